@@ -1,0 +1,102 @@
+"""Pinhole cameras in the OpenCV convention."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: x right, y down, z forward; pixel centres at half-integers."""
+
+    K: Tensor  # [3, 3] intrinsics in pixels; the principal point of an untilted photo is (W/2, H/2)
+    world_to_camera: Tensor  # [4, 4] extrinsics
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        for name, shape in {"K": (3, 3), "world_to_camera": (4, 4)}.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"Camera.{name} has shape {found}, expected {shape}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"Camera size {self.width}×{self.height} is empty")
+
+    @staticmethod
+    def from_focal(focal_px: float, width: int, height: int) -> Camera:
+        """The photo's own camera: at the world's origin, principal point in the middle."""
+        if not (math.isfinite(focal_px) and focal_px > 0):
+            raise ValueError(f"focal length must be positive, got {focal_px} px")
+        K = torch.tensor([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
+        return Camera(K, torch.eye(4), width, height)
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """(fx, fy) in pixels."""
+        return float(self.K[0, 0]), float(self.K[1, 1])
+
+    @property
+    def position(self) -> Tensor:
+        """The eye in world coordinates, [3]."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
+        """Move or convert the matrices."""
+        return dataclasses.replace(
+            self,
+            K=self.K.to(device=device, dtype=dtype),
+            world_to_camera=self.world_to_camera.to(device=device, dtype=dtype),
+        )
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on another pixel grid: intrinsics scale with each axis."""
+        factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
+        return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
+
+    def looking(self, eye: Tensor, target: Tensor) -> Camera:
+        """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down.
+
+        Raises:
+            ValueError: where eye and target coincide, or the view is straight up or down.
+        """
+        eye, target = eye.double(), target.double()
+        forward = target - eye
+        down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        right = torch.linalg.cross(down, forward)
+        if float(right.norm()) < 1e-9 * max(1.0, float(forward.norm())):
+            raise ValueError("cannot look there: eye and target coincide, or the view is vertical")
+        forward, right = forward / forward.norm(), right / right.norm()
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+        return dataclasses.replace(self, world_to_camera=matrix.to(self.world_to_camera))
+
+    def to_camera(self, points: Tensor) -> Tensor:
+        """World points [..., 3] in this camera's coordinates, [..., 3]."""
+        matrix = self.world_to_camera.to(points)
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """World points [..., 3] to pixel coordinates [..., 2] and depth z [...]."""
+        local = self.to_camera(points)
+        z = local[..., 2]
+        K = self.K.to(points)
+        uv = local[..., :2] / z[..., None] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
+        return uv, z
+
+    def unproject(self, uv: Tensor, depth: Tensor) -> Tensor:
+        """Pixels [..., 2] at depth z [...] to world points [..., 3]."""
+        K, matrix = self.K.to(uv), self.world_to_camera.to(uv)
+        xy = (uv - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]]) * depth[..., None]
+        local = torch.cat([xy, depth[..., None]], dim=-1)
+        return (local - matrix[:3, 3]) @ matrix[:3, :3]
+
+    def pixel_centers(self, stride: int = 1) -> Tensor:
+        """Centres of stride×stride cells in pixels, [H/stride, W/stride, 2] as (x, y)."""
+        ys = (torch.arange(self.height // stride) + 0.5) * stride
+        xs = (torch.arange(self.width // stride) + 0.5) * stride
+        return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)

@@ -1,0 +1,133 @@
+"""3D Gaussians as one value: five tensors that travel together."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True)
+class Gaussians:
+    """A set of N anisotropic 3D Gaussians, without a batch axis.
+
+    The world is OpenCV's: x right, y down, z forward, in metres where the base is metric.
+    """
+
+    means: Tensor  # [N, 3] centres
+    quats: Tensor  # [N, 4] rotation as (w, x, y, z); need not be normalised
+    scales: Tensor  # [N, 3] standard deviations along the rotated axes
+    opacities: Tensor  # [N] in 0..1
+    colors: Tensor  # [N, 3] linear RGB
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "colors": (n, 3)}
+        for name, shape in expected.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"Gaussians.{name} has shape {found}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """The five tensors in field order."""
+        return self.means, self.quats, self.scales, self.opacities, self.colors
+
+    @staticmethod
+    def empty(device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Gaussians:
+        """A set with N = 0."""
+        shapes: list[tuple[int, ...]] = [(0, 3), (0, 4), (0, 3), (0,), (0, 3)]
+        return Gaussians(*(torch.empty(s, device=device, dtype=dtype) for s in shapes))
+
+    @staticmethod
+    def cat(parts: Iterable[Gaussians]) -> Gaussians:
+        """Join sets in order: the first set's Gaussians stay first, bit for bit."""
+        columns = zip(*(part.tensors for part in parts), strict=True)
+        return Gaussians(*(torch.cat(column) for column in columns))
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        """Move or convert every tensor, as `Tensor.to` does."""
+        return Gaussians(*(t.to(device=device, dtype=dtype) for t in self.tensors))
+
+    def detach(self) -> Gaussians:
+        """The same values cut off from autograd."""
+        return Gaussians(*(t.detach() for t in self.tensors))
+
+    def select(self, index: Tensor | slice) -> Gaussians:
+        """Keep the Gaussians that a boolean mask [N], an index tensor [M] or a slice picks."""
+        return Gaussians(*(t[index] for t in self.tensors))
+
+    def transform(self, matrix: Tensor) -> Gaussians:
+        """Apply a similarity (rotation, uniform scale, translation).
+
+        Args:
+            matrix: [4, 4], maps old world coordinates to new ones.
+
+        Raises:
+            ValueError: where the upper left 3×3 block is not a proper rotation times a scale.
+        """
+        matrix = matrix.to(device=self.means.device, dtype=torch.float64)
+        linear = matrix[:3, :3]
+        scale = torch.linalg.det(linear).abs() ** (1 / 3)
+        rotation = linear / scale
+        orthogonal = torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-5)
+        if not orthogonal or torch.linalg.det(linear) <= 0:
+            raise ValueError("Gaussians.transform takes a rotation, a uniform scale and a translation only")
+        dtype = self.means.dtype
+        means = (self.means.double() @ linear.T + matrix[:3, 3]).to(dtype)
+        quats = quat_multiply(quat_from_matrix(rotation), self.quats.double()).to(dtype)
+        return Gaussians(means, quats, self.scales * scale.to(dtype), self.opacities, self.colors)
+
+    def covariances(self) -> Tensor:
+        """World-space covariances Σ = R S Sᵀ Rᵀ, [N, 3, 3]."""
+        factor = quat_to_matrix(self.quats) * self.scales[:, None, :]
+        return factor @ factor.transpose(1, 2)
+
+
+def quat_to_matrix(quats: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz), normalised here."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def quat_from_matrix(rotation: Tensor) -> Tensor:
+    """Unit quaternions [..., 4] (wxyz, w ≥ 0) of rotation matrices [..., 3, 3].
+
+    Each of the four components could be the one to divide by; the largest is taken, so that no
+    rotation is badly conditioned.
+    """
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in rotation.unbind(-2))
+    w = torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1)
+    x = torch.stack([m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20], -1)
+    y = torch.stack([m02 - m20, m01 + m10, 1 - m00 + m11 - m22, m12 + m21], -1)
+    z = torch.stack([m10 - m01, m02 + m20, m12 + m21, 1 - m00 - m11 + m22], -1)
+    candidates = torch.stack([w, x, y, z], dim=-2)  # row k is the quaternion times 4·component k
+    best = torch.stack([w[..., 0], x[..., 1], y[..., 2], z[..., 3]], -1).argmax(-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    quats = torch.nn.functional.normalize(candidates.gather(-2, index).squeeze(-2), dim=-1)
+    return torch.where(quats[..., :1] < 0, -quats, quats)
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of quaternions (wxyz), broadcast over leading axes: first b, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
