@@ -1,0 +1,102 @@
+"""The renderer once more, in plain PyTorch: slow, of any dtype, and readable like a textbook.
+
+Every pixel looks at every Gaussian. Tests hold the fast renderers to it, values and gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb
+from spackle.gaussians import Gaussians, quat_to_matrix
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
+from spackle.rendering import Rendering
+
+
+class ReferenceRenderer:
+    """Classic 3D Gaussian splatting, written down; a `Renderer` for small scenes."""
+
+    def render(
+        self,
+        gaussians: Gaussians | Sequence[Gaussians],
+        camera: Camera,
+        *,
+        eps2d: float = 0.0,
+        tiles: Tensor | None = None,
+        onto: Rendering | None = None,
+    ) -> Rendering:
+        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result has the input's dtype."""
+        sets = gaussians if isinstance(gaussians, Gaussians) else Gaussians.cat([Gaussians.empty(), *gaussians])
+        visible = sets.select(drawable(sets, camera))
+        z = camera.to_camera(visible.means)[:, 2]
+        visible = visible.select(torch.argsort(z, stable=True))
+        rendering = blend(visible, camera, eps2d)
+        return rendering if tiles is None else paste(rendering, tiles, onto)
+
+
+def drawable(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """Which Gaussians are finite and in front of the near plane, [N] bool."""
+    values = torch.cat([t.detach().reshape(len(gaussians), -1) for t in gaussians.tensors], dim=1)
+    return values.isfinite().all(dim=1) & (camera.to_camera(gaussians.means)[:, 2].detach() >= NEAR_PLANE)
+
+
+def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
+    """Blend Gaussians that are sorted front to back, at every pixel."""
+    uv, z = camera.project(gaussians.means)  # [N, 2], [N]
+    alphas = alphas_at(camera.pixel_centers().to(uv), uv, project_covariances(gaussians, camera, eps2d), gaussians)
+    after = torch.cumprod(1 - alphas, dim=0)  # [N, H, W] light that passes each Gaussian and those before it
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
+    weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, 0)
+    alpha = weights.sum(dim=0)
+    color = torch.einsum("nhw,nc->hwc", weights, gaussians.colors)
+    depth = torch.einsum("nhw,n->hw", weights, z) / torch.where(alpha > 0, alpha, 1)
+    return Rendering(linear_to_srgb(color), depth, alpha)
+
+
+def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
+    """Image-space covariances J W Σ Wᵀ Jᵀ + eps2d·I, [N, 2, 2].
+
+    J is the projection's Jacobian at the centre; for centres far outside the image, where it would
+    explode, it is taken at the border of 1.3 images instead, as gsplat does.
+    """
+    x, y, z = camera.to_camera(gaussians.means).unbind(-1)
+    (fx, fy), K = camera.focal, camera.K.to(x)
+    slack_x, slack_y = 0.3 * 0.5 * camera.width / fx, 0.3 * 0.5 * camera.height / fy
+    tx = (x / z).clamp(-K[0, 2] / fx - slack_x, (camera.width - K[0, 2]) / fx + slack_x)
+    ty = (y / z).clamp(-K[1, 2] / fy - slack_y, (camera.height - K[1, 2]) / fy + slack_y)
+    zero = torch.zeros_like(z)
+    rows = [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)]
+    jacobian = torch.stack(rows, dim=-2)  # [N, 2, 3]
+    axes = quat_to_matrix(gaussians.quats) * gaussians.scales[:, None, :]  # R S, [N, 3, 3]
+    factor = jacobian @ camera.world_to_camera[:3, :3].to(x) @ axes
+    return factor @ factor.transpose(1, 2) + eps2d * torch.eye(2).to(x)
+
+
+def alphas_at(pixels: Tensor, uv: Tensor, covariances: Tensor, gaussians: Gaussians) -> Tensor:
+    """Each Gaussian's alpha at each pixel, [N, H, W]; zero where it is fainter than ALPHA_MIN."""
+    xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    det = xx * yy - xy * xy
+    proper = det > 0  # a Gaussian without extent draws nothing
+    det = torch.where(proper, det, 1)[:, None, None]
+    dx, dy = (pixels - uv[:, None, None, :]).unbind(-1)  # [N, H, W]
+    xx, xy, yy = (c[:, None, None] for c in (xx, xy, yy))
+    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det  # squared, in standard deviations
+    alphas = gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance)
+    alphas = torch.where(alphas > ALPHA_MAX, ALPHA_MAX, alphas)
+    return torch.where(proper[:, None, None] & (alphas >= ALPHA_MIN), alphas, 0)
+
+
+def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
+    """Keep the chosen tiles of a rendering, [rows, columns] bool, and the rest of `onto`, or black."""
+    height, width = rendering.alpha.shape
+    if tuple(tiles.shape) != (-(-height // TILE), -(-width // TILE)):
+        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected one of each {TILE}×{TILE} pixels")
+    mask = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    parts = (rendering.rgb, rendering.depth, rendering.alpha)
+    others = (onto.rgb, onto.depth, onto.alpha) if onto is not None else tuple(torch.zeros_like(p) for p in parts)
+    rgb = torch.where(mask[..., None], parts[0], others[0])
+    return Rendering(rgb, torch.where(mask, parts[1], others[1]), torch.where(mask, parts[2], others[2]))

@@ -1,0 +1,74 @@
+"""Lists of the Gaussians that touch each tile, front to back."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spackle.render._numba import kernel
+from spackle.render.sort import even_spans, starts_of
+from spackle.render.threads import run_chunks, thread_count
+
+Array = npt.NDArray[Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class TileLists:
+    """Which Gaussians each tile draws."""
+
+    ids: Array  # [E] int32, the lists one after the other
+    starts: Array  # [T + 1] int64, where each tile's list begins
+
+
+def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
+    """Deal the sorted Gaussians out to the tiles.
+
+    Args:
+        order: [M] int32, visible Gaussians front to back.
+        boxes: [N, 4] uint16, the tiles each one touches.
+        wanted: [rows, columns] bool, the tiles to make lists for; the others' lists stay empty.
+    """
+    parts = thread_count()
+    spans = even_spans(len(order), parts)
+    counts = np.zeros((parts, wanted.size), np.int64)
+    run_chunks(lambda a, b: count_entries(a, b, spans, order, boxes, wanted, counts), parts, 1)
+    starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
+    positions = starts_of(counts)
+    ids = np.empty(starts[-1], np.int32)
+    run_chunks(lambda a, b: write_entries(a, b, spans, order, boxes, wanted, positions, ids), parts, 1)
+    return TileLists(ids, starts)
+
+
+@kernel
+def count_entries(
+    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, counts: Array
+) -> None:
+    """Count the entries that pieces first..last of the order bring to each tile."""
+    columns = wanted.shape[1]
+    for piece in range(first, last):
+        for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            box = boxes[order[k]]
+            for row in range(box[2], box[3]):
+                for column in range(box[0], box[1]):
+                    if wanted[row, column]:
+                        counts[piece, row * columns + column] += 1
+
+
+@kernel
+def write_entries(
+    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, positions: Array, ids: Array
+) -> None:
+    """Write the entries that pieces first..last of the order bring to each tile."""
+    columns = wanted.shape[1]
+    for piece in range(first, last):
+        for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            box = boxes[order[k]]
+            for row in range(box[2], box[3]):
+                for column in range(box[0], box[1]):
+                    if wanted[row, column]:
+                        tile = row * columns + column
+                        ids[positions[piece, tile]] = order[k]
+                        positions[piece, tile] += 1
