@@ -1,0 +1,276 @@
+"""Photos: any file that a person calls one, turned upright, in sRGB, with its focal length."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import os
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+
+T = TypeVar("T")
+
+MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as float32
+MAX_SIDE = 1536  # long side of the working size
+DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
+FILM_DIAGONAL_MM = math.hypot(36, 24)
+PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter real lens sits on a small sensor: SHARP's crude rule
+PLAUSIBLE_MM = (3.0, 3000.0)  # 35 mm equivalents outside this come from a broken tag
+
+_EXIF_IFD = 0x8769
+_FOCAL_LENGTH, _FOCAL_35MM = 0x920A, 0xA405
+_PIXEL_X, _PIXEL_Y, _PLANE_X_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, µm
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """An upright picture and the lens that took it."""
+
+    rgb: Tensor  # [H, W, 3] float32 sRGB in 0..1
+    focal_px: float  # in pixels of `rgb`
+    focal_source: str  # "--focal-px", "--focal-mm", "--fov", "EXIF" or "default 30 mm"
+    path: Path
+
+    @property
+    def height(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @property
+    def width(self) -> int:
+        return int(self.rgb.shape[1])
+
+    @property
+    def camera(self) -> Camera:
+        """The photo's own camera, at the world's origin."""
+        return Camera.from_focal(self.focal_px, self.width, self.height)
+
+
+def load_photo(
+    path: str | os.PathLike[str],
+    *,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
+) -> Photo:
+    """Read a JPEG, PNG, WebP, HEIC, TIFF or any other picture that Pillow opens.
+
+    EXIF orientation is applied, an embedded colour profile converted to sRGB, transparency laid over
+    white; of an animation the first frame counts. Without a given focal length EXIF's is taken, then
+    a 30 mm lens.
+
+    Args:
+        path: the file.
+        focal_px: focal length in pixels of the upright photo.
+        focal_mm: focal length as its 35 mm film equivalent, by the diagonal.
+        fov: horizontal field of view in degrees.
+
+    Raises:
+        InputError: a missing, broken or too large file, or a senseless focal length.
+    """
+    _check_focal(focal_px, focal_mm, fov)
+
+    def read(image: Image.Image) -> tuple[Tensor, dict[int, object]]:
+        tags = _exif(image)  # first: a TIFF's are gone once its pixels are loaded
+        image.load()
+        return _to_rgb(_upright(image), path), tags
+
+    rgb, exif = read_image(path, read)
+    height, width = rgb.shape[:2]
+    if focal_px is not None:
+        focal, source = focal_px, "--focal-px"
+    elif focal_mm is not None:
+        focal, source = film_to_pixels(focal_mm, width, height), "--focal-mm"
+    elif fov is not None:
+        focal, source = width / 2 / math.tan(math.radians(fov) / 2), "--fov"
+    else:
+        found = focal_from_exif(exif, width, height)
+        focal = found or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
+        source = "EXIF" if found else "default 30 mm"
+    return Photo(rgb, float(focal), source, Path(path))
+
+
+def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
+    """The photo at its working size (see `working_size`), by Lanczos; the focal length scales along."""
+    width, height = working_size(photo.width, photo.height, max_side)
+    if (width, height) == (photo.width, photo.height):
+        return photo
+    channels = [Image.fromarray(photo.rgb[..., c].contiguous().numpy()) for c in range(3)]
+    resized = [np.asarray(c.resize((width, height), Image.Resampling.LANCZOS)) for c in channels]
+    rgb = torch.from_numpy(np.stack(resized, axis=-1)).clamp_(0, 1)
+    return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width)
+
+
+def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:
+    """(width, height) with the long side at most `max_side`, never enlarged, both made even."""
+    if max_side < 2:
+        raise InputError(f"the long side must be at least 2 pixels, got {max_side}")
+    scale = min(1.0, max_side / max(width, height))
+    cap = max_side // 2 * 2
+    new_width, new_height = (min(cap, max(2, 2 * round(side * scale / 2))) for side in (width, height))
+    return new_width, new_height
+
+
+def film_to_pixels(focal_mm: float, width: int, height: int) -> float:
+    """A 35 mm film equivalent in pixels: the diagonals of film and photo correspond."""
+    return focal_mm * math.hypot(width, height) / FILM_DIAGONAL_MM
+
+
+def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float | None:
+    """Focal length in pixels of a width×height photo from EXIF tags (number → value), or None.
+
+    In order of trust: the 35 mm equivalent; the lens with the sensor's pixel pitch; the lens alone.
+    """
+
+    def plausible(mm: float) -> bool:
+        return PLAUSIBLE_MM[0] <= mm <= PLAUSIBLE_MM[1]
+
+    film = _number(tags.get(_FOCAL_35MM)) or 0.0  # 0 means "unknown" in EXIF
+    if plausible(film):
+        return film_to_pixels(film, width, height)
+    lens = _number(tags.get(_FOCAL_LENGTH))
+    if lens is None or lens <= 0:
+        return None
+    density, unit = _number(tags.get(_PLANE_X_RESOLUTION)), _number(tags.get(_PLANE_UNIT))
+    if density is not None and density > 0:
+        recorded = max(_number(tags.get(_PIXEL_X)) or 0, _number(tags.get(_PIXEL_Y)) or 0)
+        shrunk = max(width, height) / recorded if recorded > 0 else 1.0  # resized since it was taken
+        pixels = lens * density / _UNIT_MM.get(int(unit or 2), 25.4) * shrunk
+        if plausible(pixels / film_to_pixels(1.0, width, height)):
+            return pixels
+    film = lens * PHONE_FACTOR if lens < PHONE_FOCAL_MM else lens
+    return film_to_pixels(film, width, height) if plausible(film) else None
+
+
+def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -> T:
+    """Open a picture of at most 100 megapixels and return what `read` makes of it, its pixels not yet loaded.
+
+    Raises:
+        InputError: whatever goes wrong. A decoder at work on a stranger's bytes raises anything, so
+            everything is caught.
+    """
+    check_file(path, "photo")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # broken EXIF, 90 megapixels: not worth a line
+            _register_heif()
+            with Image.open(path) as image:
+                if image.width * image.height > MAX_PIXELS:
+                    megapixels = image.width * image.height / 1e6
+                    raise InputError(f"{path}: {megapixels:.0f} megapixels are too many (at most 100): shrink it first")
+                return read(image)
+    except InputError:
+        raise
+    except Image.DecompressionBombError:
+        raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
+    except UnidentifiedImageError:
+        raise InputError(f"{path}: not an image in any format that is known here: give a JPEG, PNG or HEIC") from None
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: cannot be decoded ({reason}): the file is damaged or cut off") from error
+
+
+def check_file(path: str | os.PathLike[str], kind: str) -> int:
+    """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` names it in messages."""
+    try:
+        if not os.path.exists(path):
+            raise InputError(f"{path}: no such {kind}: check the name")
+        if not os.path.isfile(path):
+            raise InputError(f"{path}: not a plain file: give the name of a {kind}")
+        size = os.path.getsize(path)
+        with open(path, "rb"):
+            pass
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{str(path)!r}: cannot be read: {error}") from error
+    if size == 0:
+        raise InputError(f"{path}: the file is empty: give another {kind}")
+    return size
+
+
+def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | None) -> None:
+    given = {"--focal-px": focal_px, "--focal-mm": focal_mm, "--fov": fov}
+    named = {name: value for name, value in given.items() if value is not None}
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)} are given together: give one of them")
+    for name, value in named.items():
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be a positive number, got {value}")
+        if name == "--fov" and value >= 180:
+            raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")
+
+
+def _register_heif() -> None:
+    if "HEIF" not in Image.OPEN:
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+
+
+def _upright(image: Image.Image) -> Image.Image:
+    try:
+        return ImageOps.exif_transpose(image)
+    except Exception:  # unreadable EXIF says nothing about the orientation
+        return image
+
+
+def _exif(image: Image.Image) -> dict[int, object]:
+    """The tags of the main and the EXIF directory; none where they are broken."""
+    try:
+        exif = image.getexif()
+        return {**exif, **exif.get_ifd(_EXIF_IFD)}
+    except Exception:
+        return {}
+
+
+def _number(value: object) -> float | None:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
+    """[H, W, 3] float32 sRGB in 0..1 of a picture in any mode."""
+    if image.mode in ("F", "I") or image.mode.startswith("I;16"):  # one channel with more than 8 bits
+        values = np.asarray(image)
+        if image.mode == "F" or values.min() < 0 or values.max() > 65535:
+            raise InputError(f"{path}: pixels of 32 bits are not a photo: save it with 8 or 16 bits a channel")
+        grey = torch.from_numpy(values.astype(np.float32)).div_(65535)
+        return grey[..., None].expand(-1, -1, 3).contiguous()
+    profile = image.info.get("icc_profile")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
+    elif image.mode not in ("RGB", "L", "CMYK"):
+        image = image.convert("RGB")
+    image = _to_srgb(image, profile).convert("RGB")
+    return torch.from_numpy(np.array(image)).float().div_(255)
+
+
+def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
+    """Convert from an embedded colour profile; a broken or unfitting one is passed over."""
+    if not profile:
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "sRGB" in ImageCms.getProfileDescription(source):
+            return image  # the detour would only round
+        target = ImageCms.createProfile("sRGB")
+        converted = ImageCms.profileToProfile(image, source, target, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return image
+    return converted or image
