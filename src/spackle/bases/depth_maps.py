@@ -1,0 +1,290 @@
+"""Depth maps that people have: NumPy, 16-bit PNG, PFM, and Middlebury's disparities."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from spackle.errors import InputError
+from spackle.image import MAX_PIXELS, check_file, read_image
+
+Array = NDArray[Any]
+StrPath = str | os.PathLike[str]
+
+MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
+PNG_UNIT_M = 0.001
+ASPECT_TOLERANCE = 0.01
+CALIBRATED_SIZE_TOLERANCE = 0.02
+MIN_DISTINCT = 16  # fewer values may share a divisor by chance
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthMap:
+    """Depth as stored: neither filled nor cleaned."""
+
+    depth: Tensor  # [H, W] float32 z in metres; 0 where not valid
+    valid: Tensor  # [H, W] bool
+    K: Tensor | None  # [3, 3] intrinsics in pixels of this map, as the calibration says them
+    quantum: float | None  # step of integer values: metres of depth, or 1/m of inverse depth
+    quantity: Literal["depth", "disparity"]  # what was stored, hence the unit of `quantum`
+    path: Path
+
+    def check_shape(self, height: int, width: int, photo: StrPath) -> None:
+        """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
+        own_height, own_width = self.depth.shape
+        if abs(own_width * height / (own_height * width) - 1) > ASPECT_TOLERANCE:
+            raise InputError(
+                f"depth map {self.path} is {own_width}×{own_height} but photo {photo} is {width}×{height}: "
+                "give a depth map with the photo's size or aspect ratio"
+            )
+
+
+def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath | None = None) -> DepthMap:
+    """Read a depth map, or a disparity map with its calibration.
+
+    Depth: `.npy`, `.npz` (one array, or the key `depth`) and `.pfm` in metres, with 0, NaN and inf for
+    unknown; 16-bit `.png` in millimetres, with 0 and 65535 for unknown. The content decides the format.
+
+    Disparity d, turned into depth = baseline · focal / (d + doffs), inf (in a PNG also 0) for unknown:
+    where `calib` is given, where a `scene.json` in the same folder names the file as its `disparity`,
+    or where the file's name starts with "disp" and a Middlebury `calib.txt` lies beside it.
+
+    Args:
+        path: the file.
+        focal_px: replaces the calibration's focal length, in pixels of the map.
+        calib: a Middlebury `calib.txt` or a `scene.json`.
+
+    Raises:
+        InputError: a missing, broken, too large, misshapen, negative or entirely unknown map.
+    """
+    check_file(path, "depth map")
+    lens = _find_calibration(Path(path), calib)
+    if focal_px is not None:
+        if not (math.isfinite(focal_px) and focal_px > 0):
+            raise InputError(f"--focal-px must be a positive number, got {focal_px}")
+        lens = lens and dataclasses.replace(lens, focal_px=focal_px)
+    stored, is_png = _read(path)
+    values = np.where(np.isfinite(stored), stored, 0)
+    if negative := int((values < 0).sum()):
+        raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
+    if lens is None:
+        quantity: Literal["depth", "disparity"] = "depth"
+        depth, valid, unit = _as_depth(stored, is_png, path)
+    else:
+        quantity = "disparity"
+        depth, valid, unit = _as_disparity(stored, is_png, lens, path)
+    with np.errstate(over="ignore"):  # too far for float32 becomes inf, hence unknown
+        metres = torch.from_numpy(depth.astype(np.float32))
+    known = torch.from_numpy(valid) & torch.isfinite(metres) & (metres > 0)
+    if not known.any():
+        raise InputError(f"{path}: all-invalid: not one of {values.size} pixels has a {quantity}")
+    integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
+    step = _step(values[known.numpy()]) if integers else None
+    quantum = None if step is None else step * unit
+    K = None if lens is None else lens.K
+    return DepthMap(metres.where(known, 0.0), known, K, quantum, quantity, Path(path))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Calibration:
+    """A rectified stereo pair: the left camera and the way back from disparity to depth."""
+
+    focal_px: float
+    cx: float
+    cy: float
+    doffs_px: float
+    baseline_m: float
+    scale: float = 1.0  # disparity in pixels = stored value · scale
+    invalid: float = math.inf  # stored value for "unknown"
+    size: tuple[int, int] | None = None  # (width, height) that the numbers are for
+
+    @property
+    def K(self) -> Tensor:
+        return torch.tensor([[self.focal_px, 0.0, self.cx], [0.0, self.focal_px, self.cy], [0.0, 0.0, 1.0]])
+
+    def check(self, path: StrPath) -> _Calibration:
+        """Itself; InputError naming the file where the numbers make no sense."""
+        for name in ("focal_px", "baseline_m", "scale"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InputError(f"{path}: {name} must be a positive number, got {getattr(self, name)}")
+        if not all(map(math.isfinite, (self.cx, self.cy, self.doffs_px))):
+            raise InputError(f"{path}: cx, cy and doffs must be finite numbers")
+        return self
+
+
+def _find_calibration(path: Path, calib: StrPath | None) -> _Calibration | None:
+    if calib is not None:
+        check_file(calib, "calibration")
+        return _read_scene(calib, None) if Path(calib).suffix.lower() == ".json" else _read_calib(calib)
+    scene, text, stem = path.with_name("scene.json"), path.with_name("calib.txt"), path.stem.lower()
+    if scene.is_file() and (lens := _read_scene(scene, path.name)):
+        return lens
+    if stem.startswith("disp") and text.is_file():
+        return _read_calib(text)
+    if stem.startswith("disp") or stem.endswith(("disp", "disparity")):
+        raise InputError(f"{path}: a disparity map by its name: give its calibration with --calib, or rename it")
+    return None
+
+
+def _read_calib(path: StrPath) -> _Calibration:
+    """Middlebury's text: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs in pixels, baseline in millimetres."""
+    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", _read_text(path), re.MULTILINE))
+    number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+    try:
+        matrix = [float(n) for n in re.findall(number, entries["cam0"])]
+        focal, _, cx, _, _, cy, *_ = matrix
+        lens = _Calibration(focal, cx, cy, float(entries.get("doffs", 0)), float(entries["baseline"]) / 1000)
+        if "width" in entries and "height" in entries:
+            lens = dataclasses.replace(lens, size=(int(entries["width"]), int(entries["height"])))
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            f"{path}: not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs and baseline"
+        ) from error
+    return lens.check(path)
+
+
+def _read_scene(path: StrPath, disparity: str | None) -> _Calibration | None:
+    """A `scene.json`; None where it is about another file than `disparity`."""
+    try:
+        scene = json.loads(_read_text(path))
+        if disparity is not None and scene.get("disparity") != disparity:
+            return None
+        focal, cx, cy, doffs, baseline = (float(scene[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
+        scale, invalid = float(scene.get("disparity_scale", 1)), float(scene.get("invalid", "inf"))
+        lens = _Calibration(focal, cx, cy, doffs, baseline, scale, invalid)
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise InputError(
+            f"{path}: not a scene description: needs focal_px, cx, cy, doffs_px and baseline_m as JSON numbers"
+        ) from error
+    return lens.check(path)
+
+
+def _read_text(path: StrPath) -> str:
+    if check_file(path, "calibration") > MAX_TEXT_BYTES:
+        raise InputError(f"{path}: too long for a calibration: give another file")
+    return Path(path).read_text(encoding="utf-8", errors="replace")
+
+
+def _as_depth(stored: Array, is_png: bool, path: StrPath) -> tuple[Array, Array, float]:
+    """Depth in metres, validity and the unit of the stored values in metres."""
+    if is_png:
+        if stored.dtype == np.uint8:
+            raise InputError(f"{path}: an 8-bit PNG is not a depth map: give 16 bits in millimetres")
+        return stored * PNG_UNIT_M, stored != 65535, PNG_UNIT_M
+    if stored.dtype.kind in "iu" and np.median(stored) > 500:
+        raise InputError(f"{path}: whole numbers around {np.median(stored):.0f} are hardly metres: divide by 1000")
+    return stored, np.isfinite(stored), 1.0
+
+
+def _as_disparity(stored: Array, is_png: bool, lens: _Calibration, path: StrPath) -> tuple[Array, Array, float]:
+    """Depth in metres, validity and the unit of the stored values in 1/m."""
+    height, width = stored.shape
+    if lens.size and max(abs(lens.size[0] / width - 1), abs(lens.size[1] / height - 1)) > CALIBRATED_SIZE_TOLERANCE:
+        calibrated = f"{lens.size[0]}×{lens.size[1]}"
+        raise InputError(f"{path}: {width}×{height} pixels, but its calibration is for {calibrated}: scale them alike")
+    valid = np.isfinite(stored) & (stored != lens.invalid)
+    if is_png:
+        valid &= stored > 0
+    with np.errstate(all="ignore"):  # what comes out infinite is marked by the caller
+        depth = lens.baseline_m * lens.focal_px / (stored.astype(np.float64) * lens.scale + lens.doffs_px)
+    return depth, valid & np.isfinite(depth), lens.scale / (lens.baseline_m * lens.focal_px)
+
+
+def _step(values: Array) -> float | None:
+    """The grid of whole numbers that all values lie on; None where one is not whole."""
+    if values.max() > 1 << 53 or not np.array_equal(values, np.round(values)):
+        return None
+    distinct = np.unique(values.astype(np.int64))
+    return float(np.gcd.reduce(np.diff(distinct))) if len(distinct) >= MIN_DISTINCT else 1.0
+
+
+def _read(path: StrPath) -> tuple[Array, bool]:
+    """The stored numbers [H, W] of any format, and whether they come from a PNG."""
+    try:
+        with open(path, "rb") as file:
+            magic = file.read(8)
+            file.seek(0)
+            if magic.startswith(b"\x89PNG"):
+                return read_image(path, lambda image: _png_values(image, path)), True
+            if magic.startswith(b"\x93NUMPY"):
+                return _read_npy(file, path), False
+            if magic.startswith(b"PK\x03\x04"):
+                return _read_npz(file, path), False
+            if magic.startswith((b"Pf", b"PF")):
+                return _read_pfm(file, path), False
+    except InputError:
+        raise
+    except Exception as error:  # NumPy and zip at work on a stranger's bytes raise anything
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: cannot be decoded ({reason}): the file is damaged or cut off") from error
+    raise InputError(f"{path}: not a depth map: give .npy, .npz or .pfm in metres, or a 16-bit .png in millimetres")
+
+
+def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
+    if len(shape) != 2:
+        raise InputError(f"{path}: an array of shape {shape} is not a depth map: give [height, width]")
+    if min(shape) < 1:
+        raise InputError(f"{path}: an array of shape {shape} is empty: give another depth map")
+    if shape[0] * shape[1] > MAX_PIXELS:
+        raise InputError(f"{path}: {shape[1]}×{shape[0]} is too large (at most 100 megapixels): shrink it first")
+
+
+def _png_values(image: Image.Image, path: StrPath) -> Array:
+    if image.mode != "L" and not image.mode.startswith("I"):
+        raise InputError(f"{path}: a PNG with mode {image.mode} is not a depth map: give one channel of 16 bits")
+    _check_size((image.height, image.width), path)
+    values = np.asarray(image)
+    return values if image.mode == "L" else values.astype(np.uint16)
+
+
+def _read_npy(file: IO[bytes], path: StrPath) -> Array:
+    """One array, its header believed only as far as the bytes reach; nothing is unpickled."""
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
+    if dtype.kind not in "fiu":
+        raise InputError(f"{path}: an array of {dtype} is not a depth map: give float32 metres")
+    _check_size(shape, path)
+    count = shape[0] * shape[1]
+    data = file.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise InputError(f"{path}: cut off: {shape[1]}×{shape[0]} values are announced, {len(data)} bytes are there")
+    values = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+    return np.ascontiguousarray(values, dtype.newbyteorder("="))
+
+
+def _read_npz(file: IO[bytes], path: StrPath) -> Array:
+    with zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+        if len(names) != 1 and "depth.npy" not in names:
+            raise InputError(f"{path}: holds {len(names)} arrays and none is called depth: name one so")
+        with archive.open("depth.npy" if "depth.npy" in names else names[0]) as member:
+            return _read_npy(member, path)
+
+
+def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
+    """Rows from the bottom up; the sign of the scale gives the byte order, its size means nothing."""
+    kind, size, scale = (file.readline(64).split() for _ in range(3))
+    if kind == [b"PF"]:
+        raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")
+    (width, height), endian = map(int, size), "<" if float(scale[0]) < 0 else ">"
+    _check_size((height, width), path)
+    data = file.read(4 * width * height)
+    if len(data) < 4 * width * height:
+        raise InputError(f"{path}: cut off: {width}×{height} values are announced, {len(data)} bytes are there")
+    values = np.frombuffer(data, f"{endian}f4").reshape(height, width)[::-1]
+    return np.ascontiguousarray(values, np.float32)
