@@ -1,0 +1,192 @@
+"""Gaussians as PLY: plain INRIA files out, INRIA's and SHARP's in."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import IO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError
+from spackle.formats.atomic import atomic_path
+from spackle.formats.cameras import checked_camera
+from spackle.formats.ply_header import Element, Header, read_extras, read_header, read_lines, skip_lines
+from spackle.gaussians import Gaussians
+from spackle.image import check_file
+
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
+SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # keep the logit finite
+SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # keep the logarithm, and float32 after it, finite
+SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
+
+# One block fits the cache, and torch computes so few numbers in one thread. Blocks are always full: so a row's
+# bits depend neither on the rows after it nor on the number of threads. log and exp are NumPy's, because
+# torch splits even these; waiting for a second thread a thousand times is slow on a busy machine.
+BLOCK = 8192
+
+_READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+_READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
+_WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
+
+
+@torch.no_grad()
+def save_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
+    """Write a binary PLY that viewers of 3D Gaussian splatting read.
+
+    One `vertex` element of float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as
+    logit, scales as logarithm, rot as unit quaternion wxyz. Row i depends on Gaussian i alone.
+
+    Raises:
+        InputError: where nothing can be written at `path`.
+        ValueError: where a Gaussian is not finite.
+    """
+    count = len(gaussians)
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [*(f"property float {name}" for name in _WRITTEN), "end_header", ""]
+    columns = [t.detach().to("cpu", torch.float32).contiguous() for t in gaussians.tensors]
+    table = np.zeros((BLOCK, len(_WRITTEN)), "<f4")
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join(lines).encode())
+        for start in range(0, count, BLOCK):
+            rows = min(BLOCK, count - start)
+            _encode([_padded(c[start : start + rows]) for c in columns], table)
+            if not np.isfinite(table[:rows]).all():
+                raise ValueError(f"{path}: Gaussians {start} to {start + rows - 1} are not all finite")
+            table[:rows].tofile(file)
+
+
+def load_ply(path: str | os.PathLike[str]) -> Gaussians:
+    """Read Gaussians from an INRIA or SHARP file, binary or ASCII; colours become linear RGB.
+
+    Properties may come in any order and type; spherical harmonics above degree 0 (f_rest) are passed
+    over. SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with
+    SHARP's camera is linear, as SHARP reads it, and any other sRGB.
+
+    Raises:
+        InputError: a missing, broken or cut file, one without Gaussians, or one with NaN or inf. An
+            infinite opacity logit is allowed: SHARP writes one for an opacity of 1.
+    """
+    size = check_file(path, "PLY file")
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+        header.check_size(size)
+        vertex, offset = _vertex(header)
+        extras = read_extras(file, header)
+        linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
+        parts = [torch.empty(vertex.count, width) for width in (3, 4, 3, 1, 3)]
+        broken = 0
+        for start, table in _tables(file, header, vertex, offset):
+            broken += _decode(table, [part[start : start + BLOCK] for part in parts], linear)
+    if broken:
+        raise InputError(f"{path}: {broken} of {vertex.count} Gaussians are not finite: export the scene again")
+    return Gaussians(parts[0], parts[1], parts[2], parts[3][:, 0], parts[4])
+
+
+def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
+    """The photo's camera that SHARP stores after the Gaussians; None in other files.
+
+    Raises:
+        InputError: a broken file, or a camera that makes no sense.
+    """
+    size = check_file(path, "PLY file")
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+        header.check_size(size)
+        extras = read_extras(file, header)
+    if "intrinsic" not in extras:
+        return None
+    intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", np.eye(4).ravel())
+    K, matrix = np.eye(3), np.eye(4)
+    if len(intrinsic) == 9 and len(extras.get("image_size", ())) == 2:
+        K, (width, height) = intrinsic.reshape(3, 3), extras["image_size"]
+    elif len(intrinsic) == 4:  # older: fx, fy, width, height
+        K[0, 0], K[1, 1], width, height = intrinsic
+        K[:2, 2] = width / 2, height / 2
+    else:
+        raise InputError(f"{path}: a camera of {len(intrinsic)} numbers is none of SHARP's: give the focal length")
+    if len(extrinsic) == 12:  # older: 3×4 with the rotation transposed
+        matrix[:3] = extrinsic.reshape(3, 4)
+        matrix[:3, :3] = matrix[:3, :3].T.copy()
+    elif len(extrinsic) == 16:
+        matrix = extrinsic.reshape(4, 4)
+    width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
+    where = f"{path}: the stored camera"
+    return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
+
+
+def _padded(part: Tensor) -> Tensor:
+    """A full block, [BLOCK, ...]; the surplus is computed and thrown away."""
+    if len(part) == BLOCK:
+        return part
+    return torch.cat([part, torch.zeros(BLOCK - len(part), *part.shape[1:])])
+
+
+def _encode(columns: list[Tensor], table: NDArray[np.float32]) -> None:
+    """Fill `table` [BLOCK, 17] from means, quats, scales, opacities, colours; the normals stay 0."""
+    means, quats, scales, opacities, colors = columns
+    table[:, 0:3] = means.numpy()
+    table[:, 6:9] = ((linear_to_srgb(colors) - 0.5) / SH_C0).numpy()
+    o = np.clip(opacities.numpy(), SMALLEST_OPACITY, LARGEST_OPACITY)
+    table[:, 9] = np.log(o / (1 - o))  # 1 - o is exact above one half
+    table[:, 10:13] = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
+    norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
+    table[:, 13:17] = (quats / norm.clamp_min(SMALLEST_QUAT)).numpy()
+    table[norm[:, 0].numpy() < SMALLEST_QUAT, 13] = 1.0
+
+
+def _vertex(header: Header) -> tuple[Element, int]:
+    """The vertices and their offset; InputError where they are not Gaussians of a fixed size."""
+    path = header.path
+    named = [element for element in header.elements if element.name == "vertex"]
+    if len(named) != 1:
+        raise InputError(f"{path}: holds {len(named)} elements called vertex instead of one: not a Gaussian scene")
+    missing = [name for name in _READ if name not in dict(named[0].fields)]
+    if missing:
+        raise InputError(f"{path}: not a Gaussian scene: its vertices have no {', '.join(missing)}")
+    for element, offset in header.readable():
+        if element is named[0] and element.count:
+            return element, offset
+    problem = "no Gaussians" if named[0].count == 0 else "lists in or before its vertices"
+    raise InputError(f"{path}: holds {problem}: export it as a plain Gaussian scene")
+
+
+def _tables(file: IO[bytes], header: Header, vertex: Element, offset: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """First row and the properties of `_READ` [14, BLOCK], overwritten by the next; the last has a surplus."""
+    table = np.zeros((len(_READ), BLOCK), np.float32)
+    file.seek(header.data_start + (0 if header.ascii else offset))
+    if header.ascii:
+        skip_lines(file, offset)
+    for start in range(0, vertex.count, BLOCK):
+        count = min(BLOCK, vertex.count - start)
+        if header.ascii:
+            rows = read_lines(file, vertex, count, header.path)
+        else:
+            rows = np.fromfile(file, vertex.dtype, count)
+            if len(rows) < count:
+                raise InputError(f"{header.path}: cut off while it was read: try again")
+        with np.errstate(over="ignore"):  # too large for float32 becomes inf, which is counted
+            for k, name in enumerate(_READ):
+                table[k, :count] = rows[name]
+        yield start, table
+
+
+def _decode(table: NDArray[np.float32], parts: list[Tensor], linear: bool) -> int:
+    """Fill means, quats, scales, opacities, colours [rows, …] from [14, BLOCK]; the number of broken rows."""
+    means, quats, scales, opacities, colors = parts
+    rows = len(means)
+    rgb = torch.from_numpy(table[3:6] * np.float32(SH_C0) + np.float32(0.5))
+    colors.copy_((rgb.clamp_min(0) if linear else srgb_to_linear(rgb))[:, :rows].T)
+    opacities.copy_(torch.from_numpy(table[6:7]).sigmoid()[:, :rows].T)
+    with np.errstate(over="ignore"):
+        table[7:10] = np.exp(table[7:10])
+    for part, first in ((means, 0), (scales, 7), (quats, 10)):
+        part.copy_(torch.from_numpy(table[first : first + part.shape[1], :rows]).T)
+    table[6][np.isinf(table[6])] = 0  # a sigmoid of 0 or 1
+    fine = np.isfinite(table[:, :rows])
+    return 0 if fine.all() else int((~fine.all(axis=0)).sum())

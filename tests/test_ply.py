@@ -1,0 +1,399 @@
+"""PLY: round trips, an independent reader, SHARP's variants, and hostile files."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError
+from spackle.formats import atomic_path, check_writable, load_ply, load_ply_camera, save_ply
+from spackle.formats.ply import BLOCK
+from spackle.gaussians import Gaussians, quat_to_matrix
+
+PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+GIVEN = [*PROPERTIES[:3], *PROPERTIES[6:]]  # SHARP writes no normals
+
+
+def scene(count: int, seed: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        torch.randn(count, 3, generator=g) * 5,
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 3, generator=g) * 0.1 + 1e-5,
+        torch.rand(count, generator=g),
+        torch.rand(count, 3, generator=g),
+    )
+
+
+def read_independently(path: Path) -> dict[str, list[float]]:
+    """The plainest reader of a binary little-endian file of floats."""
+    content = path.read_bytes()
+    header, body = content.split(b"end_header\n", 1)
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert lines[2].startswith("element vertex ")
+    count = int(lines[2].split()[2])
+    names = [line.removeprefix("property float ") for line in lines[3:]]
+    rows = list(struct.iter_unpack(f"<{len(names)}f", body))
+    assert len(rows) == count
+    return {name: [row[k] for row in rows] for k, name in enumerate(names)}
+
+
+def raw(gaussians: Gaussians, linear: bool = False) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """What a file stores for GIVEN, [N, 14], in plain double arithmetic."""
+    m, q, s, o, c = (t.double() for t in gaussians.tensors)
+    sh = ((c if linear else linear_to_srgb(c)) - 0.5) / 0.28209479177387814
+    return np.asarray(torch.cat([m, sh, torch.logit(o)[:, None], s.log(), q], dim=1))
+
+
+def ply(rows: Any, names: list[str], kind: str = "float", order: str = "binary_little_endian", tail: bytes = b"",
+        head: str = "", after: str = "") -> bytes:  # fmt: skip
+    """A file with one vertex element, and whatever comes before and after."""
+    rows = np.asarray(rows, dtype=np.float64)
+    header = f"ply\nformat {order} 1.0\ncomment made by a test\n{head}element vertex {len(rows)}\n"
+    header += "".join(f"property {kind} {name}\n" for name in names) + after + "end_header\n"
+    if order == "ascii":
+        body = "".join(" ".join(repr(float(v)) for v in row) + "\n" for row in rows).encode()
+    else:
+        code = {"float": "f4", "double": "f8", "uchar": "u1"}[kind]
+        body = rows.astype((">" if "big" in order else "<") + code).tobytes()
+    return header.encode() + body + tail
+
+
+SHARP_AFTER = "".join(
+    f"element {name} {count}\nproperty {kind} {name}\n"
+    for name, count, kind in [
+        ("extrinsic", 16, "float"), ("intrinsic", 9, "float"), ("image_size", 2, "uint"), ("frame", 2, "int"),
+        ("disparity", 2, "float"), ("color_space", 1, "uchar"), ("version", 3, "uchar"),
+    ]
+)  # fmt: skip
+
+
+def sharp_tail(color_space: int) -> bytes:
+    numbers = [*np.eye(4).ravel(), 500.0, 0, 320, 0, 500, 240, 0, 0, 1]
+    return (
+        np.array(numbers, "<f4").tobytes()
+        + struct.pack("<2I2i2f", 640, 480, 1, 3, 0.1, 0.9)
+        + bytes([color_space, 1, 5, 0])
+    )
+
+
+def close(a: Gaussians, b: Gaussians, tolerance: float = 2e-5) -> None:
+    for x, y in zip(a.tensors, b.tensors, strict=True):
+        torch.testing.assert_close(x, y, rtol=tolerance, atol=tolerance)
+
+
+def test_independent_reader_finds_what_was_meant(tmp_path: Path) -> None:
+    gaussians = scene(300)
+    save_ply(gaussians, tmp_path / "a.ply")
+    found = read_independently(tmp_path / "a.ply")
+    assert list(found) == PROPERTIES
+    expected = raw(gaussians)
+    expected[:, 10:] /= np.linalg.norm(expected[:, 10:], axis=1, keepdims=True)
+    for k, name in enumerate(GIVEN):
+        np.testing.assert_allclose(found[name], expected[:, k], rtol=1e-5, atol=2e-5, err_msg=name)
+    assert not any(found["nx"] + found["ny"] + found["nz"])
+
+
+@pytest.mark.parametrize("count", [1, 7, BLOCK - 1, BLOCK, 2 * BLOCK + 5])
+def test_round_trip(tmp_path: Path, count: int) -> None:
+    gaussians = scene(count)
+    save_ply(gaussians, tmp_path / "a.ply")
+    found = load_ply(tmp_path / "a.ply")
+    unit = torch.nn.functional.normalize(gaussians.quats, dim=-1)
+    close(found, Gaussians(gaussians.means, unit, *gaussians.tensors[2:]))
+    assert torch.equal(found.means, gaussians.means)
+
+
+@st.composite
+def any_gaussians(draw: st.DrawFn) -> Gaussians:
+    count = draw(st.integers(1, 4))
+
+    def tensor(width: int, low: float, high: float) -> torch.Tensor:
+        values = draw(st.lists(st.floats(low, high, width=32), min_size=count * width, max_size=count * width))
+        return torch.tensor(values, dtype=torch.float32).reshape(count, width)
+
+    return Gaussians(
+        tensor(3, -1e6, 1e6), tensor(4, -4, 4), tensor(3, 2**-60, 2**60), tensor(1, 0, 1)[:, 0], tensor(3, 0, 1)
+    )
+
+
+@settings(deadline=None)
+@given(any_gaussians())
+def test_round_trip_of_anything(tmp_path_factory: Any, gaussians: Gaussians) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.ply"
+    save_ply(gaussians, path)
+    found = load_ply(path)
+    assert torch.equal(found.means, gaussians.means)
+    torch.testing.assert_close(found.scales, gaussians.scales, rtol=2e-5, atol=0)
+    torch.testing.assert_close(found.opacities, gaussians.opacities, rtol=1e-5, atol=2e-7)
+    torch.testing.assert_close(found.colors, gaussians.colors, rtol=1e-5, atol=2e-6)
+    whole = gaussians.quats.norm(dim=-1) > 1e-6
+    rotation = quat_to_matrix(gaussians.quats.double()).float()
+    torch.testing.assert_close(quat_to_matrix(found.quats)[whole], rotation[whole], rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.quats.norm(dim=-1)[whole], torch.ones(int(whole.sum())))
+
+
+def test_extremes_stay_finite(tmp_path: Path) -> None:
+    opacities = torch.tensor([0.0, 1.0, 0.999, 0.9999, 0.99999, 1e-6])
+    gaussians = Gaussians(
+        torch.zeros(6, 3),
+        torch.zeros(6, 4),
+        torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e30, torch.inf])[:, None].repeat(1, 3),
+        opacities,
+        torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0, 1e-5])[:, None].repeat(1, 3),
+    )
+    save_ply(gaussians, tmp_path / "a.ply")
+    assert all(math.isfinite(v) for column in read_independently(tmp_path / "a.ply").values() for v in column)
+    found = load_ply(tmp_path / "a.ply")
+    torch.testing.assert_close(found.opacities, opacities, rtol=2e-7, atol=1e-9)
+    torch.testing.assert_close(found.colors, gaussians.colors.clamp(0, 1), rtol=1e-5, atol=1e-6)
+    assert found.quats.tolist() == [[1, 0, 0, 0]] * 6
+    assert 0 < found.scales.min() < 1e-30
+    assert torch.isfinite(found.scales).all()
+
+
+def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path) -> None:
+    base, more = scene(BLOCK + 777), scene(3 * BLOCK + 1, seed=1)
+    save_ply(base, tmp_path / "base.ply")
+    save_ply(Gaussians.cat([base, more]), tmp_path / "both.ply")
+    rows = [(tmp_path / name).read_bytes().split(b"end_header\n", 1)[1] for name in ("base.ply", "both.ply")]
+    assert rows[1].startswith(rows[0])
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1 if threads > 1 else 2)
+        save_ply(base, tmp_path / "again.ply")
+    finally:
+        torch.set_num_threads(threads)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "base.ply").read_bytes()
+    loaded, both = load_ply(tmp_path / "base.ply"), load_ply(tmp_path / "both.ply")
+    assert all(torch.equal(a, b[: len(a)]) for a, b in zip(loaded.tensors, both.tensors, strict=True))
+
+
+def test_other_devices_types_and_strides(tmp_path: Path) -> None:
+    gaussians = scene(10)
+    save_ply(gaussians, tmp_path / "a.ply")
+    strided = Gaussians(*(torch.stack([t, t], dim=-1).double().requires_grad_()[..., 0] for t in gaussians.tensors))
+    save_ply(strided, tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
+    gaussians = scene(20)
+    shuffled = [*reversed(GIVEN), *(f"f_rest_{k}" for k in range(45))]
+    rows = np.concatenate([raw(gaussians)[:, ::-1], np.full((20, 45), 0.25)], axis=1)
+    head = "element camera 2\nproperty double fov\nproperty uchar used\n"
+    content = ply(rows, shuffled, kind, order, head=head)
+    before, body = content.split(b"end_header\n", 1)
+    first = b"50 1\n60 0\n" if order == "ascii" else b"\0" * 18
+    (tmp_path / "a.ply").write_bytes(before + b"end_header\n" + first + body)
+    close(load_ply(tmp_path / "a.ply"), gaussians)
+    assert load_ply_camera(tmp_path / "a.ply") is None
+
+
+def test_windows_line_ends_and_a_mesh_after_it(tmp_path: Path) -> None:
+    after = "element face 1\nproperty list uchar int vertex_indices\n"
+    content = ply(raw(scene(3)), GIVEN, after=after, tail=b"\x03" + b"\0" * 12)
+    header, body = content.split(b"end_header\n", 1)
+    (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    close(load_ply(tmp_path / "a.ply"), scene(3))
+
+
+@pytest.mark.parametrize(("color_space", "linear"), [(0, False), (1, True)])
+def test_sharp_file(tmp_path: Path, color_space: int, linear: bool) -> None:
+    gaussians = scene(3)
+    content = ply(raw(gaussians, linear), GIVEN, after=SHARP_AFTER, tail=sharp_tail(color_space))
+    (tmp_path / "a.ply").write_bytes(content)
+    close(load_ply(tmp_path / "a.ply"), gaussians)
+    camera = load_ply_camera(tmp_path / "a.ply")
+    assert camera is not None
+    assert (camera.width, camera.height, camera.focal) == (640, 480, (500, 500))
+    assert torch.equal(camera.world_to_camera, torch.eye(4))
+    (tmp_path / "a.ply").write_bytes(content[:-4])
+    with pytest.raises(InputError, match="cut off"):
+        load_ply(tmp_path / "a.ply")
+
+
+def test_older_sharp_file(tmp_path: Path) -> None:
+    after = "element intrinsic 4\nproperty float intrinsic\nelement extrinsic 12\nproperty float extrinsic\n"
+    turn = [[0.0, 1.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]
+    tail = struct.pack("<4f12f", 700, 710, 320, 200, *np.ravel(turn))
+    (tmp_path / "a.ply").write_bytes(ply(raw(scene(3), linear=True), GIVEN, after=after, tail=tail))
+    close(load_ply(tmp_path / "a.ply"), scene(3))
+    camera = load_ply_camera(tmp_path / "a.ply")
+    assert camera is not None
+    assert camera.K.tolist() == [[700, 0, 160], [0, 710, 100], [0, 0, 1]]
+    assert camera.world_to_camera[:3].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    for bad in (0.0, math.nan):
+        tail = struct.pack("<4f12f", bad, 710, 320, 200, *np.ravel(turn))
+        (tmp_path / "a.ply").write_bytes(ply(raw(scene(3)), GIVEN, after=after, tail=tail))
+        with pytest.raises(InputError, match="stored camera"):
+            load_ply_camera(tmp_path / "a.ply")
+
+
+def test_bytes_as_values_and_an_opacity_of_one(tmp_path: Path) -> None:
+    rows = np.zeros((2, 14))
+    rows[:, 10] = 1
+    rows[0, :3] = [1, 2, 255]
+    (tmp_path / "a.ply").write_bytes(ply(rows, GIVEN, "uchar"))
+    assert load_ply(tmp_path / "a.ply").means[0].tolist() == [1, 2, 255]
+    rows[1, 6] = math.inf
+    rows[0, 6] = -math.inf
+    (tmp_path / "a.ply").write_bytes(ply(rows, GIVEN))
+    assert load_ply(tmp_path / "a.ply").opacities.tolist() == [0, 1]
+
+
+GOOD = ply(raw(scene(3)), GIVEN)
+ASCII = ply(raw(scene(3)), GIVEN, order="ascii")
+LISTED = "element face 1\nproperty list uchar int vertex_indices\n"
+
+
+def spoiled(column: int, value: float, kind: str = "float") -> bytes:
+    rows = raw(scene(3))
+    rows[1:, column] = value
+    return ply(rows, GIVEN, kind)
+
+
+BAD = {
+    "empty": (b"", "empty"),
+    "text": (b"hello\nthere\n", "not a PLY"),
+    "cut": (GOOD[:-1], "cut off"),
+    "cut header": (GOOD[:200], "no end"),
+    "endless header": (b"ply\n" + b"comment x\n" * 100_000, "no end"),
+    "one line": (b"ply\n" + b"x" * 200_000, "no end"),
+    "a million million": (GOOD.replace(b"vertex 3", b"vertex 1000000000000"), "cut off"),
+    "a long number": (GOOD.replace(b"vertex 3", b"vertex " + b"9" * 5000), "header"),
+    "negative": (GOOD.replace(b"vertex 3", b"vertex -3"), "header"),
+    "fraction": (GOOD.replace(b"vertex 3", b"vertex 3.5"), "header"),
+    "no vertices": (GOOD.replace(b"vertex 3", b"vertex 0"), "no Gaussians"),
+    "other element": (GOOD.replace(b"vertex 3", b"vortex 3"), "0 elements"),
+    "missing": (GOOD.replace(b"scale_1", b"scale_9"), "have no scale_1"),
+    "mesh": (ply(np.zeros((3, 3)), ["x", "y", "z"], after=LISTED), "not a Gaussian scene"),
+    "twice": (GOOD.replace(b"scale_1", b"scale_0"), "header"),
+    "type": (GOOD.replace(b"property float opacity", b"property half opacity"), "header"),
+    "format": (GOOD.replace(b"little", b"middle"), "header"),
+    "no format": (GOOD.replace(b"format binary_little_endian 1.0\n", b""), "header"),
+    "property first": (GOOD.replace(b"element vertex 3\n", b""), "header"),
+    "list in vertex": (GOOD.replace(b"end_header", b"property list uchar int i\nend_header"), "lists in"),
+    "list before": (ply(raw(scene(3)), GIVEN, head=LISTED), "lists in"),
+    "NaN": (spoiled(0, math.nan), "2 of 3 Gaussians are not finite"),
+    "NaN opacity": (spoiled(6, math.nan), "2 of 3 Gaussians are not finite"),
+    "inf": (spoiled(4, math.inf), "2 of 3"),
+    "inf rotation": (spoiled(13, -math.inf), "2 of 3"),
+    "large scale": (spoiled(7, 1000), "2 of 3"),
+    "beyond float32": (spoiled(1, 1e200, "double"), "2 of 3"),
+    "ascii cut": (ASCII[:-300], "cut off"),
+    "ascii words": (ASCII.replace(b"end_header\n", b"end_header\nzero "), "no number"),
+    "ascii surplus": (ASCII[:-1] + b" 1 2 3\n", "exactly 14 numbers"),
+    "ascii many": (ASCII.replace(b"vertex 3", b"vertex 1000000000000"), "cut off"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_files(tmp_path: Path, kind: str) -> None:
+    content, says = BAD[kind]
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says) as caught:
+        load_ply(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+SHARP = ply(raw(scene(3)), GIVEN, after=SHARP_AFTER, tail=sharp_tail(0))
+
+
+@given(st.sampled_from([GOOD, ASCII, SHARP]), st.data())
+def test_random_damage_is_an_input_error_or_a_scene(tmp_path_factory: Any, whole: bytes, data: st.DataObject) -> None:
+    content = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "damaged.ply"
+    path.write_bytes(content[: data.draw(st.integers(len(content) // 2, len(content)))])
+    with contextlib.suppress(InputError):
+        assert all(torch.isfinite(t).all() for t in load_ply(path).tensors)
+    with contextlib.suppress(InputError):
+        load_ply_camera(path)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such PLY file"):
+        load_ply(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="not a plain file"):
+        load_ply(tmp_path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    save_ply(scene(3), path)
+    before = path.read_bytes()
+    broken = scene(2 * BLOCK)
+    broken.means[-1, 0] = math.nan
+    with pytest.raises(ValueError, match="not all finite"):
+        save_ply(broken, path)
+    with pytest.raises(ValueError, match="not all finite"):
+        save_ply(broken, tmp_path / "new.ply")
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@contextlib.contextmanager
+def interrupted(path: Path) -> Iterator[None]:
+    with atomic_path(path) as temporary:
+        temporary.write_text("half")
+        yield
+        raise KeyboardInterrupt
+
+
+def test_atomic_path(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(KeyboardInterrupt), interrupted(path):
+        assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+    assert path.read_text() == "old"
+    link = tmp_path / "link.txt"
+    link.symlink_to(path)
+    with atomic_path(link) as temporary:
+        assert temporary.suffix == ".txt"
+        temporary.write_text("new")
+    assert link.is_symlink()
+    assert path.read_text() == "new"
+    other = tmp_path / "input.txt"
+    with pytest.raises(FileNotFoundError), atomic_path(path):  # not a failure of the output
+        other.read_text()
+    with pytest.raises(InputError, match="No space left"), atomic_path(path):
+        raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("name", ["nowhere/a.ply", "file/a.ply", ".", "a\0b.ply", "n" * 300 + ".ply", "/dev/null"])
+def test_unwritable_outputs(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="cannot write") as caught:
+        save_ply(scene(1), tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == ["file"]
+    with contextlib.suppress(InputError):
+        check_writable(tmp_path / name)
+
+
+def test_colours_pass_through_srgb(tmp_path: Path) -> None:
+    save_ply(scene(5), tmp_path / "a.ply")
+    stored = read_independently(tmp_path / "a.ply")["f_dc_0"]
+    srgb = torch.tensor(stored) * 0.28209479177387814 + 0.5
+    torch.testing.assert_close(srgb_to_linear(srgb), scene(5).colors[:, 0], rtol=1e-5, atol=1e-6)
