@@ -30,27 +30,29 @@ class ReferenceRenderer:
         onto: Rendering | None = None,
     ) -> Rendering:
         """Draw Gaussians as a camera sees them; see `Renderer.render`. The result has the input's dtype."""
-        sets = gaussians if isinstance(gaussians, Gaussians) else Gaussians.cat([Gaussians.empty(), *gaussians])
-        visible = sets.select(drawable(sets, camera))
-        z = camera.to_camera(visible.means)[:, 2]
-        visible = visible.select(torch.argsort(z, stable=True))
+        joined = gaussians if isinstance(gaussians, Gaussians) else Gaussians.cat([Gaussians.empty(), *gaussians])
+        visible = front_to_back(joined, camera)
         rendering = blend(visible, camera, eps2d)
         return rendering if tiles is None else paste(rendering, tiles, onto)
 
 
-def drawable(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Which Gaussians are finite and in front of the near plane, [N] bool."""
-    values = torch.cat([t.detach().reshape(len(gaussians), -1) for t in gaussians.tensors], dim=1)
-    return values.isfinite().all(dim=1) & (camera.to_camera(gaussians.means)[:, 2].detach() >= NEAR_PLANE)
+def front_to_back(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """The Gaussians that are finite and not behind the near plane, sorted by depth."""
+    finite = [t.detach().isfinite().unsqueeze(-1).flatten(1).all(dim=1) for t in gaussians.tensors]
+    z = camera.to_camera(gaussians.means.detach())[:, 2]
+    gaussians = gaussians.select(torch.stack(finite).all(dim=0) & (z >= NEAR_PLANE))
+    return gaussians.select(torch.argsort(camera.to_camera(gaussians.means.detach())[:, 2], stable=True))
 
 
 def blend(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
     """Blend Gaussians that are sorted front to back, at every pixel."""
-    uv, z = camera.project(gaussians.means)  # [N, 2], [N]
-    alphas = alphas_at(camera.pixel_centers().to(uv), uv, project_covariances(gaussians, camera, eps2d), gaussians)
+    alphas = falloff(gaussians, camera, eps2d)
+    alphas = torch.where(alphas > ALPHA_MAX, ALPHA_MAX, alphas)
+    alphas = torch.where(alphas >= ALPHA_MIN, alphas, 0)
     after = torch.cumprod(1 - alphas, dim=0)  # [N, H, W] light that passes each Gaussian and those before it
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
     weights = torch.where(after > TRANSMITTANCE_STOP, alphas * before, 0)
+    z = camera.to_camera(gaussians.means)[:, 2]
     alpha = weights.sum(dim=0)
     color = torch.einsum("nhw,nc->hwc", weights, gaussians.colors)
     depth = torch.einsum("nhw,n->hw", weights, z) / torch.where(alpha > 0, alpha, 1)
@@ -76,18 +78,17 @@ def project_covariances(gaussians: Gaussians, camera: Camera, eps2d: float) -> T
     return factor @ factor.transpose(1, 2) + eps2d * torch.eye(2).to(x)
 
 
-def alphas_at(pixels: Tensor, uv: Tensor, covariances: Tensor, gaussians: Gaussians) -> Tensor:
-    """Each Gaussian's alpha at each pixel, [N, H, W]; zero where it is fainter than ALPHA_MIN."""
+def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
+    """Each Gaussian's opacity, fallen off with the distance to each pixel, [N, H, W]; not yet clamped."""
+    uv, _ = camera.project(gaussians.means)  # [N, 2]
+    covariances = project_covariances(gaussians, camera, eps2d)[:, :, :, None, None]  # [N, 2, 2, 1, 1]
     xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     det = xx * yy - xy * xy
     proper = det > 0  # a Gaussian without extent draws nothing
-    det = torch.where(proper, det, 1)[:, None, None]
-    dx, dy = (pixels - uv[:, None, None, :]).unbind(-1)  # [N, H, W]
-    xx, xy, yy = (c[:, None, None] for c in (xx, xy, yy))
-    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det  # squared, in standard deviations
-    alphas = gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance)
-    alphas = torch.where(alphas > ALPHA_MAX, ALPHA_MAX, alphas)
-    return torch.where(proper[:, None, None] & (alphas >= ALPHA_MIN), alphas, 0)
+    dx, dy = (camera.pixel_centers().to(uv) - uv[:, None, None, :]).unbind(-1)  # [N, H, W]
+    # The squared distance in standard deviations, dᵀ Σ⁻¹ d.
+    distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / torch.where(proper, det, 1)
+    return torch.where(proper, gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance), 0)
 
 
 def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:

@@ -1,0 +1,147 @@
+"""The CPU renderer as one differentiable function of its tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from spackle.gaussians import Gaussians
+from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums, count_wanted
+from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array, draw
+from spackle.render.project import View
+from spackle.render.project_backward import project_backward
+from spackle.render.protocol import TILE
+from spackle.render.threads import run_chunks, thread_count
+from spackle.rendering import Rendering
+
+Array = npt.NDArray[Any]
+
+FIELDS = 5  # tensors in a set of Gaussians
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """The sets that want gradients, and the rows of the gradient table that they share."""
+
+    sets: list[int]
+    ranges: Array  # [S, 3] int64: first and last Gaussian (exclusive) of each such set, and its first row
+    rows: int
+
+    @staticmethod
+    def of(sizes: Sequence[int], wants: Sequence[bool]) -> Wanted:
+        """Lay the table out for sets of these sizes."""
+        first, row, sets, ranges = 0, 0, [], []
+        for k, (size, want) in enumerate(zip(sizes, wants, strict=True)):
+            if want:
+                sets.append(k)
+                ranges.append((first, first + size, row))
+                row += size
+            first += size
+        return Wanted(sets, np.array(ranges, np.int64).reshape(-1, 3), row)
+
+
+class Draw(torch.autograd.Function):
+    """Draw sets of Gaussians, given as a flat row of tensors, over the three images of `onto`."""
+
+    @staticmethod
+    def forward(ctx: Any, view: View, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw.
+
+        Args:
+            ctx: keeps what the gradient needs.
+            view: the camera.
+            wanted: [rows, columns] bool, the tiles to draw.
+            tensors: rgb, depth and alpha of `onto` (or None), then the five of each set; all float32.
+        """
+        under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
+        sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
+        onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
+        drawing = draw(sets, view, wanted, onto, keep_linear=True)
+        rendering = drawing.canvas.rendering()
+        ctx.drawing, ctx.sizes = drawing, [len(part) for part in sets]
+        ctx.save_for_backward(rendering.rgb, rendering.depth, rendering.alpha, *fields)
+        return rendering.rgb, rendering.depth, rendering.alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """From the gradients of the three images to those of the tensors that asked for one."""
+        saved = ctx.saved_tensors
+        outputs = tuple(as_array(t) for t in saved[:3])
+        fields = saved[3:]
+        needs = ctx.needs_input_grad[2:]
+        under = [
+            keep_undrawn(gradient, ctx.drawing.wanted) if need else None
+            for gradient, need in zip(gradients, needs[:3], strict=True)
+        ]
+        wants = [any(needs[3 + k * FIELDS : 3 + (k + 1) * FIELDS]) for k in range(len(ctx.sizes))]
+        wanted = Wanted.of(ctx.sizes, wants)
+        table = pixel_sums(ctx.drawing, outputs, tuple(as_array(g) for g in gradients), wanted)
+        results: list[Tensor | None] = [None] * len(fields)
+        for k, (_, _, row) in zip(wanted.sets, wanted.ranges, strict=True):
+            own = slice(k * FIELDS, (k + 1) * FIELDS)
+            results[own] = set_gradients(fields[own], ctx.drawing.view, table[row : row + ctx.sizes[k]])
+        return None, None, *under, *(r if need else None for r, need in zip(results, needs[3:], strict=True))
+
+
+def keep_undrawn(gradient: Tensor, wanted: Array) -> Tensor:
+    """The gradient of the image that was drawn onto: nothing where tiles were drawn over it."""
+    height, width = gradient.shape[:2]
+    drawn = torch.from_numpy(wanted).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    return torch.where(drawn if gradient.ndim == 2 else drawn[..., None], 0, gradient)
+
+
+def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], wanted: Wanted) -> Array:
+    """What the pixels give to each Gaussian that wants gradients, [wanted.rows, SUMS] float64.
+
+    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not
+    depend on which thread was faster.
+    """
+    lists, columns = drawing.lists, drawing.wanted.shape[1]
+    counts = np.zeros(drawing.wanted.size, np.int64)
+    run_chunks(
+        lambda a, b: count_wanted(a, b, lists.ids, lists.starts, wanted.ranges, counts), len(counts), BLEND_GRAIN
+    )
+    slots = np.concatenate([[0], np.cumsum(counts)])
+    tiles = np.flatnonzero(counts)
+    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((wanted.rows, SUMS))
+
+    def blend_chunk(start: int, stop: int) -> None:
+        backward_tiles(
+            start, stop, tiles, columns, lists.ids, lists.starts, drawing.splats.records,
+            outputs, gradients, drawing.canvas.linear, wanted.ranges, slots, sums,
+        )  # fmt: skip
+
+    run_chunks(blend_chunk, len(tiles), BLEND_GRAIN)
+    shares = thread_count()
+    rows = -(-wanted.rows // shares)
+    run_chunks(
+        lambda a, b: collect_sums(a, b, rows, tiles, lists.ids, lists.starts, wanted.ranges, sums, table), shares, 1
+    )
+    return table
+
+
+def set_gradients(fields: Sequence[Tensor], view: View, table: Array) -> list[Tensor | None]:
+    """The gradients of one set's five tensors."""
+    arrays = [as_array(t) for t in fields[:4]]
+    gradients = [np.zeros(tuple(t.shape), np.float32) for t in fields]
+    run_chunks(
+        lambda a, b: project_backward(a, b, *arrays, view.lens, view.pose, view.eps2d, table, *gradients),
+        len(table),
+        PROJECT_GRAIN,
+    )
+    return [torch.from_numpy(g) for g in gradients]
+
+
+def draw_differentiably(sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None) -> Rendering:
+    """Draw with gradients; see `draw`."""
+    under = [None] * 3 if onto is None else [t.float() for t in (onto.rgb, onto.depth, onto.alpha)]
+    fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
+    return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]

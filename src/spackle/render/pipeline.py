@@ -1,0 +1,132 @@
+"""The stages of the CPU renderer, one after the other: project, sort, deal out to tiles, blend."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from spackle.gaussians import Gaussians
+from spackle.render.blend import blend_tiles
+from spackle.render.project import Splats, View, project_chunk
+from spackle.render.sort import sort_by_depth
+from spackle.render.threads import run_chunks
+from spackle.render.tiles import TileLists, list_tiles
+from spackle.rendering import Rendering
+
+Array = npt.NDArray[Any]
+
+PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
+BLEND_GRAIN = 64  # tiles a thread blends at a time
+
+
+@dataclasses.dataclass(frozen=True)
+class Canvas:
+    """The images as arrays, to be drawn into tile by tile."""
+
+    rgb: Array  # [H, W, 3] float32 sRGB
+    depth: Array  # [H, W] float32
+    alpha: Array  # [H, W] float32
+    linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
+
+    @staticmethod
+    def prepare(view: View, onto: Rendering | None, keep_linear: bool) -> Canvas:
+        """Black and empty, or a copy of `onto`."""
+        size = (view.height, view.width)
+        linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
+        if onto is None:
+            rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
+        else:
+            rgb, depth, alpha = (np.array(as_array(t)) for t in (onto.rgb, onto.depth, onto.alpha))
+        return Canvas(rgb, depth, alpha, linear)
+
+    def rendering(self) -> Rendering:
+        """The same memory as tensors."""
+        return Rendering(torch.from_numpy(self.rgb), torch.from_numpy(self.depth), torch.from_numpy(self.alpha))
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A finished drawing, and what its gradient needs to know."""
+
+    view: View
+    wanted: Array  # [rows, columns] bool, the tiles that were drawn
+    splats: Splats
+    lists: TileLists
+    canvas: Canvas
+
+
+def draw(
+    sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
+) -> Drawing:
+    """Draw sets of Gaussians as one, in the wanted tiles, over a copy of `onto`.
+
+    Args:
+        sets: any number of sets.
+        view: the camera.
+        wanted: [rows, columns] bool, see `wanted_tiles`.
+        onto: what the other tiles show; black and empty where None.
+        keep_linear: keep the colour before sRGB, which the gradient needs.
+    """
+    canvas = Canvas.prepare(view, onto, keep_linear)
+    splats, spans = project(sets, view)
+    order = sort_by_depth(splats.keys, splats.ids, spans)
+    lists = list_tiles(order, splats.boxes, wanted)
+    blend(splats, lists, wanted, canvas)
+    return Drawing(view, wanted, splats, lists, canvas)
+
+
+def as_array(tensor: Tensor) -> Array:
+    """A tensor's values as contiguous float32, without a copy where they are that already."""
+    return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
+
+
+def wanted_tiles(view: View, tiles: Tensor | None) -> Array:
+    """The tiles to draw, [rows, columns] bool."""
+    if tiles is None:
+        return np.ones(view.tiles, np.bool_)
+    if tuple(tiles.shape) != view.tiles:
+        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {view.tiles}")
+    return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
+
+
+def project(sets: Sequence[Gaussians], view: View) -> tuple[Splats, Array]:
+    """Project sets one after the other, without joining them first.
+
+    Returns:
+        The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
+    """
+    splats = Splats.allocate(sum(len(part) for part in sets))
+    spans: list[tuple[int, int]] = []
+    first = 0
+    for part in sets:
+        arrays = [as_array(tensor) for tensor in part.tensors]
+
+        def chunk(start: int, stop: int, first: int = first, arrays: list[Array] = arrays) -> None:
+            found = project_chunk(
+                start, stop, first, *arrays, view.lens, view.pose, view.width, view.height, view.eps2d,
+                splats.records, splats.boxes, splats.keys, splats.ids,
+            )  # fmt: skip
+            spans.append((first + start, found))
+
+        run_chunks(chunk, len(part), PROJECT_GRAIN)
+        first += len(part)
+    return splats, np.array(sorted(spans), np.int64).reshape(-1, 2)
+
+
+def blend(splats: Splats, lists: TileLists, wanted: Array, canvas: Canvas) -> None:
+    """Draw the wanted tiles."""
+    tiles = np.flatnonzero(wanted)
+
+    def chunk(start: int, stop: int) -> None:
+        blend_tiles(
+            start, stop, tiles, wanted.shape[1], lists.ids, lists.starts, splats.records,
+            canvas.rgb, canvas.depth, canvas.alpha, canvas.linear,
+        )  # fmt: skip
+
+    run_chunks(chunk, len(tiles), BLEND_GRAIN)

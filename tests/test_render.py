@@ -1,0 +1,410 @@
+"""The CPU renderer against hand-computed cases, and against its plain twin."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.render import TILE, CpuRenderer, get_renderer
+from spackle.render.approx import encode_srgb, exp2
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
+from spackle.rendering import Rendering
+
+CPU, TWIN = CpuRenderer(), ReferenceRenderer()
+CAMERA = Camera.from_focal(100.0, 33, 33)  # an odd size: the axis meets the centre of pixel (16, 16)
+FIELDS = ("rgb", "depth", "alpha")
+
+
+def ball(x=0.0, y=0.0, z=2.0, sigma=0.04, opacity=0.5, color=(0.2, 0.4, 0.8)) -> Gaussians:
+    """A round Gaussian; at z = 2 its sigma of 0.04 covers 2 of CAMERA's pixels."""
+    return Gaussians(
+        torch.tensor([[x, y, z]]),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        torch.full((1, 3), sigma),
+        torch.tensor([opacity]),
+        torch.tensor([color]),
+    )
+
+
+def turned_camera(width: int, height: int, focal: float) -> Camera:
+    """A camera that is neither at the origin nor level, its principal point off the middle."""
+    camera = Camera.from_focal(focal, width, height)
+    camera.K[0, 2] += 2.3
+    camera.K[1, 2] -= 1.1
+    return camera.looking(torch.tensor([0.5, -0.3, -0.8]), torch.tensor([0.2, 0.4, 5.0]))
+
+
+def random_scene(seed: int, n: int, camera: Camera, dtype=torch.float32) -> Gaussians:
+    """Gaussians in and around the view, some behind the camera; no two at nearly the same depth."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    z = 0.6 + 4 * (torch.arange(n) + 0.5 * uniform(n)) / n
+    z = torch.where(uniform(n) < 0.1, -z, z)
+    uv = (uniform(n, 2) * 1.8 - 0.4) * torch.tensor([camera.width, camera.height])
+    pixels = 0.6 * (12 / 0.6) ** uniform(n, 3)  # sigma on the image
+    return Gaussians(
+        camera.unproject(uv, z),
+        torch.randn(n, 4, generator=generator),
+        pixels * z.abs()[:, None] / camera.focal[0],
+        1.02 * uniform(n),
+        uniform(n, 3),
+    ).to(dtype=dtype)
+
+
+def with_grad(gaussians: Gaussians) -> Gaussians:
+    return Gaussians(*(t.clone().requires_grad_() for t in gaussians.tensors))
+
+
+def sturdy_pixels(gaussians: Gaussians, camera: Camera, eps2d: float) -> torch.Tensor:
+    """Pixels [H, W] where no Gaussian is within rounding of a threshold, at which the image may jump."""
+    raw = falloff(front_to_back(gaussians.to(dtype=torch.float64), camera), camera, eps2d)
+
+    def near(values: torch.Tensor, threshold: float, width: float) -> torch.Tensor:
+        return ((values / threshold - 1).abs() < width).any(dim=0)
+
+    alphas = torch.where(raw < ALPHA_MIN, 0, raw.clamp_max(ALPHA_MAX))
+    passed = torch.cumprod(1 - alphas, dim=0)
+    return ~(near(raw, ALPHA_MIN, 1e-4) | near(raw, ALPHA_MAX, 1e-5) | near(passed, TRANSMITTANCE_STOP, 1e-3))
+
+
+def assert_same(one: Rendering, other: Rendering) -> None:
+    """Bit for bit."""
+    for name in FIELDS:
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
+def tile_mask(tiles: torch.Tensor, camera: Camera) -> torch.Tensor:
+    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: camera.height, : camera.width]
+
+
+# Hand-computed cases -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+def test_one_gaussian_has_its_opacity_at_its_centre_and_a_bell_around_it(renderer):
+    view = renderer.render(ball(), CAMERA)
+    for dx, dy in [(0, 0), (2, 0), (0, -3), (1, 4)]:
+        alpha = 0.5 * math.exp(-(dx * dx + dy * dy) / (2 * 2**2))
+        assert float(view.alpha[16 + dy, 16 + dx]) == pytest.approx(alpha, abs=1e-6)
+        assert float(view.depth[16 + dy, 16 + dx]) == pytest.approx(2.0, rel=1e-4)
+        color = linear_to_srgb(alpha * torch.tensor([0.2, 0.4, 0.8]))
+        torch.testing.assert_close(view.rgb[16 + dy, 16 + dx], color, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+@pytest.mark.parametrize("opacity", [0.004, 0.3, 1.0])
+def test_the_footprint_ends_where_the_contribution_is_too_faint(renderer, opacity):
+    view = renderer.render(ball(opacity=opacity), CAMERA)
+    squared = (CAMERA.pixel_centers() - 16.5).square().sum(dim=-1)
+    drawn = opacity * torch.exp(-squared / 8) >= ALPHA_MIN
+    assert torch.equal(view.alpha > 0, drawn)
+    assert torch.equal(view.depth > 0, drawn)
+    assert not view.rgb[~drawn].any()
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+def test_the_nearer_of_two_covers_the_farther_one(renderer):
+    near, far = ball(z=2.0, opacity=0.6, color=(1.0, 0.0, 0.0)), ball(z=4.0, opacity=0.5, color=(0.0, 1.0, 0.0))
+    view = renderer.render([far, near], CAMERA)
+    assert float(view.alpha[16, 16]) == pytest.approx(0.6 + 0.4 * 0.5)
+    assert float(view.depth[16, 16]) == pytest.approx((0.6 * 2 + 0.2 * 4) / 0.8)
+    torch.testing.assert_close(view.rgb[16, 16], linear_to_srgb(torch.tensor([0.6, 0.2, 0.0])), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+def test_the_gaussian_that_would_fill_a_pixel_is_not_drawn(renderer):
+    stack = [ball(z=z, opacity=1.0, color=(0.5, z / 10, 0.0)) for z in (2.0, 3.0, 4.0)]
+    view = renderer.render(stack, CAMERA)
+    assert float(view.alpha[16, 16]) == pytest.approx(ALPHA_MAX, abs=1e-6)
+    assert float(view.depth[16, 16]) == pytest.approx(2.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+@pytest.mark.parametrize("z", [-2.0, 0.0, 0.009])
+def test_nothing_is_drawn_behind_the_near_plane(renderer, z):
+    assert not renderer.render(ball(z=z), CAMERA).alpha.any()
+
+
+@pytest.mark.parametrize("renderer", [CPU, TWIN])
+def test_eps2d_widens_the_projected_covariance(renderer):
+    view = renderer.render(ball(), CAMERA, eps2d=0.3)
+    assert float(view.alpha[16, 18]) == pytest.approx(0.5 * math.exp(-4 / (2 * 4.3)), abs=1e-6)
+
+
+def test_a_gaussian_without_extent_is_drawn_only_when_eps2d_gives_it_one():
+    assert not CPU.render(ball(sigma=0.0), CAMERA).alpha.any()
+    alpha = CPU.render(ball(sigma=0.0), CAMERA, eps2d=0.5).alpha
+    assert float(alpha[16, 16]) == pytest.approx(0.5)
+    assert float(alpha[16, 17]) == pytest.approx(0.5 * math.exp(-1), abs=1e-6)
+
+
+def test_a_flat_gaussian_seen_edge_on_is_a_thin_line():
+    flat = ball()
+    flat = Gaussians(flat.means, flat.quats, torch.tensor([[0.04, 0.002, 0.04]]), flat.opacities, flat.colors)
+    alpha = CPU.render(flat, CAMERA).alpha
+    assert float(alpha[16, 18]) == pytest.approx(0.5 * math.exp(-0.5), abs=1e-5)
+    assert not alpha[15].any()
+    assert not alpha[17].any()
+
+
+# Robustness ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("empty", [Gaussians.empty(), [], [Gaussians.empty(), Gaussians.empty()]])
+def test_no_gaussians_give_a_black_empty_image(empty):
+    for renderer in (CPU, TWIN):
+        view = renderer.render(empty, CAMERA)
+        assert view.rgb.shape == (33, 33, 3)
+        assert not any(getattr(view, name).any() for name in FIELDS)
+
+
+@pytest.mark.parametrize("field", range(5))
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_bad_values_are_skipped_and_spoil_nothing(field, bad):
+    camera = turned_camera(50, 40, 45.0)
+    scene = random_scene(1, 60, camera)
+    spoiled = [t.clone() for t in scene.tensors]
+    spoiled[field][::2] = bad
+    good = CPU.render(scene.select(slice(1, None, 2)), camera)
+    assert_same(CPU.render(Gaussians(*spoiled), camera), good)
+    leaf = with_grad(Gaussians(*spoiled))
+    view = CPU.render(leaf, camera)
+    (view.rgb.sum() + view.depth.sum() + view.alpha.sum()).backward()
+    assert all(t.grad.isfinite().all() for t in leaf.tensors)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-6, 1e3, 1e12])
+def test_extreme_sizes_give_finite_images_and_gradients(size):
+    camera = turned_camera(50, 40, 45.0)
+    scene = random_scene(2, 40, camera)
+    leaf = with_grad(Gaussians(scene.means, scene.quats, scene.scales * size, scene.opacities, scene.colors))
+    view = CPU.render(leaf, camera)
+    (view.rgb.sum() + view.depth.sum() + view.alpha.sum()).backward()
+    assert all(getattr(view, name).isfinite().all() for name in FIELDS)
+    assert all(t.grad.isfinite().all() for t in leaf.tensors)
+
+
+def test_a_tiles_mask_of_the_wrong_shape_is_refused():
+    for renderer in (CPU, TWIN):
+        with pytest.raises(ValueError, match="tiles has shape"):
+            renderer.render(ball(), CAMERA, tiles=torch.ones(2, 2, dtype=torch.bool))
+
+
+def test_get_renderer_knows_its_devices():
+    assert isinstance(get_renderer(), CpuRenderer)
+    assert isinstance(get_renderer("cpu"), CpuRenderer)
+    for device in ("cuda", "abacus"):
+        with pytest.raises(InputError, match=device):
+            get_renderer(device)
+
+
+# Against the twin ----------------------------------------------------------------------------------
+
+scenes = st.tuples(
+    st.integers(0, 2**31), st.integers(1, 80), st.integers(1, 50), st.integers(1, 50), st.floats(20, 90),
+    st.sampled_from([0.0, 0.3]),
+)  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None)
+@given(scenes)
+def test_images_match_the_twin(scene):
+    seed, n, width, height, focal, eps2d = scene
+    camera = turned_camera(width, height, focal)
+    gaussians = random_scene(seed, n, camera)
+    fast = CPU.render(gaussians, camera, eps2d=eps2d)
+    slow = TWIN.render(gaussians.to(dtype=torch.float64), camera, eps2d=eps2d)
+    sturdy = sturdy_pixels(gaussians, camera, eps2d)
+    assert (~sturdy).sum() <= 2 + 0.02 * sturdy.numel()
+    for name in FIELDS:
+        found, expected = getattr(fast, name).double(), getattr(slow, name)
+        torch.testing.assert_close(found[sturdy], expected[sturdy], rtol=1e-4, atol=1e-4, msg=lambda m, n=name: n + m)
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes)
+def test_gradients_match_the_twin(scene):
+    seed, n, width, height, focal, eps2d = scene
+    camera = turned_camera(width, height, focal)
+    gaussians = random_scene(seed, n, camera)
+    sturdy = sturdy_pixels(gaussians, camera, eps2d)
+    weights = torch.randn(height, width, 5, generator=torch.Generator().manual_seed(seed)) * sturdy[..., None]
+    gradients = []
+    for renderer, dtype in ((CPU, torch.float32), (TWIN, torch.float64)):
+        leaf = with_grad(gaussians.to(dtype=dtype))
+        view = renderer.render(leaf, camera, eps2d=eps2d)
+        images = torch.cat([view.rgb, view.depth[..., None], view.alpha[..., None]], dim=-1)
+        gradients.append(torch.autograd.grad((images * weights).sum(), leaf.tensors))
+    for name, found, expected in zip(vars(gaussians), *gradients, strict=True):
+        scale = float(expected.abs().max())
+        torch.testing.assert_close(
+            found.double(), expected, rtol=1e-4, atol=1e-4 * scale + 1e-6, msg=lambda m, n=name: n + m
+        )
+
+
+def test_gradients_survive_long_lists_of_faint_gaussians():
+    camera = turned_camera(20, 18, 30.0)
+    scene = random_scene(5, 600, camera)
+    scene = Gaussians(scene.means, scene.quats, scene.scales, 0.05 * scene.opacities, scene.colors)
+    weights = sturdy_pixels(scene, camera, 0.0).double()
+    found, expected = (
+        torch.autograd.grad((r.render(s, camera).alpha * weights.to(s.means)).sum(), s.tensors[:4])
+        for r, s in ((CPU, with_grad(scene)), (TWIN, with_grad(scene.to(dtype=torch.float64))))
+    )
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-4 * float(other.abs().max()))
+
+
+def test_the_twins_gradients_are_those_of_finite_differences():
+    camera = turned_camera(7, 6, 6.0)
+    scene = random_scene(3, 4, camera, torch.float64)
+    assert sturdy_pixels(scene, camera, 0.1).all()
+
+    def images(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        view = TWIN.render(Gaussians(*tensors), camera, eps2d=0.1)
+        return view.rgb, view.depth, view.alpha
+
+    assert torch.autograd.gradcheck(images, with_grad(scene).tensors, eps=1e-7, atol=1e-5)
+
+
+def test_approximations_hold_over_their_whole_range():
+    powers = np.linspace(-30, 2, 4001, dtype=np.float32)
+    found = np.array([exp2(x) for x in powers])
+    np.testing.assert_allclose(found, np.exp2(powers.astype(np.float64)), rtol=5e-7)
+    values = torch.cat([torch.linspace(-0.1, 1.1, 4001), torch.tensor([0.0, 0.0031308, 0.0031309, 1.0])])
+    encoded = torch.tensor([encode_srgb(x) for x in values.numpy()])
+    torch.testing.assert_close(encoded, linear_to_srgb(values), atol=1e-6, rtol=0)
+
+
+# Promises of the protocol --------------------------------------------------------------------------
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes, st.integers(0, 2**31))
+def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_seed):
+    seed, n, width, height, focal, eps2d = scene
+    camera = turned_camera(width, height, focal)
+    gaussians = random_scene(seed, n, camera)
+    generator = torch.Generator().manual_seed(tile_seed)
+    tiles = torch.rand(-(-height // TILE), -(-width // TILE), generator=generator) < 0.5
+    onto = Rendering(*(torch.rand(height, width, *rest, generator=generator) for rest in ((3,), (), ())))
+    kept = [getattr(onto, name).clone() for name in FIELDS]
+    full, part = (
+        CPU.render(gaussians, camera, eps2d=eps2d),
+        CPU.render(gaussians, camera, eps2d=eps2d, tiles=tiles, onto=onto),
+    )
+    black = CPU.render(gaussians, camera, eps2d=eps2d, tiles=tiles)
+    mask = tile_mask(tiles, camera)
+    for name, before in zip(FIELDS, kept, strict=True):
+        drawn, found = getattr(full, name), getattr(part, name)
+        assert torch.equal(found[mask], drawn[mask])
+        assert torch.equal(found[~mask], before[~mask])
+        assert torch.equal(getattr(onto, name), before)
+        assert not getattr(black, name)[~mask].any()
+
+
+def test_gradients_pass_through_kept_tiles_only():
+    camera = turned_camera(40, 40, 40.0)
+    leaf = with_grad(random_scene(4, 50, camera))
+    tiles = torch.zeros(3, 3, dtype=torch.bool)
+    tiles[1, 1] = True
+    mask = tile_mask(tiles, camera)
+    onto = Rendering(*(torch.rand(40, 40, *rest).requires_grad_() for rest in ((3,), (), ())))
+    part = CPU.render(leaf, camera, tiles=tiles, onto=onto)
+    (part.rgb.sum() + part.depth.sum() + part.alpha.sum()).backward()
+    for name in FIELDS:
+        gradient = getattr(onto, name).grad
+        assert not gradient[mask].any()
+        assert (gradient[~mask] == 1).all()
+    twin = with_grad(leaf.detach())
+    full = CPU.render(twin, camera)
+    (full.rgb[mask].sum() + full.depth[mask].sum() + full.alpha[mask].sum()).backward()
+    for one, other in zip(leaf.tensors, twin.tensors, strict=True):
+        torch.testing.assert_close(one.grad, other.grad)
+
+
+def test_results_repeat_bit_for_bit_whatever_the_number_of_threads():
+    camera = turned_camera(130, 100, 100.0)
+    scene = random_scene(6, 2000, camera)
+    results = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2, 2, 5):
+            torch.set_num_threads(count)
+            leaf = with_grad(scene)
+            view = CPU.render(leaf, camera)
+            (view.rgb.square().sum() + view.depth.sum() + view.alpha.sum()).backward()
+            results.append([view.rgb, view.depth, view.alpha, *(t.grad for t in leaf.tensors)])
+    finally:
+        torch.set_num_threads(threads)
+    for result in results[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(results[0], result, strict=True))
+
+
+def test_joined_and_separate_sets_are_the_same_scene():
+    camera = turned_camera(60, 44, 50.0)
+    scene = random_scene(7, 300, camera)
+    parts = [scene.select(slice(0, 100)), Gaussians.empty(), scene.select(slice(100, None))]
+    assert_same(CPU.render(parts, camera), CPU.render(scene, camera))
+
+
+def test_equal_depths_are_drawn_in_the_order_in_which_they_came():
+    red, green = ball(opacity=0.9, color=(1.0, 0.0, 0.0)), ball(opacity=0.9, color=(0.0, 1.0, 0.0))
+    for renderer in (CPU, TWIN):
+        center = renderer.render([red, green], CAMERA).rgb[16, 16]
+        assert center[0] > center[1]
+
+
+def test_frozen_sets_get_no_gradients_and_send_no_tile_to_the_backward(monkeypatch):
+    from spackle.render import autograd
+
+    camera = turned_camera(100, 80, 80.0)
+    frozen, scene = random_scene(8, 400, camera), random_scene(9, 3, camera)
+    center = camera.unproject(torch.tensor([[40.0, 40.0], [42.0, 40.0], [43.0, 38.0]]), torch.tensor([1.0, 2.0, 1.5]))
+    aux = with_grad(Gaussians(center, scene.quats, 0.01 * center[:, 2:].expand(3, 3), scene.opacities, scene.colors))
+    visited: list[int] = []
+    backward_tiles = autograd.backward_tiles
+
+    def spy(start, stop, tiles, *rest):
+        visited.extend(tiles[start:stop])
+        backward_tiles(start, stop, tiles, *rest)
+
+    monkeypatch.setattr(autograd, "backward_tiles", spy)
+    weights = torch.rand(80, 100)
+    (CPU.render([frozen, aux], camera).alpha * weights).sum().backward()
+    touched = {y // TILE * 7 + x // TILE for y, x in CPU.render(aux.detach(), camera).alpha.nonzero().tolist()}
+    assert touched <= set(visited)
+    assert len(visited) <= 9 < 35
+    assert all(t.grad is None for t in frozen.tensors)
+    both = with_grad(Gaussians.cat([frozen, aux.detach()]))
+    (CPU.render(both, camera).alpha * weights).sum().backward()
+    for one, other in zip(aux.tensors, both.tensors, strict=True):
+        torch.testing.assert_close(one.grad, other.grad[400:])
+
+
+def test_a_single_field_may_ask_for_gradients_alone():
+    camera = turned_camera(40, 30, 40.0)
+    scene = random_scene(10, 50, camera)
+    colors = scene.colors.clone().requires_grad_()
+    view = CPU.render(Gaussians(*scene.tensors[:4], colors), camera)
+    view.rgb.sum().backward()
+    assert colors.grad.abs().sum() > 0
+    with torch.no_grad():
+        assert not CPU.render(Gaussians(*scene.tensors[:4], colors), camera).rgb.requires_grad
+
+
+def test_float64_input_gets_float64_gradients():
+    leaf = with_grad(ball().to(dtype=torch.float64))
+    CPU.render(leaf, CAMERA).alpha.sum().backward()
+    assert leaf.means.grad.dtype == torch.float64
