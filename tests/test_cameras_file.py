@@ -1,0 +1,152 @@
+"""Camera files: round trips and everything that is not a camera."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import load_cameras, save_cameras
+from spackle.gaussians import quat_to_matrix
+
+GOOD: dict[str, Any] = {
+    "width": 640,
+    "height": 480,
+    "frames": [
+        {
+            "K": [[500, 0, 320.0], [0, 510.5, 240], [0, 0, 1]],
+            "world_to_camera": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]],
+        }
+    ],
+}
+
+
+def write(path: Path, content: Any) -> Path:
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_reads_the_documented_format(tmp_path: Path) -> None:
+    content = copy.deepcopy(GOOD)
+    content["frames"].append(content["frames"][0] | {"width": 100, "height": 50})
+    first, second = load_cameras(write(tmp_path / "c.json", content))
+    assert (first.width, first.height, second.width, second.height) == (640, 480, 100, 50)
+    assert first.K.dtype == first.world_to_camera.dtype == torch.float32
+    assert first.K.tolist() == GOOD["frames"][0]["K"]
+    assert first.position.tolist() == [-0.5, 0, 2]
+    del content["width"], content["frames"][0]
+    assert load_cameras(write(tmp_path / "c.json", content))[0].width == 100
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1), min_size=1, max_size=3),
+    st.floats(1, 1e5, width=32),
+    st.tuples(*[st.floats(-1e3, 1e3, width=32)] * 5),
+    st.integers(1, 16_384),
+)
+def test_round_trip(tmp_path_factory: Any, quats: Any, focal: float, numbers: Any, width: int) -> None:
+    cameras = []
+    for k, quat in enumerate(quats):
+        matrix = torch.eye(4)
+        matrix[:3, :3] = quat_to_matrix(torch.tensor(quat, dtype=torch.float64))
+        matrix[:3, 3] = torch.tensor(numbers[:3])
+        K = torch.tensor([[focal, 0, numbers[3]], [0, focal * 2, numbers[4]], [0, 0, 1]])
+        cameras.append(Camera(K, matrix, width, 1 + k))
+    path = tmp_path_factory.getbasetemp() / "cameras.json"
+    save_cameras(cameras, path)
+    found = load_cameras(path)
+    assert len(found) == len(cameras)
+    for a, b in zip(found, cameras, strict=True):
+        assert torch.equal(a.K, b.K)
+        assert torch.equal(a.world_to_camera, b.world_to_camera)
+        assert (a.width, a.height) == (b.width, b.height)
+
+
+def changed(path: list[Any], value: Any) -> dict[str, Any]:
+    content = copy.deepcopy(GOOD)
+    target: Any = content
+    for key in path[:-1]:
+        target = target[key]
+    target[path[-1]] = value
+    return content
+
+
+def k(row: int, column: int, value: Any) -> dict[str, Any]:
+    return changed(["frames", 0, "K", row, column], value)
+
+
+def pose(row: int, column: int, value: Any) -> dict[str, Any]:
+    return changed(["frames", 0, "world_to_camera", row, column], value)
+
+
+BAD: dict[str, tuple[Any, str]] = {
+    "empty": ("", "empty"),
+    "text": ("hello", "not JSON"),
+    "half": (json.dumps(GOOD)[:-40], "not JSON"),
+    "deep": ("[" * 100_000, "not JSON"),
+    "list": ([], "frames"),
+    "no frames": ({"width": 1, "height": 1}, "frames"),
+    "zero frames": (changed(["frames"], []), "frames"),
+    "frames are text": (changed(["frames"], "abc"), "frames"),
+    "many": (changed(["frames"], [0] * 10_001), "too many"),
+    "frame is a number": (changed(["frames"], [3]), "frame 0: must be an object"),
+    "no K": (changed(["frames", 0, "K"], None), "K must be a list"),
+    "short K": (changed(["frames", 0, "K"], [[1, 2, 3]]), "K must be a list"),
+    "flat pose": (changed(["frames", 0, "world_to_camera"], [1.0] * 16), "world_to_camera must be a list"),
+    "ragged": (changed(["frames", 0, "K", 1], [1, 2]), "K must be a list"),
+    "word": (k(0, 2, "320"), "K must be a list"),
+    "bool": (k(0, 2, True), "K must be a list"),
+    "NaN": (k(0, 2, math.nan), "finite"),
+    "inf": (pose(0, 3, math.inf), "finite"),
+    "huge whole number": (k(0, 2, 10**400), "finite|not JSON"),
+    "zero focal": (k(0, 0, 0), "focal"),
+    "negative focal": (k(1, 1, -5), "focal"),
+    "K's last row": (k(2, 2, 2), "last row of K"),
+    "skew": (k(0, 1, 3), "skew"),
+    "scaled": (pose(0, 0, 1.01), "rotation"),
+    "mirror": (pose(0, 0, -1), "rotation"),
+    "zeros": (changed(["frames", 0, "world_to_camera"], [[0] * 4] * 4), "rotation"),
+    "pose's last row": (pose(3, 2, 0.5), "last row of world_to_camera"),
+    "zero width": (changed(["width"], 0), "width"),
+    "giant": (changed(["height"], 16_385), "height"),
+    "fraction": (changed(["width"], 640.5), "width"),
+    "true width": (changed(["width"], True), "width"),
+    "no width": (changed(["width"], None), "width"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_files(tmp_path: Path, kind: str) -> None:
+    content, says = BAD[kind]
+    path = write(tmp_path / "c.json", content)
+    with pytest.raises(InputError, match=says) as caught:
+        load_cameras(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_nearly_rigid_pose_is_taken(tmp_path: Path) -> None:
+    assert len(load_cameras(write(tmp_path / "c.json", pose(0, 0, 1.0003)))) == 1
+
+
+def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such camera file"):
+        load_cameras(tmp_path / "none.json")
+    (tmp_path / "c.json").write_bytes(b"\xff\xfe\x00{")
+    with pytest.raises(InputError, match="not JSON"):
+        load_cameras(tmp_path / "c.json")
+    with pytest.raises(ValueError, match="at least one"):
+        save_cameras([], tmp_path / "d.json")
+    with pytest.raises(InputError, match="cannot write"):
+        save_cameras([Camera.from_focal(5, 4, 4)], tmp_path / "none" / "d.json")
+    assert os.listdir(tmp_path) == ["c.json"]
