@@ -1,0 +1,51 @@
+"""Pictures out: colour, grey, and depth in millimetres, always as PNG."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from spackle.formats.atomic import atomic_path
+
+LARGEST_MM = 65534  # 65535 means "unknown" to some readers
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Values in 0..1 of any shape as uint8 on the CPU, rounded; outside values are clamped, NaN is 0."""
+    scaled = image.detach().float().mul(255)  # a copy: what follows is in place
+    return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
+
+
+def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:
+    """Write sRGB [H, W, 3] in 0..1 with 8 bits a channel; InputError where that cannot be."""
+    if rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"a colour picture is [H, W, 3], got {tuple(rgb.shape)}")
+    _save(Image.fromarray(to_bytes(rgb).numpy()), path)
+
+
+def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
+    """Write [H, W] in 0..1, a mask for example, with 8 bits; InputError where that cannot be."""
+    if gray.ndim != 2:
+        raise ValueError(f"a grey picture is [H, W], got {tuple(gray.shape)}")
+    _save(Image.fromarray(to_bytes(gray).numpy()), path)
+
+
+def save_depth_png(depth: Tensor, path: str | os.PathLike[str]) -> None:
+    """Write depth [H, W] in metres as 16-bit millimetres; InputError where that cannot be.
+
+    0 stands for unknown: depth that is not finite, not positive, or beyond 65.534 m.
+    """
+    if depth.ndim != 2:
+        raise ValueError(f"a depth map is [H, W], got {tuple(depth.shape)}")
+    millimetres = (depth.detach().cpu().double() * 1000).round()
+    known = torch.isfinite(millimetres) & (millimetres >= 0) & (millimetres <= LARGEST_MM)
+    _save(Image.fromarray(millimetres.where(known, 0).numpy().astype(np.uint16)), path)
+
+
+def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:
+    with atomic_path(path) as temporary:
+        image.save(temporary, format="PNG")

@@ -1,0 +1,134 @@
+"""Videos and pictures, read back by an independent decoder."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+from spackle.bases.depth_maps import load_depth
+from spackle.errors import InputError
+from spackle.formats import VideoWriter, save_depth_png, save_gray_png, save_png, save_video
+
+
+def frames(count: int, height: int, width: int) -> list[Tensor]:
+    """A smooth picture that moves."""
+    y, x = torch.meshgrid(torch.linspace(0, 1, height), torch.linspace(0, 1, width), indexing="ij")
+    return [torch.stack([x * (20 - k) / 20, y, 0.5 + 0.3 * torch.sin(x + y + k / 5)], dim=-1) for k in range(count)]
+
+
+def psnr(a: Tensor, b: Tensor) -> float:
+    return float(-10 * torch.log10((a - b).square().mean()))
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
+def test_video_decodes_to_what_went_in(tmp_path: Path, height: int, width: int) -> None:
+    given = frames(12, height, width)
+    path = tmp_path / "a.mp4"
+    save_video(iter(given), path, fps=25)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.average_rate == 25
+        decoded = list(container.decode(stream))
+    assert len(decoded) == 12
+    for sent, got in zip(given, decoded, strict=True):
+        assert (got.height, got.width) == (height + height % 2, width + width % 2)
+        assert got.format.name == "yuv420p"
+        assert (got.colorspace, got.color_primaries, got.color_trc, got.color_range) == (1, 1, 1, 1)
+        rgb = torch.from_numpy(got.to_ndarray(format="rgb24")).float() / 255
+        assert psnr(rgb[:height, :width], sent) > 35
+    assert os.listdir(tmp_path) == ["a.mp4"]
+
+
+@pytest.mark.parametrize("color", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.2, 0.6, 0.4)])
+def test_colours_are_bt709(tmp_path: Path, color: tuple[float, float, float]) -> None:
+    save_video([torch.tensor(color).expand(32, 32, 3)], tmp_path / "a.mp4")
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        planes = next(container.decode(video=0)).to_ndarray()
+    luma = 0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]
+    expected = [16 + 219 * luma, 128 + 224 * (color[2] - luma) / 1.8556, 128 + 224 * (color[0] - luma) / 1.5748]
+    assert [planes[5, 5], planes[34, 5], planes[42, 5]] == pytest.approx(expected, abs=2)
+
+
+def test_index_comes_first_and_odd_rates_last(tmp_path: Path) -> None:
+    save_video(frames(3, 16, 16), tmp_path / "a.mp4", fps=30000 / 1001)
+    content = (tmp_path / "a.mp4").read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == Fraction(30000, 1001)
+
+
+def test_strange_values_are_clamped(tmp_path: Path) -> None:
+    frame = torch.full((16, 16, 3), 7.0, dtype=torch.float64, requires_grad=True)
+    with VideoWriter(tmp_path / "a.mov") as writer:
+        writer.add(frame)
+        writer.add(torch.full((16, 16, 3), math.nan))
+    with av.open(str(tmp_path / "a.mov")) as container:
+        means = [f.to_ndarray(format="rgb24").mean() for f in container.decode(video=0)]
+    assert means == pytest.approx([255, 0], abs=2)
+
+
+def failing() -> Iterator[Tensor]:
+    yield from frames(3, 16, 16)
+    raise RuntimeError("the renderer broke")
+
+
+def test_a_failed_video_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="renderer"):
+        save_video(failing(), path)
+    with pytest.raises(ValueError, match="at least one frame"):
+        save_video([], path)
+    with pytest.raises(ValueError, match="frame 1 is"):
+        save_video([*frames(1, 16, 16), *frames(1, 16, 18)], path)
+    with pytest.raises(ValueError, match="a video frame is"):
+        save_video([torch.zeros(3, 16, 16)], path)
+    assert os.listdir(tmp_path) == ["a.mp4"]
+    assert path.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize(("name", "fps"), [("a.avi", 30), ("a", 30), ("none/a.mp4", 30), ("a.mp4", 0)])
+def test_bad_requests_fail_before_any_frame(tmp_path: Path, name: str, fps: float) -> None:
+    with pytest.raises(InputError):
+        VideoWriter(tmp_path / name, fps)
+    for rate in (-1.0, math.nan, math.inf, 1e9):
+        with pytest.raises(InputError, match="frames a second"):
+            VideoWriter(tmp_path / "a.mp4", rate)
+    assert not os.listdir(tmp_path)
+
+
+def test_colour_and_grey_png(tmp_path: Path) -> None:
+    rgb = frames(1, 9, 7)[0]
+    save_png(rgb, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as image:
+        assert (image.mode, image.size) == ("RGB", (7, 9))
+        assert np.array_equal(np.array(image), np.round(rgb.numpy() * 255).astype(np.uint8))
+    save_gray_png(torch.tensor([[0.0, 0.5], [2.0, math.nan]]), tmp_path / "g.png")
+    with Image.open(tmp_path / "g.png") as image:
+        assert np.array(image).tolist() == [[0, 128], [255, 0]]
+    for save, shape in ((save_png, (4, 4)), (save_gray_png, (4, 4, 3)), (save_depth_png, (1, 4, 4))):
+        with pytest.raises(ValueError, match="got"):
+            save(torch.zeros(shape), tmp_path / "bad.png")
+    with pytest.raises(InputError, match="cannot write"):
+        save_png(rgb, tmp_path)
+    assert sorted(os.listdir(tmp_path)) == ["a.png", "g.png"]
+
+
+def test_depth_png_reads_back(tmp_path: Path) -> None:
+    depth = torch.tensor([[0.001, 1.2344, 65.534], [math.inf, math.nan, 70.0], [0.0, -2.0, 3.0]])
+    save_depth_png(depth, tmp_path / "d.png")
+    found = load_depth(tmp_path / "d.png")
+    expected = torch.tensor([[0.001, 1.234, 65.534], [0.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
+    torch.testing.assert_close(found.depth, expected)
+    assert torch.equal(found.valid, expected > 0)
