@@ -1,1 +1,18 @@
+"""The paper's contribution: a few more Gaussians where the base shows holes, and nowhere else."""
 
+from spackle.residual.complete import Completer
+from spackle.residual.cues import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, hole_mask
+from spackle.residual.network import ResidualNet
+from spackle.residual.seeds import Seeds, make_seeds
+
+__all__ = [
+    "CELL",
+    "MASK_THRESHOLD",
+    "Completer",
+    "Cues",
+    "ResidualNet",
+    "Seeds",
+    "hole_area_ratio",
+    "hole_mask",
+    "make_seeds",
+]

@@ -1,0 +1,116 @@
+"""A photo and its depth map, lifted: one surface-aligned Gaussian for each pixel, and a coarse backing."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from spackle.bases.cleanup import attach_flying_pixels, undo_quantisation
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.fill import far_fill
+from spackle.gaussians import Gaussians
+from spackle.image import Photo
+from spackle.surface import surface_gaussians, surface_slope
+
+OPACITY = 0.999
+# Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
+# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels, closes it from behind:
+# 2 dB sharper at the photo's camera than one layer of wider blobs.
+FRONT_SPREAD_PX = 0.5
+BACKING_SPREAD_PX = 1.1
+BACKING_GAP = 0.005  # the backing's distance behind the front, relative
+BACKING_SLOPE_GAP = 4.0  # and this many pixels further along a slanted surface, so that none pokes through
+MAX_BACKING_GAP = 0.2
+
+
+class RgbdBase:
+    """Lifts a photo by a depth map that came with it."""
+
+    name = "rgbd"
+
+    def __init__(self, depth: DepthMap) -> None:
+        self.depth = depth
+
+    def predict(self, photo: Photo) -> BasePrediction:
+        """Gaussians of the photo's pixels; missing depth is filled and its share reported.
+
+        Raises:
+            InputError: where photo and depth map differ in aspect ratio.
+        """
+        self.depth.check_shape(photo.camera.height, photo.camera.width, photo.path)
+        return lift(photo.rgb, self.depth, photo.camera)
+
+
+def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
+    """A photo and its depth to Gaussians, first one for each pixel in row-major order, then the backing.
+
+    Args:
+        rgb: [H, W, 3] sRGB in 0..1.
+        depth: any size of the same aspect ratio.
+        camera: the photo's camera, at the world's origin.
+    """
+    inverse_depth, valid = _inverse_depth(depth, camera.height, camera.width)
+    missing = 1.0 - float(valid.float().mean())
+    inverse_depth, _ = far_fill(inverse_depth, rgb.permute(2, 0, 1), valid)
+    inverse_depth = attach_flying_pixels(inverse_depth)
+    slope = surface_slope(inverse_depth)
+    colors = srgb_to_linear(rgb)
+    gaussians = Gaussians.cat(
+        [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
+    )
+    return BasePrediction(gaussians, {"depth_filled": round(missing, 4)})
+
+
+def _inverse_depth(depth: DepthMap, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Inverse depth and its validity on the photo's grid, [H, W]; nearest, so that edges stay edges."""
+    inverse = torch.where(depth.valid, 1.0 / depth.depth, torch.zeros_like(depth.depth))
+    if depth.quantity == "disparity" and depth.quantum is not None:
+        inverse = undo_quantisation(inverse, depth.valid, depth.quantum)
+    if inverse.shape == (height, width):
+        return inverse, depth.valid
+    stacked = torch.stack([inverse, depth.valid.float()])[None]
+    resized = interpolate(stacked, size=(height, width), mode="nearest-exact")[0]
+    return resized[0], resized[1] > 0.5
+
+
+def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
+    """One small Gaussian for each pixel."""
+    uv = camera.pixel_centers().reshape(-1, 2)
+    opacities = torch.full((len(uv),), OPACITY)
+    flat = inverse_depth.reshape(-1)
+    return surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
+
+
+def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
+    """One wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface."""
+    cells = _cells(inverse_depth)
+    far, pick = cells.min(dim=-1)
+    slope = _cells(slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
+    # The cell's centre lies half a pixel from the farthest pixel's.
+    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
+    at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
+    gap = BACKING_GAP + BACKING_SLOPE_GAP * slope.abs().sum(-1) / at_center
+    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
+    # Its colour is the mean of the pixels on that surface.
+    same = (cells - far[..., None] < 0.02 * far[..., None]).to(colors)
+    mean = (_cells(colors) * same[..., None]).sum(2) / same.sum(2)[..., None]
+    return surface_gaussians(
+        camera,
+        camera.pixel_centers(stride=2).reshape(-1, 2),
+        (at_center * recede).reshape(-1),
+        (slope * recede[..., None]).reshape(-1, 2),
+        BACKING_SPREAD_PX,
+        mean.reshape(-1, 3),
+        torch.full((far.numel(),), OPACITY),
+    )
+
+
+def _cells(image: Tensor) -> Tensor:
+    """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order."""
+    height, width = (n // 2 for n in image.shape[:2])
+    grid = image[: 2 * height, : 2 * width].unflatten(0, (height, 2)).unflatten(2, (width, 2))
+    return grid.transpose(1, 2).flatten(2, 3)

@@ -1,0 +1,127 @@
+"""Completing views: one at a time, as the paper does (section 3.4), or a whole scene at once."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer
+from spackle.rendering import Rendering
+from spackle.residual.carve import Shield, push_behind
+from spackle.residual.compose import compose
+from spackle.residual.cues import MASK_THRESHOLD, Cues, hole_area_ratio
+from spackle.residual.network import ResidualNet, network_input
+from spackle.residual.seeds import Seeds, make_seeds
+
+PASSES = 2  # a second look closes what the first one's blobs left thin
+QUIET_HAR = 5e-4  # a view with fewer holes than this needs no completion
+QUIET_VIEWS = 2  # so many in a row, taken from all over a path, end the search for holes
+
+
+@dataclasses.dataclass(frozen=True)
+class Completer:
+    """Everything that completion needs besides the view.
+
+    Base Gaussians are only ever read: what is returned comes on top of them.
+    """
+
+    base: Gaussians
+    photo_camera: Camera
+    renderer: Renderer
+    network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
+    threshold: float = MASK_THRESHOLD
+
+    def photo_shield(self) -> Shield:
+        """What the photo itself shows: no completion may stand in front of that."""
+        return self._shield(self.photo_camera, self.renderer.render(self.base, self.photo_camera))
+
+    @torch.no_grad()
+    def complete_view(self, camera: Camera, shields: Sequence[Shield] = (), aux: Gaussians | None = None) -> Gaussians:
+        """New aux Gaussians for one view, 𝒢̃_aug of eq. 6: one for each masked cell that needs one.
+
+        Args:
+            camera: the view to complete.
+            shields: views whose content must stay in front, the photo's for instance.
+            aux: aux Gaussians that are there already.
+        """
+        found = [] if aux is None else [aux]
+        already = len(found)
+        for _ in range(PASSES):
+            rendering = self.renderer.render([self.base, *found], camera)
+            new = self._propose(rendering, camera)
+            if not len(new):
+                break
+            found.append(push_behind(new, camera.position, list(shields)))
+        return Gaussians.cat([Gaussians.empty(), *found[already:]])
+
+    @torch.no_grad()
+    def complete_scene(
+        self, cameras: Sequence[Camera], visit_all: bool = False, progress: Callable[[int, int], None] | None = None
+    ) -> Gaussians:
+        """One set of aux Gaussians for a whole path, the same from every frame.
+
+        Keyframes are visited from the widest inwards, spread over the path. Each sees what the earlier
+        ones added, and may add only behind what the photo and the other keyframes show.
+
+        Args:
+            cameras: the path.
+            visit_all: complete every camera; else stop when nothing new is found all over the path.
+            progress: called with (views visited, views at most).
+        """
+        order = farthest_first(cameras, self.photo_camera)
+        shields = {-1: self.photo_shield()}
+        aux = Gaussians.empty()
+        quiet = 0
+        for count, index in enumerate(order):
+            camera = cameras[index]
+            before = self.renderer.render([self.base, aux], camera)
+            if hole_area_ratio(before.alpha, self.threshold) < QUIET_HAR:
+                quiet += 1
+            else:
+                quiet = 0
+                aux = Gaussians.cat([aux, self.complete_view(camera, list(shields.values()), aux)])
+                shields[index] = self._shield(camera, self.renderer.render([self.base, aux], camera))
+            if progress:
+                progress(count + 1, len(order))
+            if quiet >= QUIET_VIEWS and not visit_all:
+                break
+        return aux
+
+    def _shield(self, camera: Camera, rendering: Rendering) -> Shield:
+        return Shield.of(rendering, camera, self.threshold)
+
+    def _propose(self, rendering: Rendering, camera: Camera) -> Gaussians:
+        """One Gaussian for each masked cell of a rendering."""
+        cues = Cues.of(rendering, self.threshold)
+        if not bool(cues.mask.any()):
+            return Gaussians.empty()
+        seeds = make_seeds(cues, camera, self.photo_camera)
+        return compose(seeds.select(cues.mask), self._deltas(cues, seeds), camera)
+
+    def _deltas(self, cues: Cues, seeds: Seeds) -> Tensor | None:
+        """[n, 14] for the masked cells, or None without a network."""
+        if self.network is None:
+            return None
+        field: Tensor = self.network(network_input(cues, seeds))
+        return field[0].permute(1, 2, 0)[cues.mask]
+
+
+def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
+    """An order that visits the widest view first and then always the one farthest from all visited.
+
+    Any beginning of it is spread evenly over the path.
+    """
+    eyes = torch.stack([camera.position.double() for camera in cameras])
+    distance = (eyes - photo_camera.position.double()).norm(dim=-1)
+    order: list[int] = []
+    for _ in cameras:
+        pick = int(distance.argmax())
+        order.append(pick)
+        distance = torch.minimum(distance, (eyes - eyes[pick]).norm(dim=-1))
+        distance[pick] = -1.0
+    return order

@@ -1,0 +1,107 @@
+"""Gaussians that lie in a surface given as an image of inverse depth."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians, quat_from_matrix
+
+EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
+CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts
+THICKNESS = 0.05  # third axis, in units of the smaller of the other two
+
+
+def surface_gaussians(
+    camera: Camera,
+    uv: Tensor,
+    inverse_depth: Tensor,
+    slope: Tensor,
+    spread: Tensor | float,
+    colors: Tensor,
+    opacities: Tensor,
+) -> Gaussians:
+    """One Gaussian for each sample of a surface, aligned with it.
+
+    Seen from `camera` each is a round blob of `spread` pixels; from elsewhere it foreshortens as the
+    surface does, so that a plane stays closed from every side.
+
+    Args:
+        camera: the view in which the samples are given.
+        uv: [N, 2] pixel positions.
+        inverse_depth: [N] 1/z.
+        slope: [N, 2] derivative of the inverse depth by pixel x and y.
+        spread: [N] or one number, standard deviation in pixels of `camera`.
+        colors: [N, 3] linear RGB.
+        opacities: [N].
+    """
+    fx, fy = camera.focal
+    z = 1.0 / inverse_depth
+    ray = torch.cat([(uv - camera.K[:2, 2].to(uv)) / uv.new_tensor([fx, fy]), torch.ones_like(uv[:, :1])], dim=-1)
+    # P = z·ray, so dP/du = z·d(ray)/du + dz/du·ray with dz/du = −z²·d(1/z)/du.
+    dz = -(z**2)[:, None] * slope
+    across = dz[:, :1] * ray + z[:, None] * uv.new_tensor([1 / fx, 0, 0])
+    down = dz[:, 1:] * ray + z[:, None] * uv.new_tensor([0, 1 / fy, 0])
+    rotation, lengths = _principal_axes(across, down)
+    spread = torch.as_tensor(spread, dtype=uv.dtype, device=uv.device).reshape(-1, 1)
+    scales = lengths * spread
+    scales = torch.cat([scales, THICKNESS * scales.amin(dim=-1, keepdim=True)], dim=-1)
+    local_to_world = camera.world_to_camera.to(uv)[:3, :3].T
+    means = camera.unproject(uv, z)
+    return Gaussians(means, quat_from_matrix(local_to_world @ rotation), scales, opacities, colors)
+
+
+def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Orthonormal frames [N, 3, 3] (columns: two in-plane axes, normal) and in-plane lengths [N, 2].
+
+    The ellipse a·cos t + b·sin t has its axes at the angle where p = a·cos θ + b·sin θ and
+    q = b·cos θ − a·sin θ are orthogonal; a aᵀ + b bᵀ = p pᵀ + q qᵀ for every θ.
+    """
+    theta = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
+    p = a * theta.cos() + b * theta.sin()
+    q = b * theta.cos() - a * theta.sin()
+    lengths = torch.stack([p.norm(dim=-1), q.norm(dim=-1)], dim=-1).clamp_min(1e-12)
+    p, q = p / lengths[:, :1], q / lengths[:, 1:]
+    return torch.stack([p, q, torch.linalg.cross(p, q)], dim=-1), lengths
+
+
+def surface_slope(inverse_depth: Tensor, crease: float = CREASE, edge: float = EDGE) -> Tensor:
+    """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
+
+    The inverse depth of a plane is linear in the pixel, so both one-sided differences agree on a plane
+    however slanted. Where they do not, the flatter side is the surface and the other one an edge; where
+    even the flatter one is a jump, the pixel faces the camera.
+    """
+    slopes = []
+    for axis in (1, 0):
+        before, after = neighbours(inverse_depth, axis)
+        backward, forward = inverse_depth - before, after - inverse_depth
+        flatter = torch.where(backward.abs() < forward.abs(), backward, forward)
+        smooth = (forward - backward).abs() <= crease * inverse_depth
+        slope = torch.where(smooth, (forward + backward) / 2, flatter)
+        slopes.append(torch.where(slope.abs() <= edge * inverse_depth, slope, torch.zeros_like(slope)))
+    return torch.stack(slopes, dim=-1)
+
+
+def neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """The previous and the next pixel along an axis of [H, W]; borders repeat mirrored slopes.
+
+    At a border the missing neighbour of a number image is extrapolated linearly, so that the slope there
+    is the one-sided one; a boolean image has no neighbour there.
+    """
+    size = image.shape[axis]
+    if image.dtype == torch.bool:
+        margins = (1, 1, 0, 0) if axis == 1 else (0, 0, 1, 1)
+        wide = pad(image, margins, value=0.0)
+        return wide.narrow(axis, 0, size), wide.narrow(axis, 2, size)
+    if size == 1:
+        return image, image
+    first, last = image.narrow(axis, 0, 1), image.narrow(axis, size - 1, 1)
+    start = 2 * first - image.narrow(axis, 1, 1)
+    end = 2 * last - image.narrow(axis, size - 2, 1)
+    return (
+        torch.cat([start, image.narrow(axis, 0, size - 1)], dim=axis),
+        torch.cat([image.narrow(axis, 1, size - 1), end], dim=axis),
+    )
