@@ -32,8 +32,8 @@ class DepthRange:
     @staticmethod
     def of(gaussians: Gaussians) -> DepthRange:
         """Measure the depths of Gaussians in front of the photo's camera, which is the world's."""
-        z = gaussians.means[:, 2].detach().double().cpu()
-        z = z[z > 0].numpy()
+        z = gaussians.means[:, 2].detach().double().cpu().numpy()
+        z = z[z > 0]
         if z.size == 0:
             raise ValueError("no Gaussian stands in front of the camera")
         near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])  # torch's stops at 16 M values

@@ -29,6 +29,29 @@ def attach_flying_pixels(inverse_depth: Tensor, edge: float = EDGE) -> Tensor:
     return inverse_depth
 
 
+def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) -> Tensor:
+    """Give a background pixel that a depth edge touches to the foreground, where its colour says so.
+
+    A lens blurs a silhouette over a pixel or two, so the first background pixel often has the
+    foreground's colour. Left where it is, it draws a ghost outline as soon as the camera moves.
+
+    Args:
+        inverse_depth: [H, W], positive everywhere.
+        rgb: [H, W, 3] sRGB.
+        edge: relative jump that makes a depth edge.
+    """
+    result = inverse_depth
+    for axis in (1, 0):
+        depths = neighbours(inverse_depth, axis)
+        colors = [torch.stack(c, dim=-1) for c in zip(*(neighbours(c, axis) for c in rgb.unbind(-1)), strict=True)]
+        for near, far in ((0, 1), (1, 0)):
+            silhouette = depths[near] - inverse_depth > edge * inverse_depth
+            silhouette &= (depths[far] - inverse_depth).abs() < edge * inverse_depth
+            to_near, to_far = ((rgb - colors[side]).abs().sum(-1) for side in (near, far))
+            result = torch.where(silhouette & (to_near < to_far), torch.maximum(result, depths[near]), result)
+    return result
+
+
 def undo_quantisation(inverse_depth: Tensor, valid: Tensor, quantum: float, sweeps: int = SWEEPS) -> Tensor:
     """The smoothest surface that would round to the stored steps.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Protocol
 
+from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 
@@ -14,6 +15,7 @@ class BasePrediction:
     """What the photo shows, as Gaussians in the frame of the photo's camera."""
 
     gaussians: Gaussians
+    camera: Camera  # the photo's, where the base knows the lens better than the photo's file does
     notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
 
 

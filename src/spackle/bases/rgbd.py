@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.cleanup import attach_flying_pixels, undo_quantisation
+from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, undo_quantisation
 from spackle.bases.depth_maps import DepthMap
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
@@ -41,8 +41,15 @@ class RgbdBase:
         Raises:
             InputError: where photo and depth map differ in aspect ratio.
         """
-        self.depth.check_shape(photo.camera.height, photo.camera.width, photo.path)
-        return lift(photo.rgb, self.depth, photo.camera)
+        self.depth.check_shape(photo.height, photo.width, photo.path)
+        return lift(photo.rgb, self.depth, self._camera(photo))
+
+    def _camera(self, photo: Photo) -> Camera:
+        """The calibration's lens where there is one, on the photo's pixels; else the photo's."""
+        if self.depth.K is None:
+            return photo.camera
+        height, width = self.depth.depth.shape
+        return Camera(self.depth.K, torch.eye(4), width, height).resized(photo.width, photo.height)
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
@@ -56,13 +63,13 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     inverse_depth, valid = _inverse_depth(depth, camera.height, camera.width)
     missing = 1.0 - float(valid.float().mean())
     inverse_depth, _ = far_fill(inverse_depth, rgb.permute(2, 0, 1), valid)
-    inverse_depth = attach_flying_pixels(inverse_depth)
+    inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
     colors = srgb_to_linear(rgb)
     gaussians = Gaussians.cat(
         [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
     )
-    return BasePrediction(gaussians, {"depth_filled": round(missing, 4)})
+    return BasePrediction(gaussians, camera, {"depth_filled": round(missing, 4)})
 
 
 def _inverse_depth(depth: DepthMap, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -112,5 +119,5 @@ def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camer
 def _cells(image: Tensor) -> Tensor:
     """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order."""
     height, width = (n // 2 for n in image.shape[:2])
-    grid = image[: 2 * height, : 2 * width].unflatten(0, (height, 2)).unflatten(2, (width, 2))
+    grid = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *image.shape[2:])
     return grid.transpose(1, 2).flatten(2, 3)

@@ -68,5 +68,6 @@ def _cells(image: Tensor) -> Tensor:
     height, width = image.shape[-2:]
     flat = image.reshape(1, -1, height, width)
     even = pad(flat, (0, width % CELL, 0, height % CELL), mode="replicate")
-    cells = even.unflatten(-2, (-1, CELL)).unflatten(-1, (-1, CELL)).transpose(-3, -2).flatten(-2)
-    return cells.reshape(*image.shape[:-2], *cells.shape[-3:])
+    rows, columns = even.shape[-2] // CELL, even.shape[-1] // CELL
+    grid = even.reshape(*image.shape[:-2], rows, CELL, columns, CELL)
+    return grid.transpose(-3, -2).flatten(-2)
