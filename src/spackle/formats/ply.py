@@ -35,19 +35,42 @@ _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
 
 
+# Comments of the header, which other readers pass over: the photo's camera, and how many Gaussians are the base's.
+CAMERA_COMMENT = "spackle_camera"  # fx fy cx cy width height
+BASE_COMMENT = "spackle_base"
+
+
 @torch.no_grad()
-def save_ply(gaussians: Gaussians, path: str | os.PathLike[str]) -> None:
+def save_ply(
+    gaussians: Gaussians,
+    path: str | os.PathLike[str],
+    *,
+    camera: Camera | None = None,
+    base_count: int | None = None,
+) -> None:
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
     One `vertex` element of float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as
     logit, scales as logarithm, rot as unit quaternion wxyz. Row i depends on Gaussian i alone.
+
+    Args:
+        gaussians: the scene.
+        path: the file.
+        camera: the photo's camera, at the world's origin; kept in a comment for `load_ply_camera`.
+        base_count: how many of the first Gaussians are the base's; kept in a comment likewise.
 
     Raises:
         InputError: where nothing can be written at `path`.
         ValueError: where a Gaussian is not finite.
     """
     count = len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if camera is not None:
+        numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
+        lines.append(" ".join(["comment", CAMERA_COMMENT, *(repr(number) for number in numbers)]))
+    if base_count is not None:
+        lines.append(f"comment {BASE_COMMENT} {base_count}")
+    lines.append(f"element vertex {count}")
     lines += [*(f"property float {name}" for name in _WRITTEN), "end_header", ""]
     columns = [t.detach().to("cpu", torch.float32).contiguous() for t in gaussians.tensors]
     table = np.zeros((BLOCK, len(_WRITTEN)), "<f4")
@@ -89,7 +112,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
-    """The photo's camera that SHARP stores after the Gaussians; None in other files.
+    """The photo's camera that SHARP stores after the Gaussians, or we in a comment; None in other files.
 
     Raises:
         InputError: a broken file, or a camera that makes no sense.
@@ -99,6 +122,8 @@ def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
         header = read_header(file, path)
         header.check_size(size)
         extras = read_extras(file, header)
+    if CAMERA_COMMENT in header.comments:
+        return _commented_camera(header)
     if "intrinsic" not in extras:
         return None
     intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", np.eye(4).ravel())
@@ -118,6 +143,16 @@ def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
     width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
     where = f"{path}: the stored camera"
     return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
+
+
+def _commented_camera(header: Header) -> Camera:
+    where = f"{header.path}: the stored camera"
+    try:
+        fx, fy, cx, cy, width, height = (float(word) for word in header.comments[CAMERA_COMMENT])
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return checked_camera(K, torch.eye(4), int(width), int(height), where)
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{where} makes no sense: {error}") from error
 
 
 def _padded(part: Tensor) -> Tensor:

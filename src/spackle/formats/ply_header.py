@@ -42,6 +42,7 @@ class Header:
     elements: list[Element]
     data_start: int  # bytes
     path: str | os.PathLike[str]
+    comments: dict[str, list[str]] = dataclasses.field(default_factory=dict)  # first word → the others
 
     def readable(self) -> list[tuple[Element, int]]:
         """Elements up to the first one without a fixed size, each with its offset from `data_start`.
@@ -90,7 +91,8 @@ def read_header(file: IO[bytes], path: str | os.PathLike[str]) -> Header:
         order, elements = _parse(lines[1:-1])
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"{path}: broken PLY header: {' '.join(str(error).split())[:200]}") from error
-    return Header(order == "=", elements, start, path)
+    comments = {words[1]: words[2:] for words in lines if words[:1] == ["comment"] and len(words) > 1}
+    return Header(order == "=", elements, start, path, comments)
 
 
 def _parse(lines: list[list[str]]) -> tuple[str, list[Element]]:

@@ -1,6 +1,6 @@
 """The paper's contribution: a few more Gaussians where the base shows holes, and nowhere else."""
 
-from spackle.residual.complete import Completer
+from spackle.residual.complete import Completer, farthest_first
 from spackle.residual.cues import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, hole_mask
 from spackle.residual.network import ResidualNet
 from spackle.residual.seeds import Seeds, make_seeds
@@ -12,6 +12,7 @@ __all__ = [
     "Cues",
     "ResidualNet",
     "Seeds",
+    "farthest_first",
     "hole_area_ratio",
     "hole_mask",
     "make_seeds",

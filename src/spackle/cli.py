@@ -1,0 +1,172 @@
+"""The command line: one thin function a command."""
+
+from __future__ import annotations
+
+import sys
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.errors import InputError
+
+app = typer.Typer(
+    name="spackle",
+    help="One photo in, a 3D Gaussian scene out that survives a large camera move.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class Trajectory(str, Enum):
+    """Camera paths, as the command line spells them."""
+
+    swipe = "swipe"
+    shake = "shake"
+    rotate = "rotate"
+    rotate_forward = "rotate-forward"
+
+
+class ModeChoice(str, Enum):
+    """One scene for all views, or the paper's Gaussians for each view."""
+
+    scene = "scene"
+    view = "view"
+
+
+class Device(str, Enum):
+    """Where to render."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+TrajectoryOption = Annotated[Trajectory, typer.Option(help="Camera path of the video.")]
+DisparityOption = Annotated[float, typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.")]
+CamerasOption = Annotated[
+    Path | None, typer.Option(metavar="FILE.json", help="Exactly these views in place of a path.")
+]
+FramesOption = Annotated[int, typer.Option(help="Frames of the path.")]
+DeviceOption = Annotated[Device, typer.Option(help="Where to compute.")]
+VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each stage takes.")]
+
+
+@app.command()
+def predict(
+    photo: Annotated[Path, typer.Option("-i", "--input", metavar="PHOTO_OR_FOLDER", help="A photo, or a folder.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")],
+    base: Annotated[str, typer.Option(help="What turns the photo into Gaussians: rgbd.")] = "rgbd",
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH_OR_FOLDER",
+            help="Depth: .npy, .npz, .pfm (metres), 16-bit .png (mm), or Middlebury disparity.",
+        ),
+    ] = None,
+    calib: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
+    ] = None,
+    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    residual: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATH|seeds|none",
+            help="Weights of the residual. seeds: without any; none: the base alone. Default: shipped weights, else seeds.",
+        ),
+    ] = None,
+    render: Annotated[bool, typer.Option(help="Write a video.")] = True,
+    trajectory: TrajectoryOption = Trajectory.rotate_forward,
+    disparity: DisparityOption = 0.3,
+    cameras: CamerasOption = None,
+    frames: FramesOption = 60,
+    mode: Annotated[
+        ModeChoice, typer.Option(help="scene: one set of Gaussians for all views; view: one for each (the paper's).")
+    ] = ModeChoice.scene,
+    device: DeviceOption = Device.auto,
+    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the photo.")] = None,
+    focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
+    verbose: VerboseOption = False,
+) -> None:
+    """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each."""
+    from spackle.jobs.predict import predict_all
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.setup import PredictOptions
+
+    options = PredictOptions(
+        base=base,
+        depth=depth,
+        calib=calib,
+        checkpoint=checkpoint,
+        residual=residual,
+        render=render,
+        trajectory=trajectory.name,  # type: ignore[arg-type]  # the members are named as the paths are
+        disparity=disparity,
+        cameras=cameras,
+        frames=frames,
+        mode=mode.value,
+        device=device.value,
+        focal_px=focal_px,
+        focal_mm=focal_mm,
+        fov=fov,
+    )
+    if predict_all(photo, output, options, Reporter(verbose)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def render(
+    scene: Annotated[Path, typer.Option("-i", "--input", metavar="SCENE.ply", help="A 3D Gaussian scene.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or a name ending in .mp4.")],
+    trajectory: TrajectoryOption = Trajectory.rotate_forward,
+    disparity: DisparityOption = 0.3,
+    cameras: CamerasOption = None,
+    frames: FramesOption = 60,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Size of the video, e.g. 1280x720.")] = None,
+    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
+    device: DeviceOption = Device.auto,
+    verbose: VerboseOption = False,
+) -> None:
+    """Draw a saved scene along a camera path."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.render import RenderOptions, parse_size, render_scene
+
+    options = RenderOptions(
+        trajectory=trajectory.name,  # type: ignore[arg-type]
+        disparity=disparity,
+        cameras=cameras,
+        frames=frames,
+        size=None if size is None else parse_size(size),
+        focal_px=focal_px,
+        device=device.value,
+    )
+    render_scene(scene, output, options, Reporter(verbose))
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the results.")] = Path(
+        "demo-output"
+    ),
+    verbose: VerboseOption = False,
+) -> None:
+    """Complete the Middlebury Motorcycle photo and compare with the true second photo (needs scikit-image)."""
+    from spackle.jobs.demo import run_demo
+    from spackle.jobs.progress import Reporter
+
+    run_demo(output, Reporter(verbose))
+
+
+def main() -> None:
+    """Entry point: bad input is one line and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        print(f"spackle: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("spackle: interrupted", file=sys.stderr)
+        sys.exit(130)

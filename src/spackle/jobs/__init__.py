@@ -1,0 +1,1 @@
+"""The work behind the commands: files in, files out, progress on the way."""

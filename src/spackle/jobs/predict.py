@@ -1,0 +1,78 @@
+"""`spackle predict`: photos to scenes, videos and reports."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spackle.errors import InputError
+from spackle.formats import save_ply
+from spackle.gaussians import Gaussians
+from spackle.image import load_photo, resize_photo
+from spackle.jobs.inputs import find_photos, make_folder
+from spackle.jobs.progress import Reporter
+from spackle.jobs.report import focal_source, make_report, summary, write_report
+from spackle.jobs.setup import PredictOptions, Tools, make_base, set_up
+from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views
+
+
+def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
+    """Work through a photo or a folder; returns the number of photos that failed.
+
+    Raises:
+        InputError: a single photo, or an option, that cannot be used.
+    """
+    found = find_photos(photos)
+    tools = set_up(options)
+    failed = 0
+    for path, name in found:
+        try:
+            predict_one(path, output / name, options, tools, reporter)
+        except InputError as error:
+            if not photos.is_dir():
+                raise
+            failed += 1
+            reporter.say(f"error: {error}")
+    if failed:
+        reporter.say(f"{failed} of {len(found)} photos failed")
+    return failed
+
+
+def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools, reporter: Reporter) -> None:
+    """One photo to `folder`: base.ply, scene.ply, video.mp4, report.json, and views/ with --cameras.
+
+    Raises:
+        InputError: a photo or depth map that cannot be used, or a folder that cannot be written to.
+    """
+    seconds: dict[str, float] = {}
+    with reporter.stage("load", seconds):
+        full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
+        base = make_base(full, options)
+        photo = resize_photo(full)
+    make_folder(folder)  # before the long work: an output that cannot be written is known at once
+    with reporter.stage("base", seconds):
+        prediction = base.predict(photo)
+    reporter.say(
+        f"{path.name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
+        f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source(photo, prediction)})"
+    )
+    if missing := float(prediction.notes.get("depth_filled", 0)):
+        reporter.say(f"{path.name}: {missing:.1%} of the depth was missing and has been filled")
+    plan = make_plan(prediction, options, tools.views)
+    with reporter.stage("complete", seconds) as step:
+        completed = complete(prediction, plan, options, tools, step)
+    with reporter.stage("write", seconds):
+        count = len(completed.base)
+        save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
+        merged = Gaussians.cat([completed.base, completed.aux])
+        save_ply(merged, folder / "scene.ply", camera=prediction.camera, base_count=count)
+    if options.render:
+        with reporter.stage("video", seconds) as step:
+            save_plan_video(folder / "video.mp4", plan, completed, tools.renderer, step)
+    if tools.views:
+        with reporter.stage("views", seconds) as step:
+            save_views(folder / "views", plan, completed, tools.renderer, step)
+    with reporter.stage("measure", seconds):
+        holes = measure_holes(plan, completed, tools.renderer)
+    report = make_report(photo, prediction, base.name, completed, options, tools, holes, seconds)
+    write_report(report, folder / "report.json")
+    reporter.say(f"{path.name}: {summary(report)} -> {folder}")

@@ -1,0 +1,51 @@
+"""Progress that suits where it is read: bars on a terminal, lines in a log."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+Step = Callable[[int, int], None]  # (done, of how many)
+
+
+class Reporter:
+    """Says what is going on, and how long each stage took."""
+
+    def __init__(self, verbose: bool = False, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True, highlight=False)
+        self.verbose = verbose
+
+    def say(self, line: str) -> None:
+        """One line for everybody."""
+        self.console.print(escape(line), soft_wrap=True)
+
+    def detail(self, line: str) -> None:
+        """One line for those who asked for more."""
+        if self.verbose:
+            self.say(line)
+
+    @contextlib.contextmanager
+    def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
+        """Time a stage into `seconds[name]`; yields a function to call as it advances."""
+        start = time.perf_counter()
+        if self.console.is_terminal:
+            with Progress(
+                TextColumn("{task.description:<12}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                console=self.console,
+                transient=True,
+            ) as bars:
+                task = bars.add_task(name, total=None)
+                yield lambda done, total: bars.update(task, completed=done, total=total)
+        else:
+            yield lambda done, total: None
+        elapsed = time.perf_counter() - start
+        seconds[name] = round(seconds.get(name, 0.0) + elapsed, 3)
+        self.detail(f"  {name}: {elapsed:.2f} s")

@@ -1,0 +1,71 @@
+"""What is said about a prediction once it is done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import spackle
+from spackle.bases.protocol import BasePrediction
+from spackle.formats import atomic_path
+from spackle.image import Photo
+from spackle.jobs.setup import PredictOptions, Tools
+from spackle.jobs.views import Completed
+
+
+def focal_source(photo: Photo, prediction: BasePrediction) -> str:
+    """Who said what the focal length is: an option, the photo, the base's calibration, or nobody."""
+    differs = abs(prediction.camera.focal[0] - photo.focal_px) > 1e-3 * photo.focal_px
+    return "calibration" if differs else photo.focal_source
+
+
+def make_report(
+    photo: Photo,
+    prediction: BasePrediction,
+    base_name: str,
+    completed: Completed,
+    options: PredictOptions,
+    tools: Tools,
+    holes: list[dict[str, float | str]],
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """Counts, holes, times and sources of one photo, ready for JSON."""
+    base, aux = len(completed.base), len(completed.aux)
+    report: dict[str, Any] = {
+        "spackle": spackle.__version__,
+        "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
+        "focal_px": round(prediction.camera.focal[0], 3),
+        "focal_source": focal_source(photo, prediction),
+        "base": {"name": base_name, "gaussians": base, **prediction.notes},
+        "residual": {"weights": tools.residual},
+        "aux": {"gaussians": aux, "share": aux / base},
+        "merged": base + aux,
+        "mode": options.mode,
+        "path": str(options.cameras) if options.cameras else options.trajectory,
+        "disparity": None if options.cameras else options.disparity,
+        "hole_area_ratio": holes,
+        "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
+    }
+    if tools.residual == "seeds":
+        report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
+    if completed.saved_view is not None:
+        report["scene_ply_view"] = completed.saved_view
+    return report
+
+
+def write_report(report: dict[str, Any], path: Path) -> None:
+    """Write a report as JSON, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+
+
+def summary(report: dict[str, Any]) -> str:
+    """A report in one line."""
+    holes = report["hole_area_ratio"]
+    before, after = (sum(view[key] for view in holes) / len(holes) for key in ("before", "after"))
+    aux = report["aux"]
+    return (
+        f"{aux['gaussians']:,} aux Gaussians ({aux['share']:.1%}, {report['residual']['weights']}), "
+        f"holes {before:.2%} -> {after:.3%}, {report['seconds']['total']:.1f} s"
+    )

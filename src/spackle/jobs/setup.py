@@ -1,0 +1,105 @@
+"""What a prediction was asked for, checked before any work begins."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Literal
+
+from spackle.bases.depth_maps import load_depth
+from spackle.bases.protocol import Base
+from spackle.bases.rgbd import RgbdBase
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import load_cameras
+from spackle.image import Photo
+from spackle.jobs.inputs import find_depth
+from spackle.render import Renderer, get_renderer
+from spackle.residual import ResidualNet
+from spackle.residual.weights import SHIPPED, load_residual
+from spackle.trajectory import TrajectoryKind
+
+Mode = Literal["scene", "view"]
+BASES = ("rgbd",)
+MAX_DISPARITY = 2.0
+MAX_FRAMES = 10_000
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictOptions:
+    """The choices of `spackle predict`."""
+
+    base: str = "rgbd"
+    depth: Path | None = None  # a depth map, or a folder of depth maps named as the photos
+    calib: Path | None = None  # calibration of a disparity map
+    checkpoint: Path | None = None  # weights of the base
+    residual: str | None = None  # a file, "seeds", "none", or None for the shipped weights if any
+    render: bool = True
+    trajectory: TrajectoryKind = "rotate_forward"
+    disparity: float = 0.3
+    cameras: Path | None = None  # exactly these views in place of a trajectory
+    frames: int = 60
+    mode: Mode = "scene"
+    device: str = "auto"
+    focal_px: float | None = None
+    focal_mm: float | None = None
+    fov: float | None = None
+
+    @property
+    def gives_focal(self) -> bool:
+        """Whether a person said what the focal length is."""
+        return any(value is not None for value in (self.focal_px, self.focal_mm, self.fov))
+
+
+@dataclasses.dataclass(frozen=True)
+class Tools:
+    """What is set up once for all photos."""
+
+    renderer: Renderer
+    network: ResidualNet | None
+    residual: str  # for the report: a path, "seeds" or "none"
+    views: list[Camera] | None  # of --cameras
+
+
+def set_up(options: PredictOptions) -> Tools:
+    """Check the options that do not depend on a photo, and load what all photos share.
+
+    Raises:
+        InputError: an option that cannot be used.
+    """
+    if options.base not in BASES:
+        raise InputError(f"--base {options.base}: unknown base; this version has: {', '.join(BASES)}")
+    if options.depth is None:
+        raise InputError("--base rgbd needs the photo's depth: give --depth FILE, or --depth FOLDER for many photos")
+    if options.checkpoint is not None:
+        raise InputError(f"-c {options.checkpoint}: the rgbd base has no checkpoint; leave the option out")
+    check_path_options(options.disparity, options.frames)
+    residual = options.residual or (str(SHIPPED) if SHIPPED.exists() else "seeds")
+    network = None if residual in ("seeds", "none") else load_residual(residual)
+    views = load_cameras(options.cameras) if options.cameras else None
+    return Tools(get_renderer(options.device), network, residual, views)
+
+
+def check_path_options(disparity: float, frames: int) -> None:
+    """InputError for a path that cannot be flown."""
+    if not (math.isfinite(disparity) and 0 <= disparity <= MAX_DISPARITY):
+        raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {frames}")
+
+
+def make_base(photo: Photo, options: PredictOptions) -> Base:
+    """The base for one photo, given at its full size.
+
+    Raises:
+        InputError: a depth map that cannot be used, or none for this photo.
+    """
+    assert options.depth is not None  # set_up has refused it
+    path = find_depth(options.depth, photo.path)
+    depth = load_depth(path, calib=options.calib)
+    depth.check_shape(photo.height, photo.width, photo.path)
+    if options.gives_focal and depth.K is not None:  # a person's word beats the calibration's
+        scale = depth.depth.shape[1] / photo.width
+        depth = load_depth(path, calib=options.calib, focal_px=photo.focal_px * scale)
+    return RgbdBase(depth)

@@ -1,0 +1,120 @@
+"""Which views a prediction is made for, and what they look like once it is done."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import save_gray_png, save_png, save_video
+from spackle.gaussians import Gaussians
+from spackle.jobs.inputs import make_folder
+from spackle.jobs.progress import Step
+from spackle.jobs.setup import PredictOptions, Tools
+from spackle.render import Renderer
+from spackle.residual import Completer, farthest_first, hole_area_ratio, hole_mask
+from spackle.scene import even_camera, scene_path
+from spackle.trajectory import DepthRange, extremes
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Views to complete: those to draw come first."""
+
+    cameras: list[Camera]
+    drawn: int  # how many of them make the video
+    checked: dict[str, int]  # name → index: views whose holes go into the report
+
+
+@dataclasses.dataclass(frozen=True)
+class Completed:
+    """A base and its aux Gaussians: one set for all views of the plan, or one for each."""
+
+    base: Gaussians
+    aux: Gaussians  # what scene.ply holds besides the base
+    by_view: list[Gaussians] | None = None  # in view mode
+    saved_view: int | None = None  # in view mode: the view that `aux` belongs to
+
+    def of_view(self, index: int) -> list[Gaussians]:
+        """The sets that a view is drawn with."""
+        return [self.base, self.aux if self.by_view is None else self.by_view[index]]
+
+
+def make_plan(prediction: BasePrediction, options: PredictOptions, views: list[Camera] | None) -> Plan:
+    """The given views, or a path and its two extremes."""
+    if views:
+        return Plan(views, len(views), {str(i): i for i in range(len(views))})
+    gaussians, camera = prediction.gaussians, prediction.camera
+    path = scene_path(gaussians, camera, options.trajectory, options.disparity, options.frames)
+    sides = extremes(even_camera(camera), options.disparity, DepthRange.of(gaussians))
+    names = (f"{-options.disparity:g}", f"+{options.disparity:g}")
+    return Plan([*path, *sides], len(path), {name: len(path) + k for k, name in enumerate(names)})
+
+
+def complete(prediction: BasePrediction, plan: Plan, options: PredictOptions, tools: Tools, step: Step) -> Completed:
+    """Fill the holes of all planned views, as --mode and --residual say."""
+    base = prediction.gaussians
+    if tools.residual == "none":
+        return Completed(base, Gaussians.empty())
+    completer = Completer(base, prediction.camera, tools.renderer, tools.network)
+    if options.mode == "scene":
+        given = options.cameras is not None
+        return Completed(base, completer.complete_scene(plan.cameras, visit_all=given, progress=step))
+    shields = [completer.photo_shield()]
+    by_view = []
+    for index, camera in enumerate(plan.cameras):
+        by_view.append(completer.complete_view(camera, shields))
+        step(index + 1, len(plan.cameras))
+    widest = farthest_first(plan.cameras, prediction.camera)[0]
+    return Completed(base, by_view[widest], by_view, widest)
+
+
+def save_plan_video(path: Path, plan: Plan, completed: Completed, renderer: Renderer, step: Step) -> None:
+    """The drawn views as a video.
+
+    Raises:
+        InputError: views of different sizes, or a file that cannot be written.
+    """
+    cameras = plan.cameras[: plan.drawn]
+    if len({(camera.width, camera.height) for camera in cameras}) > 1:
+        raise InputError(
+            "--cameras: the frames differ in size, so they make no video: add --no-render for pictures only"
+        )
+
+    def frames() -> Iterator[Tensor]:
+        for index, camera in enumerate(cameras):
+            with torch.no_grad():
+                yield renderer.render(completed.of_view(index), camera).rgb
+            step(index + 1, len(cameras))
+
+    save_video(frames(), path)
+
+
+@torch.no_grad()
+def save_views(folder: Path, plan: Plan, completed: Completed, renderer: Renderer, step: Step) -> None:
+    """Each drawn view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
+    make_folder(folder)
+    for index, camera in enumerate(plan.cameras[: plan.drawn]):
+        before = renderer.render(completed.base, camera)
+        save_png(renderer.render(completed.of_view(index), camera).rgb, folder / f"{index:04d}.png")
+        save_png(before.rgb, folder / f"{index:04d}_base.png")
+        save_gray_png(hole_mask(before.alpha).to(torch.float32), folder / f"{index:04d}_mask.png")
+        step(index + 1, plan.drawn)
+
+
+@torch.no_grad()
+def measure_holes(plan: Plan, completed: Completed, renderer: Renderer) -> list[dict[str, float | str]]:
+    """HAR of the checked views, before and after completion."""
+    rows: list[dict[str, float | str]] = []
+    for name, index in plan.checked.items():
+        camera = plan.cameras[index]
+        before = hole_area_ratio(renderer.render(completed.base, camera).alpha)
+        after = hole_area_ratio(renderer.render(completed.of_view(index), camera).alpha)
+        rows.append({"view": name, "before": before, "after": after})
+    return rows

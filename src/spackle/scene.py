@@ -1,0 +1,126 @@
+"""A photo's completed scene, and the three-line way to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import torch
+
+from spackle.bases.depth_maps import DepthMap, load_depth
+from spackle.bases.protocol import Base, BasePrediction
+from spackle.bases.rgbd import RgbdBase
+from spackle.camera import Camera
+from spackle.formats import save_ply, save_video
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, load_photo, resize_photo
+from spackle.render import Renderer, get_renderer
+from spackle.rendering import Rendering
+from spackle.residual import Completer, ResidualNet
+from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
+
+PATH_FRAMES = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Base and aux Gaussians of a photo, in the frame of its camera."""
+
+    base: Gaussians  # what the photo shows; never changed
+    aux: Gaussians  # what completion added
+    camera: Camera  # the photo's
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Everything, the base first."""
+        return Gaussians.cat([self.base, self.aux])
+
+    def path(
+        self, kind: TrajectoryKind = "rotate_forward", disparity: float = 0.3, frames: int = PATH_FRAMES
+    ) -> list[Camera]:
+        """Cameras of a video around the photo's eye, both sides of the picture even."""
+        return scene_path(self.base, self.camera, kind, disparity, frames)
+
+    def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
+        """One view of the whole scene."""
+        with torch.no_grad():
+            return (renderer or get_renderer()).render([self.base, self.aux], camera)
+
+    def frames(self, cameras: Iterable[Camera], renderer: Renderer | None = None) -> Iterator[Rendering]:
+        """Views along a path, one after the other."""
+        renderer = renderer or get_renderer()
+        for camera in cameras:
+            yield self.render(camera, renderer)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a plain PLY that every common viewer opens."""
+        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base))
+
+    def save_video(
+        self,
+        path: str | os.PathLike[str],
+        kind: TrajectoryKind = "rotate_forward",
+        disparity: float = 0.3,
+        frames: int = PATH_FRAMES,
+        fps: float = 30,
+    ) -> None:
+        """Write an mp4 of a camera path."""
+        cameras = self.path(kind, disparity, frames)
+        save_video((view.rgb for view in self.frames(cameras)), path, fps=fps)
+
+
+def predict(
+    photo: str | os.PathLike[str] | Photo,
+    depth: str | os.PathLike[str] | DepthMap,
+    *,
+    kind: TrajectoryKind = "rotate_forward",
+    disparity: float = 0.3,
+    network: ResidualNet | None = None,
+    renderer: Renderer | None = None,
+) -> Scene:
+    """A photo and its depth to a scene without holes along a camera path.
+
+    Args:
+        photo: a file, or a loaded photo of at most 1536 pixels a side.
+        depth: a file, or a loaded depth map.
+        kind: the path that the scene is completed for.
+        disparity: how far the path goes, see `spackle.trajectory.max_offset`.
+        network: residual weights; without any the seeds alone fill the holes.
+        renderer: the CPU's where None.
+
+    Raises:
+        InputError: a photo or a depth map that cannot be used.
+    """
+    loaded = photo if isinstance(photo, Photo) else resize_photo(load_photo(photo))
+    base: Base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
+    prediction = base.predict(loaded)
+    cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
+    return complete(prediction, cameras, network=network, renderer=renderer)
+
+
+def complete(
+    prediction: BasePrediction,
+    cameras: Sequence[Camera],
+    *,
+    visit_all: bool = False,
+    network: ResidualNet | None = None,
+    renderer: Renderer | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Scene:
+    """One scene for all views of a path: see `Completer.complete_scene`."""
+    completer = Completer(prediction.gaussians, prediction.camera, renderer or get_renderer(), network)
+    aux = completer.complete_scene(cameras, visit_all=visit_all, progress=progress)
+    return Scene(prediction.gaussians, aux, prediction.camera)
+
+
+def scene_path(
+    base: Gaussians, camera: Camera, kind: TrajectoryKind, disparity: float, frames: int = PATH_FRAMES
+) -> list[Camera]:
+    """Cameras around the photo's eye at the photo's size, both sides made even."""
+    return trajectory(kind, even_camera(camera), disparity, DepthRange.of(base), frames)
+
+
+def even_camera(camera: Camera) -> Camera:
+    """The same view with an even width and height, as videos want it."""
+    return camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)
