@@ -99,7 +99,7 @@ def keep_undrawn(gradient: Tensor, wanted: Array) -> Tensor:
 
 
 def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], wanted: Wanted) -> Array:
-    """What the pixels give to each Gaussian that wants gradients, [wanted.rows, SUMS] float64.
+    """What the pixels give to each Gaussian that wants gradients, [wanted.rows, SUMS] float32.
 
     Each tile writes sums of its own, which are added up in the order of the tiles: the result does not
     depend on which thread was faster.
@@ -111,7 +111,7 @@ def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Ar
     )
     slots = np.concatenate([[0], np.cumsum(counts)])
     tiles = np.flatnonzero(counts)
-    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((wanted.rows, SUMS))
+    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((wanted.rows, SUMS), np.float32)
 
     def blend_chunk(start: int, stop: int) -> None:
         backward_tiles(

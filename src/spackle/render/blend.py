@@ -59,14 +59,16 @@ def blend_row(
 @kernel
 def rows_of(y: np.float32, half_height: np.float32) -> tuple[int, int]:
     """The tile's rows first..last (exclusive) that a Gaussian may reach, its centre `y` counted in the tile."""
-    first = max(math.ceil(max(y - half_height, -ONE) - SLACK), 0)
-    last = min(math.floor(min(y + half_height, SIDE) + SLACK) + 1, TILE)
+    # Truncation rounds up where one is added; a call to ceil or floor would cost more than a row.
+    first = int(max(y - half_height - SLACK, -ONE) + ONE)
+    last = min(int(min(y + half_height + SLACK, SIDE)) + 1, TILE)
     return first, last
 
 
 @kernel
-def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
+def blend_splat(state: Array, records: Array, index: int, left: int, top: int) -> None:
     """Draw one Gaussian into the tile whose first pixel is (left, top)."""
+    record = records[index]
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     first, last = rows_of(y, record[HALF_HEIGHT])
     for row in range(first, last):
@@ -136,10 +138,10 @@ def blend_tiles(
     for k in range(first, last):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        state[:PLANE] = ONE
-        state[PLANE:] = ZERO
+        for i in range(STATE):
+            state[i] = ONE if i < PLANE else ZERO
         for entry in range(starts[tile], starts[tile + 1]):
-            blend_splat(state, records[ids[entry]], left, top)
+            blend_splat(state, records, ids[entry], left, top)
             if (entry - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_full(state):
                 break
         store_tile(state, left, top, rgb, depth, alpha, linear)

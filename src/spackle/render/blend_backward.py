@@ -19,16 +19,17 @@ Array = npt.NDArray[Any]
 # v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace is one flat buffer, see `blend`: light, the light from behind a Gaussian, the gradients
-# of red, green, blue, depth and alpha, SUMS rows of lanes, and the alphas and light of one chunk of
-# Gaussians. A chunk's share fits the second-level cache.
+# The workspace is one flat buffer of planes, see `blend`: the light that is left, what lies behind the
+# Gaussian in hand, the gradients of red, green, blue, depth and alpha.
 BEHIND = 1 * PLANE
 GRADIENTS = 2 * PLANE
-LANES = 7 * PLANE
-HISTORY = 8 * PLANE
+WORKSPACE = 7 * PLANE
+
+# The alphas and light of a chunk of Gaussians are noted down on the way forth, for the way back; small
+# enough for the second-level cache.
 CHUNK = 128  # Gaussians
-STEP = 2 * TILE  # floats that one row of one Gaussian leaves in the history
-WORKSPACE = HISTORY + CHUNK * TILE * STEP
+NOTE = 2 * TILE  # floats for one row of one Gaussian
+NOTES = CHUNK * TILE * NOTE
 
 
 @kernel
@@ -66,7 +67,8 @@ def load_gradients(
     """
     rgb, depth, alpha = outputs
     rgb_grad, depth_grad, alpha_grad = gradients
-    work[GRADIENTS : GRADIENTS + 5 * PLANE] = ZERO
+    for i in range(GRADIENTS, GRADIENTS + 5 * PLANE):
+        work[i] = ZERO
     for row in range(min(TILE, depth.shape[0] - top)):
         for column in range(min(TILE, depth.shape[1] - left)):
             i, y, x = GRADIENTS + row * TILE + column, top + row, left + column
@@ -82,31 +84,37 @@ def load_gradients(
 
 @kernel
 def replay_row(
-    work: Array, offset: np.uint64, history: np.uint64, peak: np.float32, across: np.float32, center: np.float32
+    work: Array,
+    offset: np.uint64,
+    notes: Array,
+    note: np.uint64,
+    peak: np.float32,
+    across: np.float32,
+    center: np.float32,
 ) -> None:
-    """Draw one row as `blend_row` does, and note alpha (0 where nothing is drawn) and the light before it."""
+    """Draw one row as `blend_row` does; note alpha (0 where nothing is drawn) and the light before it."""
     for x in range(TILE):
-        i, h = offset + np.uint64(x), history + np.uint64(x)
+        i, n = offset + np.uint64(x), note + np.uint64(x)
         u = np.float32(x) - center
         alpha = alpha_of(peak - across * u * u)
         light = work[i]
         after = light * (ONE - alpha)
         full = after <= STOP
         work[i] = -abs(light) if full else after
-        work[h] = ZERO if full else alpha
-        work[h + np.uint64(TILE)] = light
+        notes[n] = ZERO if full else alpha
+        notes[n + np.uint64(TILE)] = light
 
 
 @kernel
-def replay(work: Array, records: Array, ids: Array, left: int, top: int, noted: Array) -> int:
-    """Draw a chunk of Gaussians again; `noted` [CHUNK] gets where the history of each begins.
+def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
+    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] gets where the notes of each begin.
 
     Returns:
         How many were drawn before the tile was full.
     """
-    history = np.uint64(HISTORY)
+    note = np.uint64(0)
     for k in range(len(ids)):
-        noted[k] = history
+        first_notes[k] = note
         record = records[ids[k]]
         x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
         first, last = rows_of(y, record[HALF_HEIGHT])
@@ -115,8 +123,8 @@ def replay(work: Array, records: Array, ids: Array, left: int, top: int, noted: 
             peak = record[PEAK] - record[FALL] * dy * dy
             if peak < INVISIBLE:
                 continue
-            replay_row(work, np.uint64(row * TILE), history, peak, record[ACROSS], x + record[SLOPE] * dy)
-            history += np.uint64(STEP)
+            replay_row(work, np.uint64(row * TILE), notes, note, peak, record[ACROSS], x + record[SLOPE] * dy)
+            note += np.uint64(NOTE)
         if k % CHECK_EVERY == CHECK_EVERY - 1 and is_full(work):
             return k + 1
     return len(ids)
@@ -126,7 +134,8 @@ def replay(work: Array, records: Array, ids: Array, left: int, top: int, noted: 
 def pass_row(
     work: Array,
     offset: np.uint64,
-    history: np.uint64,
+    notes: Array,
+    note: np.uint64,
     red: np.float32,
     green: np.float32,
     blue: np.float32,
@@ -134,64 +143,56 @@ def pass_row(
 ) -> None:
     """Walk back past a row of a Gaussian that wants no gradient."""
     for x in range(TILE):
-        i, h = offset + np.uint64(x), history + np.uint64(x)
+        i, n = offset + np.uint64(x), note + np.uint64(x)
         g = i + np.uint64(GRADIENTS)
         value = red * work[g] + green * work[g + np.uint64(PLANE)] + blue * work[g + np.uint64(2 * PLANE)]
         value += depth * work[g + np.uint64(3 * PLANE)] + work[g + np.uint64(4 * PLANE)]
-        work[i + np.uint64(BEHIND)] += work[h] * work[h + np.uint64(TILE)] * value
+        work[i + np.uint64(BEHIND)] += notes[n] * notes[n + np.uint64(TILE)] * value
 
 
-@kernel
+@reordering_kernel
 def gather_row(
     work: Array,
     offset: np.uint64,
-    history: np.uint64,
+    notes: Array,
+    note: np.uint64,
     center: np.float32,
-    dy: np.float32,
     red: np.float32,
     green: np.float32,
     blue: np.float32,
     depth: np.float32,
-) -> None:
-    """Walk back past a row of a Gaussian, and add up in each lane what the pixel gives to it."""
+) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
+    """Walk back past a row of a Gaussian, and add up what its pixels give to it: see SUMS, without dy."""
+    sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
+    sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
     for x in range(TILE):
-        i, h = offset + np.uint64(x), history + np.uint64(x)
-        g, s = i + np.uint64(GRADIENTS), np.uint64(LANES) + np.uint64(x)
+        i, n = offset + np.uint64(x), note + np.uint64(x)
+        g = i + np.uint64(GRADIENTS)
         by_red, by_green, by_blue = work[g], work[g + np.uint64(PLANE)], work[g + np.uint64(2 * PLANE)]
         by_depth, by_alpha = work[g + np.uint64(3 * PLANE)], work[g + np.uint64(4 * PLANE)]
         value = red * by_red + green * by_green + blue * by_blue + depth * by_depth + by_alpha
-        alpha, light, behind = work[h], work[h + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
+        alpha, light, behind = notes[n], notes[n + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
         weight = alpha * light
+        work[i + np.uint64(BEHIND)] = behind + weight * value
         # More alpha shows more of this one and less of what lies behind; at the clamp nothing moves.
         slope = alpha * (light * value - behind / (ONE - alpha))
         v = slope if alpha < LIMIT else ZERO
-        work[i + np.uint64(BEHIND)] = behind + weight * value
         u = np.float32(x) - center
-        work[s] += v
-        work[s + np.uint64(1 * TILE)] += v * u
-        work[s + np.uint64(2 * TILE)] += v * u * u
-        work[s + np.uint64(3 * TILE)] += v * dy
-        work[s + np.uint64(4 * TILE)] += v * dy * dy
-        work[s + np.uint64(5 * TILE)] += v * u * dy
-        work[s + np.uint64(6 * TILE)] += weight * by_red
-        work[s + np.uint64(7 * TILE)] += weight * by_green
-        work[s + np.uint64(8 * TILE)] += weight * by_blue
-        work[s + np.uint64(9 * TILE)] += weight * by_depth
-
-
-@reordering_kernel
-def sum_lanes(work: Array, sums: Array) -> None:
-    """Add up the lanes."""
-    for k in range(SUMS):
-        total = ZERO
-        for x in range(TILE):
-            total += work[LANES + k * TILE + x]
-        sums[k] = total
+        sum_v += v
+        sum_vu += v * u
+        sum_vuu += v * u * u
+        sum_red += weight * by_red
+        sum_green += weight * by_green
+        sum_blue += weight * by_blue
+        sum_depth += weight * by_depth
+    return sum_v, sum_vu, sum_vuu, sum_red, sum_green, sum_blue, sum_depth
 
 
 @kernel
-def walk_back(work: Array, record: Array, left: int, top: int, history: np.uint64, wanted: bool) -> None:
-    """Walk back past one Gaussian, whose notes begin at `history`."""
+def walk_back(
+    work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
+) -> None:
+    """Walk back past one Gaussian, whose notes begin at `note`; if it wants gradients, `sums` [SUMS] gets them."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     red, green, blue, depth = record[RED], record[GREEN], record[BLUE], record[DEPTH]
     first, last = rows_of(y, record[HALF_HEIGHT])
@@ -201,47 +202,77 @@ def walk_back(work: Array, record: Array, left: int, top: int, history: np.uint6
             continue
         offset = np.uint64(row * TILE)
         if wanted:
-            gather_row(work, offset, history, x + record[SLOPE] * dy, dy, red, green, blue, depth)
+            gifts = gather_row(work, offset, notes, note, x + record[SLOPE] * dy, red, green, blue, depth)
+            v, vu, vuu, by_red, by_green, by_blue, by_depth = gifts
+            sums[0] += v
+            sums[1] += vu
+            sums[2] += vuu
+            sums[3] += v * dy
+            sums[4] += v * dy * dy
+            sums[5] += vu * dy
+            sums[6] += by_red
+            sums[7] += by_green
+            sums[8] += by_blue
+            sums[9] += by_depth
         else:
-            pass_row(work, offset, history, red, green, blue, depth)
-        history += np.uint64(STEP)
+            pass_row(work, offset, notes, note, red, green, blue, depth)
+        note += np.uint64(NOTE)
 
 
 @kernel
 def backward_tile(
-    work: Array, noted: Array, records: Array, ids: Array, left: int, top: int, ranges: Array, sums: Array
+    work: Array,
+    notes: Array,
+    first_notes: Array,
+    records: Array,
+    ids: Array,
+    left: int,
+    top: int,
+    ranges: Array,
+    sums: Array,
 ) -> None:
     """The gradients of one tile.
 
     Args:
+        work: [WORKSPACE], its gradients loaded.
+        notes: [NOTES], room for notes, and `first_notes` [CHUNK], where each Gaussian's begin.
         ids: [n], the tile's list.
         sums: [m, SUMS], one row for each entry of the list that wants gradients, in the list's order.
     """
     chunks = (len(ids) + CHUNK - 1) // CHUNK
     before = np.empty((chunks, PLANE), np.float32)  # the light that reaches each chunk
-    work[:PLANE] = ONE
-    work[BEHIND : BEHIND + PLANE] = ZERO
-    for chunk in range(chunks - 1):
-        before[chunk] = work[:PLANE]
-        replay(work, records, ids[chunk * CHUNK : (chunk + 1) * CHUNK], left, top, noted)
-    if chunks > 0:
-        before[chunks - 1] = work[:PLANE]
+    fill(work, 0, ONE)
+    fill(work, BEHIND, ZERO)
+    for chunk in range(chunks):
+        copy_plane(work, before[chunk])
+        if chunk < chunks - 1:
+            replay(work, notes, records, ids[chunk * CHUNK : (chunk + 1) * CHUNK], left, top, first_notes)
     slot = len(sums)
     for chunk in range(chunks - 1, -1, -1):
-        work[:PLANE] = before[chunk]
+        copy_plane(before[chunk], work)
         part = ids[chunk * CHUNK : (chunk + 1) * CHUNK]
-        drawn = replay(work, records, part, left, top, noted)
+        drawn = replay(work, notes, records, part, left, top, first_notes)
         for k in range(len(part) - 1, -1, -1):
             if slot == 0:
                 return
             wanted = wanted_row(part[k], ranges) >= 0
+            slot -= wanted
             if k < drawn:
-                work[LANES : LANES + SUMS * TILE] = ZERO
-                walk_back(work, records[part[k]], left, top, noted[k], wanted)
-            if wanted:
-                slot -= 1
-                if k < drawn:
-                    sum_lanes(work, sums[slot])
+                walk_back(work, notes, first_notes[k], records[part[k]], left, top, wanted, sums[slot])
+
+
+@kernel
+def fill(work: Array, plane: int, value: np.float32) -> None:
+    """Set a plane of the workspace."""
+    for i in range(PLANE):
+        work[plane + i] = value
+
+
+@kernel
+def copy_plane(source: Array, target: Array) -> None:
+    """Copy the first plane of a buffer to the first of another."""
+    for i in range(PLANE):
+        target[i] = source[i]
 
 
 @kernel
@@ -266,13 +297,14 @@ def backward_tiles(
         slots: [T + 1] int64, where each tile's rows in `sums` begin.
         sums: [E, SUMS] float32, zeros.
     """
-    work, noted = np.empty(WORKSPACE, np.float32), np.empty(CHUNK, np.uint64)
+    work, notes = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32)
+    first_notes = np.empty(CHUNK, np.uint64)
     for k in range(first, last):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         load_gradients(work, left, top, outputs, gradients, linear)
         part, rows = ids[starts[tile] : starts[tile + 1]], sums[slots[tile] : slots[tile + 1]]
-        backward_tile(work, noted, records, part, left, top, ranges, rows)
+        backward_tile(work, notes, first_notes, records, part, left, top, ranges, rows)
 
 
 @kernel
@@ -283,7 +315,7 @@ def collect_sums(
 
     Args:
         rows: the size of a share: shares first..last own the rows from first·rows to last·rows.
-        table: [G, SUMS] float64, zeros.
+        table: [G, SUMS] float32, zeros.
     """
     slot = 0
     for k in range(len(tiles)):

@@ -22,6 +22,7 @@ X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(11
 RECORD = 12  # floats in a record, the last one unused
 
 LOG2_E = math.log2(math.e)
+LOG_FAINT = math.log(ALPHA_MIN)
 BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place
 FINITE = 1e30  # larger values would overflow float32 further on
 
@@ -115,15 +116,19 @@ def project_chunk(
             continue
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
-        cxx, cxy, cyy, det = covariance(x, y, z, quats[i], scales[i], lens, pose, eps2d)
+        nearness = 1.0 / z
+        x, y = x * nearness, y * nearness
+        cxx, cxy, cyy, det = covariance(x, y, nearness, quats[i], scales[i], lens, pose, eps2d)
         if not (det > 0.0 and det < FINITE and cxx < FINITE and cyy < FINITE):
             continue
-        u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        reach = 2.0 * math.log(opacity / ALPHA_MIN) * (1.0 + 1e-5)
-        if not cover(u, v, math.sqrt(reach * cxx), math.sqrt(reach * cyy), width, height, boxes[out]):
+        u, v = lens[0] * x + lens[2], lens[1] * y + lens[3]
+        log_opacity = math.log(opacity)
+        reach = 2.0 * max(log_opacity - LOG_FAINT, 0.0) * (1.0 + 1e-5)
+        half_height = math.sqrt(reach * cyy)
+        if not cover(u, v, math.sqrt(reach * cxx), half_height, width, height, boxes[out]):
             continue
-        across = 0.5 * LOG2_E * cyy / det
-        fall = 0.5 * LOG2_E / cyy
+        narrow = 1.0 / cyy
+        fall, across = 0.5 * LOG2_E * narrow, 0.5 * LOG2_E * cyy / det
         red, green, blue = colors[i, 0], colors[i, 1], colors[i, 2]
         light = abs(red) + abs(green) + abs(blue)
         if not (across < FINITE and fall < FINITE and light < FINITE):
@@ -131,9 +136,8 @@ def project_chunk(
             continue
         record = records[out]
         record[X], record[Y], record[DEPTH] = u, v, z
-        record[SLOPE], record[ACROSS], record[FALL] = cxy / cyy, across, fall
-        record[PEAK] = math.log2(opacity)
-        record[HALF_HEIGHT] = math.sqrt(reach * cyy)
+        record[SLOPE], record[ACROSS], record[FALL] = cxy * narrow, across, fall
+        record[PEAK], record[HALF_HEIGHT] = log_opacity * LOG2_E, half_height
         record[RED], record[GREEN], record[BLUE] = red, green, blue
         depth_bits[found] = z
         ids[found] = out
@@ -143,25 +147,23 @@ def project_chunk(
 
 @kernel
 def covariance(
-    x: float, y: float, z: float, quat: Array, scale: Array, lens: Array, pose: Array, eps2d: float
+    x: float, y: float, nearness: float, quat: Array, scale: Array, lens: Array, pose: Array, eps2d: float
 ) -> tuple[float, float, float, float]:
-    """The projected covariance (xx, xy, yy) and its determinant.
+    """The projected covariance (xx, xy, yy) and its determinant, of a Gaussian at (x, y, 1) / nearness.
 
     With M = J W R S, the covariance is M Mᵀ, and its determinant the squared cross product of M's rows
     (Cauchy–Binet), which does not cancel where a Gaussian is seen edge-on.
     """
     qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    norm = 1.0 / max(math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
-    qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
+    two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² makes the rotation a unit one
     # The Jacobian's two rows are (a, 0, b) and (0, c, d).
-    tx = min(lens[5], max(lens[4], x / z))
-    ty = min(lens[7], max(lens[6], y / z))
-    a, b, c, d = lens[0] / z, -lens[0] * tx / z, lens[1] / z, -lens[1] * ty / z
+    a, c = lens[0] * nearness, lens[1] * nearness
+    b, d = -a * min(lens[5], max(lens[4], x)), -c * min(lens[7], max(lens[6], y))
     h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
     v0, v1, v2 = c * pose[1, 0] + d * pose[2, 0], c * pose[1, 1] + d * pose[2, 1], c * pose[1, 2] + d * pose[2, 2]
-    r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    r00, r01, r02 = 1 - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)
+    r10, r11, r12 = two * (qx * qy + qw * qz), 1 - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx)
+    r20, r21, r22 = two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), 1 - two * (qx * qx + qy * qy)
     s0, s1, s2 = np.float64(scale[0]), np.float64(scale[1]), np.float64(scale[2])
     m0, n0 = s0 * (h0 * r00 + h1 * r10 + h2 * r20), s0 * (v0 * r00 + v1 * r10 + v2 * r20)
     m1, n1 = s1 * (h0 * r01 + h1 * r11 + h2 * r21), s1 * (v0 * r01 + v1 * r11 + v2 * r21)

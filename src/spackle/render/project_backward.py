@@ -37,23 +37,21 @@ def project_backward(
         table: [N, SUMS], what the pixels give to each Gaussian of the set (see `blend_backward`). All
             zeros mean that no pixel saw it; the gradients are then left as they are.
     """
-    factor, axes, jacobian = np.empty((2, 3)), np.empty((3, 3)), np.zeros((2, 3))
-    factor_grad, axes_grad = np.empty((2, 3)), np.empty((3, 3))
+    factor, axes, jacobian, local = np.empty((2, 3)), np.empty((3, 3)), np.zeros((2, 3)), np.empty(3)
+    factor_grad, axes_grad, jacobian_grad = np.empty((2, 3)), np.empty((3, 3)), np.empty((2, 3))
     for i in range(start, stop):
         row = table[i]
         if not row.any():
             continue
         colors_grad[i, 0], colors_grad[i, 1], colors_grad[i, 2] = row[6], row[7], row[8]
         opacities_grad[i] = row[0] / opacities[i]
-        local = pose[:, 3].copy()
         for a in range(3):
-            for b in range(3):
-                local[a] += pose[a, b] * np.float64(means[i, b])
+            local[a] = pose[a, 0] * means[i, 0] + pose[a, 1] * means[i, 1] + pose[a, 2] * means[i, 2] + pose[a, 3]
         norm = rotate_axes(quats[i], axes)
         linearise(local, lens, jacobian)
         project_axes(jacobian, pose, axes, scales[i], factor)
         u_grad, v_grad = splat_backward(row, factor, eps2d, factor_grad)
-        jacobian_grad = axes_backward(jacobian, pose, axes, scales[i], factor_grad, axes_grad, scales_grad[i])
+        axes_backward(jacobian, pose, axes, scales[i], factor_grad, jacobian_grad, axes_grad, scales_grad[i])
         quat_backward(quats[i], norm, axes_grad, quats_grad[i])
         local_grad = point_backward(local, lens, jacobian_grad, u_grad, v_grad, row[9])
         for b in range(3):
@@ -121,10 +119,17 @@ def splat_backward(row: Array, factor: Array, eps2d: float, factor_grad: Array) 
 
 @kernel
 def axes_backward(
-    jacobian: Array, pose: Array, axes: Array, scale: Array, factor_grad: Array, axes_grad: Array, scale_grad: Array
-) -> Array:
-    """From the factor's gradient to those of the rotation and the scales; returns the Jacobian's, [2, 3]."""
-    jacobian_grad = np.zeros((2, 3))
+    jacobian: Array,
+    pose: Array,
+    axes: Array,
+    scale: Array,
+    factor_grad: Array,
+    jacobian_grad: Array,
+    axes_grad: Array,
+    scale_grad: Array,
+) -> None:
+    """From the factor's gradient to those of the Jacobian, the rotation and the scales."""
+    jacobian_grad[:, :] = 0.0
     for k in range(3):
         scale_grad[k] = 0.0
         for b in range(3):
@@ -137,7 +142,6 @@ def axes_backward(
             for a in range(2):
                 for c in range(3):
                     jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axes[b, k] * pose[c, b]
-    return jacobian_grad
 
 
 @kernel

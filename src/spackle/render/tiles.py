@@ -34,41 +34,44 @@ def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
     parts = thread_count()
     spans = even_spans(len(order), parts)
     counts = np.zeros((parts, wanted.size), np.int64)
-    run_chunks(lambda a, b: count_entries(a, b, spans, order, boxes, wanted, counts), parts, 1)
+    sorted_boxes = np.empty((len(order), 4), np.uint16)
+    run_chunks(lambda a, b: count_entries(a, b, spans, order, boxes, wanted, sorted_boxes, counts), parts, 1)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     positions = starts_of(counts)
     ids = np.empty(starts[-1], np.int32)
-    run_chunks(lambda a, b: write_entries(a, b, spans, order, boxes, wanted, positions, ids), parts, 1)
+    run_chunks(lambda a, b: write_entries(a, b, spans, order, sorted_boxes, wanted, positions, ids), parts, 1)
     return TileLists(ids, starts)
 
 
 @kernel
 def count_entries(
-    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, counts: Array
+    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
 ) -> None:
-    """Count the entries that pieces first..last of the order bring to each tile."""
+    """Count the entries that pieces first..last of the order bring to each tile, and sort the boxes on the way."""
     columns = wanted.shape[1]
     for piece in range(first, last):
+        row_counts = counts[piece]
         for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
             box = boxes[order[k]]
-            for row in range(box[2], box[3]):
-                for column in range(box[0], box[1]):
-                    if wanted[row, column]:
-                        counts[piece, row * columns + column] += 1
+            left, right, top, bottom = box[0], box[1], box[2], box[3]
+            sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
+            for row in range(top, bottom):
+                for column in range(left, right):
+                    row_counts[row * columns + column] += wanted[row, column]
 
 
 @kernel
 def write_entries(
     first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, positions: Array, ids: Array
 ) -> None:
-    """Write the entries that pieces first..last of the order bring to each tile."""
+    """Write the entries that pieces first..last of the order, whose boxes are sorted, bring to each tile."""
     columns = wanted.shape[1]
     for piece in range(first, last):
+        places = positions[piece]
         for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            box = boxes[order[k]]
-            for row in range(box[2], box[3]):
-                for column in range(box[0], box[1]):
+            for row in range(boxes[k, 2], boxes[k, 3]):
+                for column in range(boxes[k, 0], boxes[k, 1]):
                     if wanted[row, column]:
                         tile = row * columns + column
-                        ids[positions[piece, tile]] = order[k]
-                        positions[piece, tile] += 1
+                        ids[places[tile]] = order[k]
+                        places[tile] += 1
