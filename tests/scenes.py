@@ -1,0 +1,127 @@
+"""Small scenes with exact depth, and one real stereo pair, that several tests share."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.protocol import BasePrediction
+from spackle.bases.rgbd import lift
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.rendering import Rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A photo, its exact depth and its camera at the world's origin."""
+
+    rgb: Tensor  # [H, W, 3] sRGB
+    depth: Tensor  # [H, W], 0 where unknown
+    camera: Camera
+
+    @property
+    def depth_map(self) -> DepthMap:
+        return DepthMap(self.depth, self.depth > 0, None, None, "depth", Path("synthetic.npy"))
+
+    def lift(self) -> BasePrediction:
+        return lift(self.rgb, self.depth_map, self.camera)
+
+    def base(self) -> Gaussians:
+        return self.lift().gaussians
+
+
+def texture(height: int, width: int, hue: tuple[float, float, float] = (0.5, 0.45, 0.6)) -> Tensor:
+    """A smooth pattern [H, W, 3] around a colour, ±0.1."""
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    waves = [torch.sin(0.5 * x + 0.2 * y), torch.sin(0.4 * y - 0.1 * x), torch.cos(0.3 * x + 0.3 * y)]
+    return torch.tensor(hue) + 0.1 * torch.stack(waves, dim=-1)
+
+
+def slanted_plane(near: float, far: float, axis: int, width: int = 160, height: int = 120, focal: float = 150) -> Scene:
+    """A plane whose depth runs from `far` at the first row (axis 0) or column (axis 1) to `near` at the last."""
+    ramp = torch.linspace(1 / far, 1 / near, (height, width)[axis])
+    inverse = (ramp[:, None] if axis == 0 else ramp[None, :]).expand(height, width)
+    return Scene(texture(height, width), 1 / inverse, Camera.from_focal(focal, width, height))
+
+
+def wall(depth: float = 4.0, width: int = 64, height: int = 48, focal: float = 60) -> Scene:
+    """A plane that faces the camera."""
+    camera = Camera.from_focal(focal, width, height)
+    return Scene(texture(height, width), torch.full((height, width), depth), camera)
+
+
+def box_mask(width: int, height: int) -> Tensor:
+    """[H, W] bool: the pixels of the box in `box_before_wall`, the middle third each way."""
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
+    return mask
+
+
+def box_before_wall(near: float = 2.0, far: float = 6.0, width: int = 96, height: int = 72, focal: float = 80) -> Scene:
+    """A reddish box before a bluish wall, both facing the camera."""
+    mask = box_mask(width, height)
+    front, back = texture(height, width, (0.8, 0.3, 0.2)), texture(height, width, (0.2, 0.4, 0.7))
+    depth = torch.where(mask, near, far)
+    return Scene(torch.where(mask[..., None], front, back), depth, Camera.from_focal(focal, width, height))
+
+
+def cast(camera: Camera, z: float) -> Tensor:
+    """[H, W, 3] where a view's pixels meet the world's plane at depth z."""
+    centers = camera.pixel_centers()
+    ray = camera.unproject(centers, torch.ones(centers.shape[:-1])) - camera.position
+    return camera.position + ray * ((z - camera.position[2]) / ray[..., 2])[..., None]
+
+
+def shifted(camera: Camera, right: float, focus: float = 4.0) -> Camera:
+    """The photo's camera moved sideways, still looking at the same spot."""
+    return camera.looking(torch.tensor([right, 0.0, 0.0]), torch.tensor([0.0, 0.0, focus]))
+
+
+def away(camera: Camera) -> Camera:
+    """The photo's camera turned round: it sees nothing of the photo's scene."""
+    return camera.looking(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]))
+
+
+def psnr(a: Tensor, b: Tensor) -> float:
+    """Of images in 0..1; inf where they are the same."""
+    return -10 * float((a - b).double().square().mean().log10())
+
+
+def same_bits(a: Rendering | Gaussians, b: Rendering | Gaussians) -> bool:
+    """Whether two values of one type hold the same tensors, bit for bit."""
+    fields = [field.name for field in dataclasses.fields(a)]
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in fields)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stereo:
+    """The left photo with its depth, and what the right camera saw."""
+
+    left: Scene
+    right: Camera
+    right_rgb: Tensor  # [H, W, 3] sRGB
+
+
+@functools.cache
+def motorcycle() -> Stereo:
+    """Middlebury's Motorcycle at quarter size, in metres; a real depth map, with gaps."""
+    data = pytest.importorskip("skimage.data")
+    left, right, disparity = data.stereo_motorcycle()
+    focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
+    depth = np.where(np.isfinite(disparity), focal * baseline / (disparity + doffs), 0).astype(np.float32)
+    height, width = depth.shape
+    K = torch.tensor([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+    beside, pose = K.clone(), torch.eye(4)
+    beside[0, 2] += doffs
+    pose[0, 3] = -baseline
+    photos = [torch.from_numpy(image).float() / 255 for image in (left, right)]
+    scene = Scene(photos[0], torch.from_numpy(depth), Camera(K, torch.eye(4), width, height))
+    return Stereo(scene, Camera(beside, pose, width, height), photos[1])

@@ -1,0 +1,232 @@
+"""Gaussians and their quaternions, against SciPy's rotations and hand-computed values."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import same_bits
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians, quat_from_matrix, quat_multiply, quat_to_matrix
+from spackle.render.reference import ReferenceRenderer
+
+UNIT = st.floats(-1, 1)
+QUATS = st.tuples(UNIT, UNIT, UNIT, UNIT).filter(lambda q: math.hypot(*q) > 1e-2)
+OFFSETS = st.tuples(*[st.floats(-20, 20)] * 3)
+FACTORS = st.floats(0.05, 20)
+HALF = math.sqrt(0.5)
+PROPERTY = settings(deadline=None, max_examples=60)
+
+
+def scipy_matrix(quat: tuple[float, ...]) -> Tensor:
+    """SciPy's rotation matrix of a quaternion (wxyz)."""
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    return torch.from_numpy(rotation.from_quat(np.roll(quat, -1)).as_matrix())
+
+
+def double(*values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def random_set(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:
+    """Gaussians in front of a camera at the origin."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    means = (uniform(count, 3) - 0.5) * 2 + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
+    return Gaussians(means, uniform(count, 4) - 0.5, 0.05 + 0.3 * uniform(count, 3), uniform(count), uniform(count, 3))
+
+
+def similarity(quat: tuple[float, ...], factor: float, offset: tuple[float, ...]) -> Tensor:
+    """[4, 4] rotation, then scale, then translation."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = factor * scipy_matrix(quat), double(*offset)
+    return matrix
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "colors"])
+def test_a_field_of_the_wrong_shape_is_named(field: str) -> None:
+    wrong = torch.zeros(3, 1) if field == "opacities" else torch.zeros(3, 5)
+    with pytest.raises(ValueError, match=rf"Gaussians\.{field} has shape"):
+        dataclasses.replace(random_set(3), **{field: wrong})
+
+
+def test_fields_of_different_lengths_are_refused() -> None:
+    with pytest.raises(ValueError, match="scales"):
+        dataclasses.replace(random_set(3), scales=torch.ones(2, 3))
+
+
+def test_a_set_cannot_be_changed_in_place() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        random_set(2).means = torch.zeros(2, 3)  # type: ignore[misc]
+
+
+def test_the_empty_set_has_length_zero_and_vanishes_in_a_join() -> None:
+    some = random_set(4, dtype=torch.float32)
+    assert len(Gaussians.empty()) == 0
+    assert Gaussians.empty(dtype=torch.float64).means.dtype == torch.float64
+    assert Gaussians.empty().covariances().shape == (0, 3, 3)
+    assert same_bits(Gaussians.cat([Gaussians.empty(), some, Gaussians.empty()]), some)
+
+
+def test_joined_sets_keep_their_order_bit_for_bit() -> None:
+    first, second, third = (random_set(n, seed=n) for n in (3, 1, 5))
+    joined = Gaussians.cat(part for part in (first, second, third))
+    assert len(joined) == 9
+    assert same_bits(joined.select(slice(0, 3)), first)
+    assert same_bits(joined.select(torch.tensor([3])), second)
+    assert same_bits(joined.select(torch.arange(9) >= 4), third)
+
+
+def test_conversion_reaches_every_tensor_and_detaching_cuts_every_gradient() -> None:
+    some = Gaussians(*(t.requires_grad_() for t in random_set(2).tensors))
+    assert {t.dtype for t in some.to(dtype=torch.float32).tensors} == {torch.float32}
+    assert all(t.requires_grad for t in some.to(dtype=torch.float32).tensors)
+    assert not any(t.requires_grad for t in some.detach().tensors)
+    assert same_bits(some.detach(), some)
+
+
+@PROPERTY
+@given(QUATS)
+def test_rotation_matrices_are_scipys(quat: tuple[float, ...]) -> None:
+    found = quat_to_matrix(double(*quat))
+    torch.testing.assert_close(found, scipy_matrix(quat), rtol=0, atol=1e-12)
+    torch.testing.assert_close(quat_to_matrix(7.5 * double(*quat)), found, rtol=0, atol=1e-12)
+
+
+@PROPERTY
+@given(QUATS)
+def test_quaternions_come_back_from_their_matrices(quat: tuple[float, ...]) -> None:
+    found = quat_from_matrix(scipy_matrix(quat))
+    assert float(found.norm()) == pytest.approx(1, abs=1e-12)
+    assert found[0] >= 0
+    torch.testing.assert_close(quat_to_matrix(found), scipy_matrix(quat), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("quat", "about"),
+    [((0, 1, 0, 0), "x"), ((0, 0, 1, 0), "y"), ((0, 0, 0, 1), "z"), ((0, HALF, -HALF, 0), "a diagonal")],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_half_turns_are_well_conditioned(quat: tuple[float, ...], about: str, dtype: torch.dtype) -> None:
+    found = quat_from_matrix(scipy_matrix(quat).to(dtype))
+    assert abs(float(found @ torch.tensor(quat, dtype=dtype))) == pytest.approx(1, abs=1e-6), about
+    nearly = quat_from_matrix(scipy_matrix((1e-4, *quat[1:])).to(dtype))
+    assert float(nearly[0]) == pytest.approx(1e-4, rel=1e-2)
+
+
+def test_quaternions_of_matrices_take_any_leading_axes_and_pass_gradients() -> None:
+    quats = torch.randn(2, 5, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matrices = quat_to_matrix(quats).requires_grad_()
+    found = quat_from_matrix(matrices)
+    assert found.shape == (2, 5, 4)
+    torch.testing.assert_close(quat_from_matrix(matrices[1, 3]), found[1, 3])
+    found.square().sum(-1).mul(torch.rand(2, 5)).sum().backward()
+    assert matrices.grad is not None
+    assert bool(matrices.grad.isfinite().all())
+
+
+@PROPERTY
+@given(QUATS, QUATS)
+def test_a_product_turns_by_the_second_factor_first(a: tuple[float, ...], b: tuple[float, ...]) -> None:
+    product = quat_multiply(double(*a), double(*b))
+    torch.testing.assert_close(quat_to_matrix(product), scipy_matrix(a) @ scipy_matrix(b), rtol=0, atol=1e-12)
+    assert float(product.norm()) == pytest.approx(math.hypot(*a) * math.hypot(*b))
+
+
+def test_hamiltons_table() -> None:
+    one, i, j, k = torch.eye(4).unbind()
+    assert torch.equal(quat_multiply(i, j), k)
+    assert torch.equal(quat_multiply(j, i), -k)
+    assert torch.equal(quat_multiply(j, k), i)
+    assert torch.equal(quat_multiply(k, i), j)
+    assert torch.equal(quat_multiply(i, i), -one)
+    assert torch.equal(quat_multiply(torch.eye(4), one), torch.eye(4))
+
+
+def test_a_quarter_turn_about_z_swaps_the_variances_of_x_and_y() -> None:
+    quat, scales = double([HALF, 0, 0, HALF]), double([1, 2, 3])
+    some = Gaussians(double([0, 0, 0]), quat, scales, double(1), double([0, 0, 0]))
+    torch.testing.assert_close(some.covariances()[0], torch.diag(double(4, 1, 9)))
+
+
+@PROPERTY
+@given(QUATS, st.tuples(FACTORS, FACTORS, FACTORS))
+def test_covariances_have_the_squared_scales_as_eigenvalues(quat: tuple[float, ...], scales: tuple[float, ...]) -> None:
+    some = Gaussians(double([0, 0, 0]), double(quat), double(scales), double(1), double([0, 0, 0]))
+    rotation = scipy_matrix(quat)
+    expected = rotation @ torch.diag(double(*scales) ** 2) @ rotation.T
+    torch.testing.assert_close(some.covariances()[0], expected, rtol=1e-9, atol=1e-9)
+
+
+@PROPERTY
+@given(QUATS, FACTORS, OFFSETS)
+def test_a_transform_moves_points_and_covariances_alike(quat: tuple[float, ...], factor: float, offset: tuple) -> None:
+    some, matrix = random_set(6), similarity(quat, factor, offset)
+    moved, linear = some.transform(matrix), matrix[:3, :3]
+    torch.testing.assert_close(moved.means, torch.stack([linear @ m + matrix[:3, 3] for m in some.means]))
+    torch.testing.assert_close(moved.covariances(), linear @ some.covariances() @ linear.T, rtol=1e-8, atol=1e-10)
+    assert torch.equal(moved.opacities, some.opacities)
+    assert torch.equal(moved.colors, some.colors)
+
+
+@PROPERTY
+@given(QUATS, QUATS, FACTORS, FACTORS, OFFSETS)
+def test_transforms_compose_as_their_matrices_do(a: tuple, b: tuple, s: float, t: float, offset: tuple) -> None:
+    some, first, second = random_set(3), similarity(a, s, offset), similarity(b, t, offset[::-1])
+    one, other = some.transform(first).transform(second), some.transform(second @ first)
+    torch.testing.assert_close(one.means, other.means)
+    torch.testing.assert_close(one.scales, other.scales)
+    torch.testing.assert_close(one.covariances(), other.covariances(), rtol=1e-8, atol=1e-8)
+
+
+def test_moving_scene_and_camera_together_leaves_the_picture_and_scales_its_depth() -> None:
+    some, camera = random_set(12), Camera.from_focal(20, 16, 12).to(dtype=torch.float64)
+    matrix = similarity((0.9, 0.1, -0.3, 0.2), 2.5, (1, -2, 3))
+    rigid = matrix.clone()
+    rigid[:3, :3] /= 2.5
+    rigid[:3, 3] = matrix[:3, 3]
+    moved = dataclasses.replace(camera, world_to_camera=torch.linalg.inv(rigid))
+    before, after = ReferenceRenderer().render(some, camera), ReferenceRenderer().render(some.transform(matrix), moved)
+    assert float(before.alpha.max()) > 0.5
+    torch.testing.assert_close(after.rgb, before.rgb, rtol=0, atol=1e-9)
+    torch.testing.assert_close(after.alpha, before.alpha, rtol=0, atol=1e-9)
+    torch.testing.assert_close(after.depth, 2.5 * before.depth, rtol=0, atol=1e-8)
+
+
+def test_a_transform_keeps_single_precision_and_passes_gradients() -> None:
+    some = Gaussians(*(t.requires_grad_() for t in random_set(3, dtype=torch.float32).tensors))
+    moved = some.transform(similarity((1, 2, 3, 4), 2, (0, 0, 1)))
+    assert {t.dtype for t in moved.tensors} == {torch.float32}
+    (moved.means.sum() + moved.quats[:, 0].sum() + moved.scales.sum()).backward()
+    torch.testing.assert_close(some.scales.grad, torch.full((3, 3), 2.0))
+    assert some.means.grad is not None
+    assert some.quats.grad is not None
+
+
+@pytest.mark.parametrize(
+    "block",
+    {
+        "mirror": torch.diag(double(1, 1, -1)),
+        "stretch": torch.diag(double(1, 1, 2)),
+        "shear": double([1, 0.1, 0], [0, 1, 0], [0, 0, 1]),
+        "nothing": torch.zeros(3, 3, dtype=torch.float64),
+        "flat": torch.diag(double(1, 1, 0)),
+        "nan": torch.full((3, 3), math.nan, dtype=torch.float64),
+    }.items(),
+    ids=lambda item: item[0],
+)
+def test_only_similarities_are_taken(block: tuple[str, Tensor]) -> None:
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = block[1]
+    with pytest.raises(ValueError, match="uniform scale"):
+        random_set(2).transform(matrix)
