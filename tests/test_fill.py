@@ -1,0 +1,186 @@
+"""The fill of holes from their rim: exact where known, bounded, and biased to the far side."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from spackle.fill import far_fill
+
+PROPERTY = settings(deadline=None, max_examples=50)
+SIZES = st.tuples(st.integers(1, 13), st.integers(1, 13))
+SEEDS = st.integers(0, 2**32 - 1)
+BIASES = st.sampled_from([0.0, 5.0, 80.0])
+
+
+def random_scene(seed: int, height: int, width: int, share: float = 0.4) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse depths over two decades, two channels, and what is known; at least one pixel."""
+    generator = torch.Generator().manual_seed(seed)
+    inverse = 0.02 * 100 ** torch.rand(height, width, generator=generator)
+    known = torch.rand(height, width, generator=generator) < share
+    known[seed % height, seed % width] = True
+    return inverse, torch.rand(2, height, width, generator=generator), known
+
+
+def strip(width: int = 64, near: float = 1.0, far: float = 0.2) -> tuple[Tensor, Tensor, Tensor]:
+    """A near red side, a hole, and a far blue side."""
+    x = torch.arange(width).expand(16, width)
+    inverse = torch.where(x < width // 2, near, far)
+    red, blue = (x < width // 2).float(), (x >= width // 2).float()
+    known = (x < width // 4) | (x >= width - width // 4)
+    return inverse, torch.stack([red, torch.zeros_like(red), blue]), known
+
+
+@PROPERTY
+@given(SEEDS, SIZES, BIASES)
+def test_known_pixels_stay_bit_for_bit_and_the_rest_within_what_is_known(seed: int, size: tuple, bias: float) -> None:
+    inverse, values, known = random_scene(seed, *size)
+    filled, carried = far_fill(inverse, values, known, far_bias=bias)
+    assert torch.equal(filled[known], inverse[known])
+    assert torch.equal(carried[:, known], values[:, known])
+    for image, source in ((filled, inverse[known]), (carried[0], values[0, known]), (carried[1], values[1, known])):
+        assert float(image.min()) >= float(source.min()) * (1 - 1e-4) - 1e-6
+        assert float(image.max()) <= float(source.max()) * (1 + 1e-4) + 1e-6
+
+
+@PROPERTY
+@given(SEEDS, SIZES, BIASES)
+def test_what_is_not_known_is_not_read(seed: int, size: tuple, bias: float) -> None:
+    inverse, values, known = random_scene(seed, *size)
+    filled, carried = far_fill(inverse, values, known, far_bias=bias)
+    for rubbish in (math.nan, math.inf, -1.0, 0.0, 1e30):
+        spoiled = torch.where(known, inverse, rubbish), torch.where(known, values, rubbish)
+        again = far_fill(*spoiled, known, far_bias=bias)
+        assert torch.equal(again[0], filled)
+        assert torch.equal(again[1], carried)
+
+
+@PROPERTY
+@given(SEEDS, SIZES, BIASES)
+def test_a_constant_is_continued_as_it_is(seed: int, size: tuple, bias: float) -> None:
+    _, _, known = random_scene(seed, *size)
+    filled, carried = far_fill(torch.full(size, 0.3), torch.full((1, *size), 0.7), known, far_bias=bias)
+    torch.testing.assert_close(filled, torch.full(size, 0.3), rtol=1e-5, atol=0)
+    torch.testing.assert_close(carried, torch.full((1, *size), 0.7), rtol=1e-5, atol=0)
+
+
+@PROPERTY
+@given(SEEDS, SIZES, BIASES, st.sampled_from([1e-3, 0.1, 37.0, 1e3]))
+def test_the_unit_of_depth_plays_no_part(seed: int, size: tuple, bias: float, unit: float) -> None:
+    inverse, values, known = random_scene(seed, *size)
+    filled, carried = far_fill(inverse, values, known, far_bias=bias)
+    scaled, same = far_fill(unit * inverse, values, known, far_bias=bias)
+    torch.testing.assert_close(scaled / unit, filled, rtol=2e-3, atol=0)
+    torch.testing.assert_close(same, carried, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("bias", [0.0, 80.0])
+@pytest.mark.parametrize("flip", [(0,), (1,), (0, 1)])
+def test_left_and_right_top_and_bottom_are_alike(bias: float, flip: tuple[int, ...]) -> None:
+    inverse, values, known = random_scene(3, 32, 32, share=0.3)
+    filled, _ = far_fill(inverse, values, known, far_bias=bias)
+    flipped, _ = far_fill(inverse.flip(flip), values.flip([1 + axis for axis in flip]), known.flip(flip), far_bias=bias)
+    torch.testing.assert_close(flipped.flip(flip), filled, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_hole_beside_a_near_thing_continues_what_lies_behind_it(turned: bool, flipped: bool) -> None:
+    inverse, values, known = strip()
+    if flipped:
+        inverse, values, known = inverse.flip(1), values.flip(2), known.flip(1)
+    if turned:
+        inverse, values, known = inverse.T, values.transpose(1, 2), known.T
+    filled, carried = far_fill(inverse, values, known)
+    _, alike = far_fill(inverse, values, known, far_bias=0.0)
+    assert float(filled[~known].median()) < 0.3  # the far side has 0.2, the near one 1
+    assert float(alike[0][~known].mean()) == pytest.approx(0.5, abs=0.05)
+    assert float(carried[0][~known].mean()) < 0.3
+
+
+def test_without_a_bias_both_sides_count_alike() -> None:
+    inverse, values, known = strip()
+    filled, carried = far_fill(inverse, values, known, far_bias=0.0)
+    x = torch.arange(16, 48)
+    expected = 1.0 - 0.8 * (x - 15) / 33  # the membrane between two straight rims is a ramp
+    assert float((filled[:, 16:48] - expected).abs().max()) < 0.08
+    torch.testing.assert_close(carried[0] + carried[2], torch.ones(16, 64), rtol=0, atol=1e-5)
+
+
+def membrane(image: Tensor, known: Tensor) -> Tensor:
+    """The exact membrane: each unknown pixel is the mean of its neighbours inside the image."""
+    height, width = image.shape
+    system, right = torch.eye(height * width, dtype=torch.float64), torch.where(known, image, 0.0).double().flatten()
+    for y, x in (~known).nonzero().tolist():
+        around = [(y + dy, x + dx) for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
+        inside = [(v, u) for v, u in around if 0 <= v < height and 0 <= u < width]
+        for v, u in inside:
+            system[y * width + x, v * width + u] = -1 / len(inside)
+    return torch.linalg.solve(system, right).reshape(height, width)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_without_a_bias_the_fill_is_nearly_the_exact_membrane(share: float) -> None:
+    generator = torch.Generator().manual_seed(5)
+    y, x = torch.meshgrid(torch.linspace(0, 3, 24), torch.linspace(0, 3, 24), indexing="ij")
+    inverse = 1 + 0.5 * torch.sin(x + y)
+    known = torch.rand(24, 24, generator=generator) < share
+    filled, _ = far_fill(inverse, torch.zeros(0, 24, 24), known, far_bias=0.0)
+    error = filled.double() - membrane(inverse, known)
+    assert float(error.square().mean().sqrt()) < 0.02
+
+
+def test_a_bias_image_acts_where_it_stands() -> None:
+    inverse, values, known = random_scene(1, 16, 16)
+    filled, carried = far_fill(inverse, values, known, far_bias=torch.full((16, 16), 80.0))
+    again, same = far_fill(inverse, values, known, far_bias=80.0)
+    assert torch.equal(filled, again)
+    assert torch.equal(carried, same)
+    near_far, colors, rim = (torch.cat([image] * 4, dim=-2) for image in strip())
+    upper = torch.zeros(64, 64)
+    upper[:32] = 80.0
+    mixed, _ = far_fill(near_far, colors, rim, far_bias=upper)
+    above, below = mixed[:24, 16:48].mean(), mixed[-24:, 16:48].mean()
+    assert float(above) < 0.4
+    assert float(below) == pytest.approx(0.6, abs=0.05)  # the mean of the ramp from 1 to 0.2
+
+
+def test_results_repeat_bit_for_bit() -> None:
+    scene = random_scene(2, 37, 53)
+    first, second = far_fill(*scene), far_fill(*scene)
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2), (47, 63)])
+def test_any_size_is_filled_from_a_single_pixel(size: tuple[int, int]) -> None:
+    known = torch.zeros(size, dtype=torch.bool)
+    known[-1, -1] = True
+    filled, carried = far_fill(torch.full(size, 0.5), torch.full((3, *size), 0.25), known)
+    torch.testing.assert_close(filled, torch.full(size, 0.5))
+    torch.testing.assert_close(carried, torch.full((3, *size), 0.25))
+
+
+def test_nothing_to_carry_along_is_allowed_and_nothing_known_is_not() -> None:
+    inverse, _, known = random_scene(0, 5, 5)
+    filled, carried = far_fill(inverse, torch.zeros(0, 5, 5), known)
+    assert carried.shape == (0, 5, 5)
+    assert torch.equal(filled[known], inverse[known])
+    with pytest.raises(ValueError, match="no pixel is known"):
+        far_fill(inverse, torch.zeros(1, 5, 5), torch.zeros(5, 5, dtype=torch.bool))
+
+
+def test_without_holes_nothing_happens_and_the_input_is_left_alone() -> None:
+    inverse, values, known = random_scene(4, 8, 8)
+    kept = inverse.clone(), values.clone()
+    far_fill(inverse, values, known)
+    assert torch.equal(inverse, kept[0])
+    assert torch.equal(values, kept[1])
+    filled, carried = far_fill(inverse, values, torch.ones(8, 8, dtype=torch.bool))
+    assert torch.equal(filled, inverse)
+    assert torch.equal(carried, values)
