@@ -125,3 +125,9 @@ def motorcycle() -> Stereo:
     photos = [torch.from_numpy(image).float() / 255 for image in (left, right)]
     scene = Scene(photos[0], torch.from_numpy(depth), Camera(K, torch.eye(4), width, height))
     return Stereo(scene, Camera(beside, pose, width, height), photos[1])
+
+
+@functools.cache
+def motorcycle_base() -> BasePrediction:
+    """Motorcycle's left photo, lifted once for all tests of a run."""
+    return motorcycle().left.lift()
