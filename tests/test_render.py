@@ -42,8 +42,11 @@ def turned_camera(width: int, height: int, focal: float) -> Camera:
     return camera.looking(torch.tensor([0.5, -0.3, -0.8]), torch.tensor([0.2, 0.4, 5.0]))
 
 
-def random_scene(seed: int, n: int, camera: Camera, dtype=torch.float32) -> Gaussians:
-    """Gaussians in and around the view, some behind the camera; no two at nearly the same depth."""
+def random_scene(seed: int, n: int, camera: Camera, solidity: float = 1.0, dtype=torch.float32) -> Gaussians:
+    """Gaussians in and around the view, some behind the camera; no two at nearly the same depth.
+
+    With more solidity more of them are opaque: pixels fill up, alphas reach their clamp.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> torch.Tensor:
@@ -57,7 +60,7 @@ def random_scene(seed: int, n: int, camera: Camera, dtype=torch.float32) -> Gaus
         camera.unproject(uv, z),
         torch.randn(n, 4, generator=generator),
         pixels * z.abs()[:, None] / camera.focal[0],
-        1.02 * uniform(n),
+        1.02 * uniform(n) ** (1 / solidity),
         uniform(n, 3),
     ).to(dtype=dtype)
 
@@ -213,44 +216,44 @@ def test_get_renderer_knows_its_devices():
 
 scenes = st.tuples(
     st.integers(0, 2**31), st.integers(1, 80), st.integers(1, 50), st.integers(1, 50), st.floats(20, 90),
-    st.sampled_from([0.0, 0.3]),
+    st.sampled_from([0.0, 0.3]), st.sampled_from([1.0, 10.0]),
 )  # fmt: skip
 
 
 @settings(max_examples=25, deadline=None)
 @given(scenes)
 def test_images_match_the_twin(scene):
-    seed, n, width, height, focal, eps2d = scene
+    seed, n, width, height, focal, eps2d, solidity = scene
     camera = turned_camera(width, height, focal)
-    gaussians = random_scene(seed, n, camera)
+    gaussians = random_scene(seed, n, camera, solidity)
     fast = CPU.render(gaussians, camera, eps2d=eps2d)
     slow = TWIN.render(gaussians.to(dtype=torch.float64), camera, eps2d=eps2d)
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
     assert (~sturdy).sum() <= 2 + 0.02 * sturdy.numel()
     for name in FIELDS:
         found, expected = getattr(fast, name).double(), getattr(slow, name)
-        torch.testing.assert_close(found[sturdy], expected[sturdy], rtol=1e-4, atol=1e-4, msg=lambda m, n=name: n + m)
+        torch.testing.assert_close(found[sturdy], expected[sturdy], rtol=1e-5, atol=1e-5, msg=lambda m, n=name: n + m)
 
 
 @settings(max_examples=15, deadline=None)
 @given(scenes)
 def test_gradients_match_the_twin(scene):
-    seed, n, width, height, focal, eps2d = scene
+    seed, n, width, height, focal, eps2d, solidity = scene
     camera = turned_camera(width, height, focal)
-    gaussians = random_scene(seed, n, camera)
+    gaussians = random_scene(seed, n, camera, solidity)
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
-    weights = torch.randn(height, width, 5, generator=torch.Generator().manual_seed(seed)) * sturdy[..., None]
+    # In any one weighting the pixels' shares may cancel; in none of several they hardly can.
+    weights = torch.randn(4, height, width, 5, generator=torch.Generator().manual_seed(seed)) * sturdy[..., None]
     gradients = []
     for renderer, dtype in ((CPU, torch.float32), (TWIN, torch.float64)):
         leaf = with_grad(gaussians.to(dtype=dtype))
         view = renderer.render(leaf, camera, eps2d=eps2d)
         images = torch.cat([view.rgb, view.depth[..., None], view.alpha[..., None]], dim=-1)
-        gradients.append(torch.autograd.grad((images * weights).sum(), leaf.tensors))
+        rows = [torch.autograd.grad((images * w).sum(), leaf.tensors, retain_graph=True) for w in weights]
+        gradients.append([torch.stack(column).double() for column in zip(*rows, strict=True)])
     for name, found, expected in zip(vars(gaussians), *gradients, strict=True):
         scale = float(expected.abs().max())
-        torch.testing.assert_close(
-            found.double(), expected, rtol=1e-4, atol=1e-4 * scale + 1e-6, msg=lambda m, n=name: n + m
-        )
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * scale, msg=lambda m, n=name: n + m)
 
 
 def test_gradients_survive_long_lists_of_faint_gaussians():
@@ -268,7 +271,7 @@ def test_gradients_survive_long_lists_of_faint_gaussians():
 
 def test_the_twins_gradients_are_those_of_finite_differences():
     camera = turned_camera(7, 6, 6.0)
-    scene = random_scene(3, 4, camera, torch.float64)
+    scene = random_scene(3, 4, camera, dtype=torch.float64)
     assert sturdy_pixels(scene, camera, 0.1).all()
 
     def images(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -293,9 +296,9 @@ def test_approximations_hold_over_their_whole_range():
 @settings(max_examples=15, deadline=None)
 @given(scenes, st.integers(0, 2**31))
 def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_seed):
-    seed, n, width, height, focal, eps2d = scene
+    seed, n, width, height, focal, eps2d, solidity = scene
     camera = turned_camera(width, height, focal)
-    gaussians = random_scene(seed, n, camera)
+    gaussians = random_scene(seed, n, camera, solidity)
     generator = torch.Generator().manual_seed(tile_seed)
     tiles = torch.rand(-(-height // TILE), -(-width // TILE), generator=generator) < 0.5
     onto = Rendering(*(torch.rand(height, width, *rest, generator=generator) for rest in ((3,), (), ())))

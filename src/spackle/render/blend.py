@@ -15,11 +15,11 @@ from spackle.render.protocol import ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
 Array = npt.NDArray[Any]
 
-# A tile's state is one flat buffer of five planes: transmittance, red, green, blue, depth. One buffer,
-# because the compiler then knows that the planes do not overlap. Transmittance is negative once a pixel
-# is full: its size stays, and every product with it stays below the stop.
+# A tile's state is one flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red,
+# green, blue, depth, alpha. One buffer, because the compiler then knows that the planes do not overlap.
+# Alpha has a sum of its own: as 1 - light a faint one would lose digits, and depth, its quotient, too.
 PLANE = TILE * TILE
-STATE = 5 * PLANE
+STATE = 6 * PLANE
 CHECK_EVERY = 16  # Gaussians between two looks at whether the whole tile is full
 
 STOP = np.float32(TRANSMITTANCE_STOP)
@@ -49,11 +49,12 @@ def blend_row(
         after = light * (ONE - alpha)
         full = after <= STOP
         weight = ZERO if full else alpha * light
-        state[i] = -abs(light) if full else after
+        state[i] = ZERO if full else after
         state[i + np.uint64(1 * PLANE)] += weight * red
         state[i + np.uint64(2 * PLANE)] += weight * green
         state[i + np.uint64(3 * PLANE)] += weight * blue
         state[i + np.uint64(4 * PLANE)] += weight * depth
+        state[i + np.uint64(5 * PLANE)] += weight
 
 
 @kernel
@@ -102,7 +103,7 @@ def store_tile(state: Array, left: int, top: int, rgb: Array, depth: Array, alph
     for row in range(rows):
         for column in range(columns):
             i = row * TILE + column
-            opacity = ONE - abs(state[i])
+            opacity = state[i + 5 * PLANE]
             alpha[top + row, left + column] = opacity
             depth[top + row, left + column] = state[i + 4 * PLANE] / opacity if opacity > ZERO else ZERO
 

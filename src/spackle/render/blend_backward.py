@@ -100,7 +100,7 @@ def replay_row(
         light = work[i]
         after = light * (ONE - alpha)
         full = after <= STOP
-        work[i] = -abs(light) if full else after
+        work[i] = ZERO if full else after
         notes[n] = ZERO if full else alpha
         notes[n + np.uint64(TILE)] = light
 

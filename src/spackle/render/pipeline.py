@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spackle.gaussians import Gaussians
 from spackle.render.blend import blend_tiles
-from spackle.render.project import Splats, View, project_chunk
+from spackle.render.project import Splats, View, count_before, project_chunk
 from spackle.render.sort import sort_by_depth
 from spackle.render.threads import run_chunks
 from spackle.render.tiles import TileLists, list_tiles
@@ -74,7 +74,7 @@ def draw(
         keep_linear: keep the colour before sRGB, which the gradient needs.
     """
     canvas = Canvas.prepare(view, onto, keep_linear)
-    splats, spans = project(sets, view)
+    splats, spans = project(sets, view, wanted)
     order = sort_by_depth(splats.keys, splats.ids, spans)
     lists = list_tiles(order, splats.boxes, wanted)
     blend(splats, lists, wanted, canvas)
@@ -95,13 +95,14 @@ def wanted_tiles(view: View, tiles: Tensor | None) -> Array:
     return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
 
 
-def project(sets: Sequence[Gaussians], view: View) -> tuple[Splats, Array]:
-    """Project sets one after the other, without joining them first.
+def project(sets: Sequence[Gaussians], view: View, wanted: Array) -> tuple[Splats, Array]:
+    """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
 
     Returns:
         The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
     """
     splats = Splats.allocate(sum(len(part) for part in sets))
+    before = count_before(wanted)
     spans: list[tuple[int, int]] = []
     first = 0
     for part in sets:
@@ -109,7 +110,7 @@ def project(sets: Sequence[Gaussians], view: View) -> tuple[Splats, Array]:
 
         def chunk(start: int, stop: int, first: int = first, arrays: list[Array] = arrays) -> None:
             found = project_chunk(
-                start, stop, first, *arrays, view.lens, view.pose, view.width, view.height, view.eps2d,
+                start, stop, first, *arrays, view.lens, view.pose, view.width, view.height, view.eps2d, before,
                 splats.records, splats.boxes, splats.keys, splats.ids,
             )  # fmt: skip
             spans.append((first + start, found))

@@ -90,6 +90,7 @@ def project_chunk(
     width: int,
     height: int,
     eps2d: float,
+    wanted_before: Array,
     records: Array,
     boxes: Array,
     keys: Array,
@@ -97,7 +98,8 @@ def project_chunk(
 ) -> int:
     """Project Gaussians start..stop of one set, whose first one is number `first` of all.
 
-    Arithmetic is float64, which costs nothing here and keeps thin Gaussians exact.
+    Arithmetic is float64, which costs nothing here and keeps thin Gaussians exact. A Gaussian that
+    touches no wanted tile counts as invisible; see `count_before`.
 
     Returns:
         How many are visible; their keys and ids lie from first + start on.
@@ -126,6 +128,8 @@ def project_chunk(
         reach = 2.0 * max(log_opacity - LOG_FAINT, 0.0) * (1.0 + 1e-5)
         half_height = math.sqrt(reach * cyy)
         if not cover(u, v, math.sqrt(reach * cxx), half_height, width, height, boxes[out]):
+            continue
+        if not touches(boxes[out], wanted_before):
             continue
         narrow = 1.0 / cyy
         fall, across = 0.5 * LOG2_E * narrow, 0.5 * LOG2_E * cyy / det
@@ -187,3 +191,16 @@ def cover(u: float, v: float, half_width: float, half_height: float, width: int,
     box[0], box[1] = left // TILE, (right + TILE - 1) // TILE
     box[2], box[3] = top // TILE, (bottom + TILE - 1) // TILE
     return True
+
+
+def count_before(wanted: Array) -> Array:
+    """How many tiles are wanted above and to the left of each corner, [rows + 1, columns + 1] int32."""
+    return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
+
+
+@kernel
+def touches(box: Array, wanted_before: Array) -> bool:
+    """Whether any tile of a box is wanted."""
+    left, right, top, bottom = box[0], box[1], box[2], box[3]
+    below = wanted_before[bottom, right] - wanted_before[bottom, left]
+    return bool(below != wanted_before[top, right] - wanted_before[top, left])
