@@ -74,7 +74,7 @@ def predict(
         str | None,
         typer.Option(
             metavar="PATH|seeds|none",
-            help="Weights of the residual. seeds: without any; none: the base alone. Default: shipped weights, else seeds.",
+            help="Weights of the residual. seeds: without any; none: base alone. Default: shipped ones, else seeds.",
         ),
     ] = None,
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,

@@ -113,13 +113,9 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
 
 
 def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:
-    """(width, height) with the long side at most `max_side`, never enlarged, both made even."""
-    if max_side < 2:
-        raise InputError(f"the long side must be at least 2 pixels, got {max_side}")
+    """(width, height) with the long side at most `max_side`, never enlarged."""
     scale = min(1.0, max_side / max(width, height))
-    cap = max_side // 2 * 2
-    new_width, new_height = (min(cap, max(2, 2 * round(side * scale / 2))) for side in (width, height))
-    return new_width, new_height
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def film_to_pixels(focal_mm: float, width: int, height: int) -> float:

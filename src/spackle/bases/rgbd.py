@@ -16,7 +16,9 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.surface import surface_gaussians, surface_slope
 
-OPACITY = 0.999
+# Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
+# behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
+OPACITY = 0.99
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
 # close the surface would blur it. So a coarse backing, one blob for 2×2 pixels, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
@@ -28,23 +32,14 @@ class Shield:
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> Shield:
         """The shield of a rendered view."""
-        depth = torch.where(hole_mask(rendering.alpha, threshold), 0.0, rendering.depth)
-        wide = max_pool2d(depth[None, None], 2 * REACH_PX + 1, stride=1, padding=REACH_PX)[0, 0]
-        return Shield(camera, wide)
-
-    def blocks(self, points: Tensor) -> Tensor:
-        """[N] bool: points [N, 3] that would stand in front of what this view shows."""
-        uv, z = self.camera.project(points)
-        # A point just outside the frame reaches into it; the shield's border pixels speak for it.
-        x, y = uv.unbind(-1)
-        seen = (z > 0) & (x > -REACH_PX) & (y > -REACH_PX)
-        seen &= (x < self.camera.width + REACH_PX) & (y < self.camera.height + REACH_PX)
-        column = x.nan_to_num(0.0).clamp(0, self.camera.width - 1).long()
-        row = y.nan_to_num(0.0).clamp(0, self.camera.height - 1).long()
-        return seen & (z < self.depth[row, column] * (1.0 + CLEARANCE))
+        depth = torch.where(hole_mask(rendering.alpha, threshold), 0.0, rendering.depth)[None, None]
+        size = 2 * REACH_PX + 1
+        wide = max_pool2d(depth, (size, 1), stride=1, padding=(REACH_PX, 0))
+        wide = max_pool2d(wide, (1, size), stride=1, padding=(0, REACH_PX))
+        return Shield(camera, wide[0, 0])
 
 
-def push_behind(aux: Gaussians, eye: Tensor, shields: list[Shield]) -> Gaussians:
+def push_behind(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> Gaussians:
     """Slide Gaussians away from the eye that wants them until no shield is blocked.
 
     Scaling about the eye moves and grows a Gaussian without changing how that eye sees it. Far enough
@@ -58,18 +53,53 @@ def push_behind(aux: Gaussians, eye: Tensor, shields: list[Shield]) -> Gaussians
     if not len(aux) or not shields:
         return aux
     eye = eye.to(aux.means)
-    factor = torch.ones(len(aux)).to(aux.means)
-    pending = torch.arange(len(aux), device=factor.device)
-    for step in range(STEPS):
-        factor[pending] = 1.0 / (1.0 - step / STEPS)
-        points = eye + factor[pending, None] * (aux.means[pending] - eye)
-        blocked = torch.stack([shield.blocks(points) for shield in shields]).any(0)
-        pending = pending[blocked]
-        if not len(pending):
-            break
-    moved = dataclasses.replace(
-        aux, means=eye + factor[:, None] * (aux.means - eye), scales=aux.scales * factor[:, None]
-    )
-    keep = torch.ones(len(aux), dtype=torch.bool)
-    keep[pending] = False
-    return moved.select(keep)
+    rays = (aux.means - eye).detach().cpu().double().numpy()
+    lenses = np.stack([_lens(shield.camera) for shield in shields])
+    depths = np.concatenate([shield.depth.detach().cpu().float().numpy().ravel() for shield in shields])
+    sizes = np.array([[shield.camera.height, shield.camera.width] for shield in shields])
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+    factors = _free_factors(eye.cpu().double().numpy(), rays, lenses, depths, sizes, starts)
+    factor = torch.from_numpy(factors).to(aux.means)[:, None]
+    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
+    free = factor[:, 0] > 0
+    return moved if bool(free.all()) else moved.select(free)
+
+
+def _lens(camera: Camera) -> Any:
+    """fx, fy, cx, cy and the 3×4 extrinsics, [16] float64."""
+    K, matrix = camera.K.detach().cpu().double(), camera.world_to_camera.detach().cpu().double()
+    return torch.cat([torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), matrix[:3].reshape(-1)]).numpy()
+
+
+@kernel
+def _free_factors(eye: Any, rays: Any, lenses: Any, depths: Any, sizes: Any, starts: Any) -> Any:
+    """For each ray [N, 3] the smallest of 1 / (1 − k / STEPS) that no shield blocks; 0 where there is none."""
+    factors = np.zeros(len(rays))
+    for n in range(len(rays)):
+        for step in range(STEPS):
+            factor = 1.0 / (1.0 - step / STEPS)
+            x, y, z = eye[0] + factor * rays[n, 0], eye[1] + factor * rays[n, 1], eye[2] + factor * rays[n, 2]
+            blocked = False
+            for s in range(len(lenses)):
+                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z):
+                    blocked = True
+                    break
+            if not blocked:
+                factors[n] = factor
+                break
+    return factors
+
+
+@kernel
+def _blocks(lens: Any, depths: Any, start: int, height: int, width: int, x: float, y: float, z: float) -> bool:
+    """Whether a point would stand in front of what a view shows."""
+    depth = lens[12] * x + lens[13] * y + lens[14] * z + lens[15]
+    if not depth > 0:
+        return False
+    u = lens[0] * (lens[4] * x + lens[5] * y + lens[6] * z + lens[7]) / depth + lens[2]
+    v = lens[1] * (lens[8] * x + lens[9] * y + lens[10] * z + lens[11]) / depth + lens[3]
+    # A point just outside the frame reaches into it; the shield's border pixels speak for it.
+    if not (-REACH_PX < u < width + REACH_PX and -REACH_PX < v < height + REACH_PX):
+        return False
+    column, row = min(max(int(np.floor(u)), 0), width - 1), min(max(int(np.floor(v)), 0), height - 1)
+    return bool(depth < depths[start + row * width + column] * (1.0 + CLEARANCE))

@@ -19,6 +19,7 @@ from spackle.residual.network import ResidualNet, network_input
 from spackle.residual.seeds import Seeds, make_seeds
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
+CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 QUIET_HAR = 5e-4  # a view with fewer holes than this needs no completion
 QUIET_VIEWS = 2  # so many in a row, taken from all over a path, end the search for holes
 
@@ -38,26 +39,27 @@ class Completer:
 
     def photo_shield(self) -> Shield:
         """What the photo itself shows: no completion may stand in front of that."""
-        return self._shield(self.photo_camera, self.renderer.render(self.base, self.photo_camera))
+        rendering = self.renderer.render(self.base, self.photo_camera)
+        return Shield.of(rendering, self.photo_camera, self.threshold)
 
     @torch.no_grad()
-    def complete_view(self, camera: Camera, shields: Sequence[Shield] = (), aux: Gaussians | None = None) -> Gaussians:
+    def complete_view(
+        self,
+        camera: Camera,
+        shields: Sequence[Shield] = (),
+        aux: Gaussians | None = None,
+        rendering: Rendering | None = None,
+    ) -> Gaussians:
         """New aux Gaussians for one view, 𝒢̃_aug of eq. 6: one for each masked cell that needs one.
 
         Args:
             camera: the view to complete.
             shields: views whose content must stay in front, the photo's for instance.
             aux: aux Gaussians that are there already.
+            rendering: base and aux from this view, where that is at hand.
         """
-        found = [] if aux is None else [aux]
-        already = len(found)
-        for _ in range(PASSES):
-            rendering = self.renderer.render([self.base, *found], camera)
-            new = self._propose(rendering, camera)
-            if not len(new):
-                break
-            found.append(push_behind(new, camera.position, list(shields)))
-        return Gaussians.cat([Gaussians.empty(), *found[already:]])
+        there = [self.base] if aux is None else [self.base, aux]
+        return self._fill(camera, shields, there, rendering or self.renderer.render(there, camera))[0]
 
     @torch.no_grad()
     def complete_scene(
@@ -74,7 +76,7 @@ class Completer:
             progress: called with (views visited, views at most).
         """
         order = farthest_first(cameras, self.photo_camera)
-        shields = {-1: self.photo_shield()}
+        shields = [self.photo_shield()]
         aux = Gaussians.empty()
         quiet = 0
         for count, index in enumerate(order):
@@ -84,16 +86,29 @@ class Completer:
                 quiet += 1
             else:
                 quiet = 0
-                aux = Gaussians.cat([aux, self.complete_view(camera, list(shields.values()), aux)])
-                shields[index] = self._shield(camera, self.renderer.render([self.base, aux], camera))
+                new, after = self._fill(camera, shields, [self.base, aux], before)
+                aux = Gaussians.cat([aux, new])
+                shields.append(Shield.of(after, camera, self.threshold))
             if progress:
                 progress(count + 1, len(order))
             if quiet >= QUIET_VIEWS and not visit_all:
                 break
         return aux
 
-    def _shield(self, camera: Camera, rendering: Rendering) -> Shield:
-        return Shield.of(rendering, camera, self.threshold)
+    def _fill(
+        self, camera: Camera, shields: Sequence[Shield], there: Sequence[Gaussians], rendering: Rendering
+    ) -> tuple[Gaussians, Rendering]:
+        """New aux Gaussians for a view, and the view with them."""
+        added = [Gaussians.empty()]
+        for _ in range(PASSES):
+            new = self._propose(rendering, camera)
+            if not len(new):
+                break
+            added.append(push_behind(new, camera.position, shields))
+            rendering = self.renderer.render([*there, *added], camera)
+            if hole_area_ratio(rendering.alpha, self.threshold) < CLOSED_HAR:
+                break
+        return Gaussians.cat(added), rendering
 
     def _propose(self, rendering: Rendering, camera: Camera) -> Gaussians:
         """One Gaussian for each masked cell of a rendering."""

@@ -17,7 +17,7 @@ BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaus
 
 RIM_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-OPACITY = 0.999
+OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 
 
 @dataclasses.dataclass(frozen=True)
