@@ -1,6 +1,7 @@
 """The CPU renderer against hand-computed cases, and against its plain twin."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -353,6 +354,16 @@ def test_results_repeat_bit_for_bit_whatever_the_number_of_threads():
         torch.set_num_threads(threads)
     for result in results[1:]:
         assert all(torch.equal(one, other) for one, other in zip(results[0], result, strict=True))
+
+
+def test_two_python_threads_may_render_at_once():
+    camera = turned_camera(130, 100, 100.0)
+    scenes = [random_scene(seed, 1000, camera) for seed in range(4)]
+    alone = [CPU.render(scene, camera) for scene in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda scene: CPU.render(scene, camera), scenes))
+    for one, other in zip(alone, together, strict=True):
+        assert_same(one, other)
 
 
 def test_joined_and_separate_sets_are_the_same_scene():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle.render._numba import kernel
+from spackle._numba import kernel
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN
 
 # Constants are float32 throughout: a Python float would widen a whole expression to float64.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spackle.render._numba import kernel
+from spackle._numba import kernel
 from spackle.render.approx import HALF, ONE, ZERO, alpha_of, encode_srgb
 from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
 from spackle.render.protocol import ALPHA_MIN, TILE, TRANSMITTANCE_STOP

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spackle.render._numba import kernel, reordering_kernel
+from spackle._numba import kernel, reordering_kernel
 from spackle.render.approx import HALF, LIMIT, ONE, ZERO, alpha_of, srgb_slope
 from spackle.render.blend import CHECK_EVERY, INVISIBLE, PLANE, STOP, is_full, rows_of
 from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
@@ -258,7 +258,8 @@ def backward_tile(
             wanted = wanted_row(part[k], ranges) >= 0
             slot -= wanted
             if k < drawn:
-                walk_back(work, notes, first_notes[k], records[part[k]], left, top, wanted, sums[slot])
+                own = sums[slot if wanted else 0]
+                walk_back(work, notes, first_notes[k], records[part[k]], left, top, wanted, own)
 
 
 @kernel

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from spackle._numba import kernel
 from spackle.camera import Camera
-from spackle.render._numba import kernel
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE
 
 Array = npt.NDArray[Any]

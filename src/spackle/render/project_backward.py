@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spackle.render._numba import kernel
+from spackle._numba import kernel
 
 Array = npt.NDArray[Any]
 
