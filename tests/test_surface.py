@@ -15,7 +15,7 @@ from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, und
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.reference import project_covariances
-from spackle.surface import CREASE, EDGE, THICKNESS, neighbours, surface_gaussians, surface_slope
+from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, neighbours, surface_gaussians, surface_slope
 
 PROPERTY = settings(deadline=None, max_examples=60)
 SLOPES = st.floats(-0.01, 0.01)
@@ -110,14 +110,22 @@ def test_the_slope_of_a_plane_is_exact_up_to_its_border(axis: int) -> None:
 def test_a_slope_never_crosses_a_depth_edge() -> None:
     """A slanted box before a wall that slants the other way: each side keeps its own slope."""
     x = torch.arange(20, dtype=torch.float64)
-    near, far = 1.0 + 0.01 * x, 0.3 - 0.002 * x
+    near, far = 1.0 + 0.004 * x, 0.3 - 0.001 * x
     for inverse in (torch.where(x < 10, near, far), torch.where(x < 10, far, near)):
-        expected = torch.where((inverse > 0.5), 0.01, -0.002).double()
+        expected = torch.where((inverse > 0.5), 0.004, -0.001).double()
         slope = surface_slope(inverse.expand(3, 20))
         torch.testing.assert_close(slope[..., 0], expected.expand(3, 20))
         assert not slope[..., 1].any()
         down = surface_slope(inverse[:, None].expand(20, 3))
         torch.testing.assert_close(down[..., 1], expected[:, None].expand(20, 3))
+
+
+def test_a_ragged_rim_faces_the_camera() -> None:
+    """A steep slope that only one side confirms would stand out as a whisker from the side."""
+    inverse = torch.where(torch.arange(20) < 10, 1.0 + 0.009 * torch.arange(20), 0.3).expand(3, 20)
+    slope = surface_slope(inverse)
+    assert (slope[:, :9, 0] > 0).all()
+    assert not slope[:, 9, 0].any()
 
 
 def test_a_lone_pixel_between_two_edges_faces_the_camera() -> None:
@@ -135,10 +143,10 @@ def plain_slope(row: list[float]) -> list[float]:
             continue
         backward = here - row[k - 1] if k > 0 else row[1] - row[0]
         forward = row[k + 1] - here if k < last else row[last] - row[last - 1]
-        slope = (backward + forward) / 2
+        slope, steepest = (backward + forward) / 2, EDGE
         if abs(forward - backward) > CREASE * here:
-            slope = backward if abs(backward) < abs(forward) else forward
-        slopes.append(slope if abs(slope) <= EDGE * here else 0.0)
+            slope, steepest = backward if abs(backward) < abs(forward) else forward, RAGGED
+        slopes.append(slope if abs(slope) <= steepest * here else 0.0)
     return slopes
 
 

@@ -11,6 +11,7 @@ from spackle.gaussians import Gaussians, quat_from_matrix
 
 EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
 CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts
+RAGGED = 0.005  # steepest slope that one side alone is believed; more of it stands out as whiskers from the side
 THICKNESS = 0.05  # third axis, in units of the smaller of the other two
 
 
@@ -67,21 +68,25 @@ def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([p, q, torch.linalg.cross(p, q)], dim=-1), lengths
 
 
-def surface_slope(inverse_depth: Tensor, crease: float = CREASE, edge: float = EDGE) -> Tensor:
+def surface_slope(inverse_depth: Tensor) -> Tensor:
     """Derivative of the inverse depth by pixel x and y, [H, W, 2], that never crosses a depth edge.
 
     The inverse depth of a plane is linear in the pixel, so both one-sided differences agree on a plane
     however slanted. Where they do not, the flatter side is the surface and the other one an edge; where
-    even the flatter one is a jump, the pixel faces the camera.
+    even the flatter one is steep, the depth is ragged there and the pixel faces the camera.
+
+    Args:
+        inverse_depth: [H, W], positive everywhere.
     """
     slopes = []
     for axis in (1, 0):
         before, after = neighbours(inverse_depth, axis)
         backward, forward = inverse_depth - before, after - inverse_depth
         flatter = torch.where(backward.abs() < forward.abs(), backward, forward)
-        smooth = (forward - backward).abs() <= crease * inverse_depth
+        smooth = (forward - backward).abs() <= CREASE * inverse_depth
         slope = torch.where(smooth, (forward + backward) / 2, flatter)
-        slopes.append(torch.where(slope.abs() <= edge * inverse_depth, slope, torch.zeros_like(slope)))
+        steepest = torch.where(smooth, EDGE, RAGGED) * inverse_depth
+        slopes.append(torch.where(slope.abs() <= steepest, slope, torch.zeros_like(slope)))
     return torch.stack(slopes, dim=-1)
 
 

@@ -14,19 +14,30 @@ def attach_flying_pixels(inverse_depth: Tensor, edge: float = EDGE) -> Tensor:
     """Move pixels that hang between foreground and background to the side they are closer to.
 
     A pixel hangs when it lies strictly between its left and right (or upper and lower) neighbours with
-    a depth edge to both.
+    a depth edge to both, while the depth beyond those neighbours goes on much more smoothly: on a steep
+    plane it does not.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
         edge: relative jump that makes a depth edge.
     """
     for axis in (1, 0):
-        before, after = neighbours(inverse_depth, axis)
+        before, after = _shifted(inverse_depth, axis, -1), _shifted(inverse_depth, axis, 1)
         to_before, to_after = (inverse_depth - before).abs(), (inverse_depth - after).abs()
+        gap = torch.minimum(to_before, to_after)
         between = (inverse_depth - before) * (after - inverse_depth) > 0
-        hangs = between & (torch.minimum(to_before, to_after) > edge * inverse_depth)
+        beyond = torch.maximum(
+            (before - _shifted(inverse_depth, axis, -2)).abs(), (after - _shifted(inverse_depth, axis, 2)).abs()
+        )
+        hangs = between & (gap > edge * inverse_depth) & (beyond < 0.5 * gap)
         inverse_depth = torch.where(hangs, torch.where(to_before < to_after, before, after), inverse_depth)
     return inverse_depth
+
+
+def _shifted(image: Tensor, axis: int, by: int) -> Tensor:
+    """The pixel `by` steps along an axis of [H, W]; the border pixel beyond the border."""
+    index = (torch.arange(image.shape[axis]) + by).clamp(0, image.shape[axis] - 1)
+    return image.index_select(axis, index)
 
 
 def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) -> Tensor:

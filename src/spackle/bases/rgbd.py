@@ -8,10 +8,10 @@ from torch.nn.functional import interpolate
 
 from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, undo_quantisation
 from spackle.bases.depth_maps import DepthMap
+from spackle.bases.missing import fill_missing
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
-from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.surface import surface_gaussians, surface_slope
@@ -64,7 +64,7 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     """
     inverse_depth, valid = _inverse_depth(depth, camera.height, camera.width)
     missing = 1.0 - float(valid.float().mean())
-    inverse_depth, _ = far_fill(inverse_depth, rgb.permute(2, 0, 1), valid)
+    inverse_depth = fill_missing(inverse_depth, rgb, valid)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
     colors = srgb_to_linear(rgb)
@@ -97,6 +97,8 @@ def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera)
 def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
     """One wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface."""
     cells = _cells(inverse_depth)
+    if not cells.numel():  # one pixel high or wide
+        return Gaussians.empty()
     far, pick = cells.min(dim=-1)
     slope = _cells(slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
     # The cell's centre lies half a pixel from the farthest pixel's.
