@@ -12,8 +12,8 @@ from torch.nn.functional import pad
 from spackle._numba import kernel
 from spackle.fill import far_fill
 
-COLOR_COST = 60.0  # pixels of detour that crossing from black to white in one channel is worth
-NEAR_COST = 30.0  # pixels of detour before a depth that is far too near is taken
+COLOR_COST = 60.0  # pixels of detour that a change from 0 to 1 in one channel is worth
+NEAR_COST = 300.0  # and this many before a depth is taken that is far too near
 ROUNDS = 4  # sweeps down and up; a path may turn as often
 MEDIAN = 5  # window that removes specks from what was filled
 
