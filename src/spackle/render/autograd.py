@@ -13,12 +13,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from spackle.gaussians import Gaussians
-from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums, count_wanted
+from spackle.render.blend_backward import backward_tiles, collect_sums, count_wanted
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array, draw
 from spackle.render.project import View
 from spackle.render.project_backward import project_backward
 from spackle.render.protocol import TILE
 from spackle.render.threads import run_chunks, thread_count
+from spackle.render.walk import SUMS
 from spackle.rendering import Rendering
 
 Array = npt.NDArray[Any]
