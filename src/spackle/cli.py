@@ -165,7 +165,7 @@ def main() -> None:
     try:
         app()
     except InputError as error:
-        print(f"spackle: {error}", file=sys.stderr)
+        print(f"spackle: {' '.join(str(error).splitlines())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("spackle: interrupted", file=sys.stderr)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from spackle.errors import InputError
+from spackle.formats import check_writable
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")
+LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
 
 
 def find_photos(path: Path) -> list[tuple[Path, str]]:
@@ -17,17 +23,20 @@ def find_photos(path: Path) -> list[tuple[Path, str]]:
     Raises:
         InputError: nothing there, or a folder without photos.
     """
-    if not path.is_dir():
-        return [(path, path.stem)]
+    if not os.path.isdir(path):
+        return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
     try:
-        photos = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in PHOTO_SUFFIXES)
+        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
     except OSError as error:
         raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
     if not photos:
         raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
-    stems = [photo.stem for photo in photos]
-    # a.jpg and a.png must not write over each other.
-    return [(photo, photo.stem if stems.count(photo.stem) == 1 else photo.name) for photo in photos]
+    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
+    stems = Counter(photo.stem.casefold() for photo in photos)
+    names = {photo.name.casefold() for photo in photos}
+    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
+    return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
 
 
 def find_depth(depth: Path, photo: Path) -> Path:
@@ -36,14 +45,50 @@ def find_depth(depth: Path, photo: Path) -> Path:
     Raises:
         InputError: a folder without such a file.
     """
-    if not depth.is_dir():
+    if not os.path.isdir(depth):
         return depth
-    for suffix in DEPTH_SUFFIXES:
-        for candidate in (depth / f"{photo.stem}{suffix}", depth / f"{photo.name}{suffix}"):
-            if candidate.is_file() and candidate.resolve() != photo.resolve():
+    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which a.png may mean too
+        for suffix in DEPTH_SUFFIXES:
+            candidate = depth / f"{name}{suffix}"
+            if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
                 return candidate
     names = ", ".join(f"{photo.stem}{suffix}" for suffix in DEPTH_SUFFIXES)
     raise InputError(f"{photo}: no depth map in {depth}: looked for {names}")
+
+
+@contextlib.contextmanager
+def results_folder(path: Path, files: Sequence[str] = ()) -> Iterator[None]:
+    """Create a folder for results; where the block puts nothing into it, it goes again.
+
+    Args:
+        path: the folder.
+        files: what the block is going to write there. That none of it can be is known at once rather
+            than after long work, and what a killed run left of it half-written goes.
+
+    Raises:
+        InputError: where the folder cannot be created, or one of the files not be written.
+    """
+    missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+    try:
+        make_folder(path)
+        for name in files:
+            check_writable(path / name)
+        _remove_leftovers(path, files)
+        yield
+    finally:
+        for folder in missing:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
+
+
+def _remove_leftovers(folder: Path, files: Sequence[str]) -> None:
+    """Delete temporary files of these names; others may belong to a run that is still at work."""
+    wanted = set(files)
+    with contextlib.suppress(OSError):
+        for file in folder.iterdir():
+            match = LEFTOVER.fullmatch(file.name)
+            if match and match[1] + match[2] in wanted:
+                file.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> None:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
+import torch
+
+from spackle.bases.protocol import Base
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.gaussians import Gaussians
-from spackle.image import load_photo, resize_photo
-from spackle.jobs.inputs import find_photos, make_folder
+from spackle.image import Photo, load_photo, resize_photo
+from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import focal_source, make_report, summary, write_report
 from spackle.jobs.setup import PredictOptions, Tools, make_base, set_up
-from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views
+from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
+
+FILES_WITHOUT_VIDEO = ("base.ply", "scene.ply", "report.json")
+FILES = (*FILES_WITHOUT_VIDEO, "video.mp4")
 
 
 def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
@@ -24,14 +31,15 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     found = find_photos(photos)
     tools = set_up(options)
     failed = 0
-    for path, name in found:
-        try:
-            predict_one(path, output / name, options, tools, reporter)
-        except InputError as error:
-            if not photos.is_dir():
-                raise
-            failed += 1
-            reporter.say(f"error: {error}")
+    with results_folder(output):
+        for path, name in found:
+            try:
+                predict_one(path, output / name, options, tools, reporter)
+            except InputError as error:
+                if path == photos:  # the only one
+                    raise
+                failed += 1
+                reporter.say(f"error: {error}")
     if failed:
         reporter.say(f"{failed} of {len(found)} photos failed")
     return failed
@@ -48,18 +56,39 @@ def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools,
         full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
         base = make_base(full, options)
         photo = resize_photo(full)
-    make_folder(folder)  # before the long work: an output that cannot be written is known at once
+    with contextlib.ExitStack() as folders:
+        folders.enter_context(results_folder(folder, FILES if options.render else FILES_WITHOUT_VIDEO))
+        if tools.views:
+            folders.enter_context(results_folder(folder / "views", view_files(len(tools.views))))
+        _predict_loaded(photo, base, folder, options, tools, reporter, seconds)
+
+
+def _predict_loaded(
+    photo: Photo,
+    base: Base,
+    folder: Path,
+    options: PredictOptions,
+    tools: Tools,
+    reporter: Reporter,
+    seconds: dict[str, float],
+) -> None:
+    """The stages after loading; nothing is written before all is computed."""
+    name = photo.path.name
     with reporter.stage("base", seconds):
         prediction = base.predict(photo)
+        if not _finite(prediction.gaussians):
+            raise InputError(f"{photo.path}: depth times focal length leaves the range of float32: check both")
     reporter.say(
-        f"{path.name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
+        f"{name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
         f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source(photo, prediction)})"
     )
     if missing := float(prediction.notes.get("depth_filled", 0)):
-        reporter.say(f"{path.name}: {missing:.1%} of the depth was missing and has been filled")
-    plan = make_plan(prediction, options, tools.views)
+        reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+    plan = make_plan(photo.path, prediction, options, tools.views)
     with reporter.stage("complete", seconds) as step:
         completed = complete(prediction, plan, options, tools, step)
+        if not _finite(completed.aux):
+            raise InputError(f"{options.cameras or photo.path}: views too extreme to complete: check their K")
     with reporter.stage("write", seconds):
         count = len(completed.base)
         save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
@@ -75,4 +104,8 @@ def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools,
         holes = measure_holes(plan, completed, tools.renderer)
     report = make_report(photo, prediction, base.name, completed, options, tools, holes, seconds)
     write_report(report, folder / "report.json")
-    reporter.say(f"{path.name}: {summary(report)} -> {folder}")
+    reporter.say(f"{name}: {summary(report)} -> {folder}")
+
+
+def _finite(gaussians: Gaussians) -> bool:
+    return all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors)

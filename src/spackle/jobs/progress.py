@@ -22,7 +22,7 @@ class Reporter:
 
     def say(self, line: str) -> None:
         """One line for everybody."""
-        self.console.print(escape(line), soft_wrap=True)
+        self.console.print(escape(" ".join(line.splitlines())), soft_wrap=True)  # names may hold line breaks
 
     def detail(self, line: str) -> None:
         """One line for those who asked for more."""

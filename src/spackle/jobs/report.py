@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
+
 import spackle
 from spackle.bases.protocol import BasePrediction
 from spackle.formats import atomic_path
@@ -16,8 +18,10 @@ from spackle.jobs.views import Completed
 
 def focal_source(photo: Photo, prediction: BasePrediction) -> str:
     """Who said what the focal length is: an option, the photo, the base's calibration, or nobody."""
-    differs = abs(prediction.camera.focal[0] - photo.focal_px) > 1e-3 * photo.focal_px
-    return "calibration" if differs else photo.focal_source
+    if photo.focal_source.startswith("--"):  # a person's word beats the calibration's
+        return photo.focal_source
+    same = torch.allclose(prediction.camera.K, photo.camera.K, rtol=1e-3)
+    return photo.focal_source if same else "calibration"
 
 
 def make_report(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +25,7 @@ Mode = Literal["scene", "view"]
 BASES = ("rgbd",)
 MAX_DISPARITY = 2.0
 MAX_FRAMES = 10_000
+MAX_VIDEO_SIDE = 8192
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +80,8 @@ def set_up(options: PredictOptions) -> Tools:
     residual = options.residual or (str(SHIPPED) if SHIPPED.exists() else "seeds")
     network = None if residual in ("seeds", "none") else load_residual(residual)
     views = load_cameras(options.cameras) if options.cameras else None
+    if views and options.render and (problem := video_problem(views)):
+        raise InputError(f"{options.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     return Tools(get_renderer(options.device), network, residual, views)
 
 
@@ -87,6 +91,16 @@ def check_path_options(disparity: float, frames: int) -> None:
         raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if not 1 <= frames <= MAX_FRAMES:
         raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {frames}")
+
+
+def video_problem(cameras: Sequence[Camera]) -> str | None:
+    """Why these views cannot be the frames of a video, or None."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) > 1:
+        return "the frames differ in size"
+    if max(max(size) for size in sizes) > MAX_VIDEO_SIDE:
+        return f"the frames have more than {MAX_VIDEO_SIDE} pixels a side"
+    return None
 
 
 def make_base(photo: Photo, options: PredictOptions) -> Base:

@@ -14,7 +14,6 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
-from spackle.jobs.inputs import make_folder
 from spackle.jobs.progress import Step
 from spackle.jobs.setup import PredictOptions, Tools
 from spackle.render import Renderer
@@ -46,13 +45,20 @@ class Completed:
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
 
-def make_plan(prediction: BasePrediction, options: PredictOptions, views: list[Camera] | None) -> Plan:
-    """The given views, or a path and its two extremes."""
+def make_plan(photo: Path, prediction: BasePrediction, options: PredictOptions, views: list[Camera] | None) -> Plan:
+    """The given views, or a path and its two extremes.
+
+    Raises:
+        InputError: where depths and focal length allow no path.
+    """
     if views:
         return Plan(views, len(views), {str(i): i for i in range(len(views))})
     gaussians, camera = prediction.gaussians, prediction.camera
-    path = scene_path(gaussians, camera, options.trajectory, options.disparity, options.frames)
-    sides = extremes(even_camera(camera), options.disparity, DepthRange.of(gaussians))
+    try:
+        path = scene_path(gaussians, camera, options.trajectory, options.disparity, options.frames)
+        sides = extremes(even_camera(camera), options.disparity, DepthRange.of(gaussians))
+    except ValueError as error:
+        raise InputError(f"{photo}: no camera path: {error}: check the depth map and the focal length") from error
     names = (f"{-options.disparity:g}", f"+{options.disparity:g}")
     return Plan([*path, *sides], len(path), {name: len(path) + k for k, name in enumerate(names)})
 
@@ -76,16 +82,12 @@ def complete(prediction: BasePrediction, plan: Plan, options: PredictOptions, to
 
 
 def save_plan_video(path: Path, plan: Plan, completed: Completed, renderer: Renderer, step: Step) -> None:
-    """The drawn views as a video.
+    """The drawn views, all of one size, as a video.
 
     Raises:
-        InputError: views of different sizes, or a file that cannot be written.
+        InputError: a file that cannot be written.
     """
     cameras = plan.cameras[: plan.drawn]
-    if len({(camera.width, camera.height) for camera in cameras}) > 1:
-        raise InputError(
-            "--cameras: the frames differ in size, so they make no video: add --no-render for pictures only"
-        )
 
     def frames() -> Iterator[Tensor]:
         for index, camera in enumerate(cameras):
@@ -96,10 +98,14 @@ def save_plan_video(path: Path, plan: Plan, completed: Completed, renderer: Rend
     save_video(frames(), path)
 
 
+def view_files(count: int) -> list[str]:
+    """What `save_views` writes for so many views."""
+    return [f"{index:04d}{kind}.png" for index in range(count) for kind in ("", "_base", "_mask")]
+
+
 @torch.no_grad()
 def save_views(folder: Path, plan: Plan, completed: Completed, renderer: Renderer, step: Step) -> None:
     """Each drawn view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
-    make_folder(folder)
     for index, camera in enumerate(plan.cameras[: plan.drawn]):
         before = renderer.render(completed.base, camera)
         save_png(renderer.render(completed.of_view(index), camera).rgb, folder / f"{index:04d}.png")
