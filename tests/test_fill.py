@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plain_fill import plain_far_fill
 from torch import Tensor
 
 from spackle.fill import far_fill
@@ -46,6 +47,17 @@ def test_known_pixels_stay_bit_for_bit_and_the_rest_within_what_is_known(seed: i
     for image, source in ((filled, inverse[known]), (carried[0], values[0, known]), (carried[1], values[1, known])):
         assert float(image.min()) >= float(source.min()) * (1 - 1e-4) - 1e-6
         assert float(image.max()) <= float(source.max()) * (1 + 1e-4) + 1e-6
+
+
+@PROPERTY
+@given(SEEDS, SIZES, BIASES, st.integers(0, 12), st.booleans())
+def test_the_fill_matches_its_plain_twin(seed: int, size: tuple, bias: float, sweeps: int, uneven: bool) -> None:
+    inverse, values, known = random_scene(seed, *size)
+    biases = bias * torch.rand(size, generator=torch.Generator().manual_seed(seed)) if uneven else bias
+    filled, carried = far_fill(inverse, values, known, far_bias=biases, sweeps=sweeps)
+    plain, beside = plain_far_fill(inverse, values, known, far_bias=biases, sweeps=sweeps)
+    torch.testing.assert_close(filled, plain, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(carried, beside, rtol=1e-3, atol=1e-3)
 
 
 @PROPERTY

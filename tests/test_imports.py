@@ -1,0 +1,149 @@
+"""What may import what: the house's rooms, the light package, and the core dependencies alone."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import spackle
+
+SOURCES = Path(spackle.__file__).parent
+FILES = sorted(SOURCES.rglob("*.py"))
+
+OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage")
+
+# Rooms in the order in which the data flows; each may import itself and what is named here.
+SHELL = {"", "__main__", "cli", "jobs", "scene"}  # thin, on top of everything; "" is the package itself
+ALLOWED = {
+    "values": set(),
+    "render": {"values"},
+    "bases": {"values"},
+    "residual": {"values", "render"},
+    "formats": {"values"},
+    "pseudo": {"values", "render", "bases", "residual"},
+    "training": {"values", "render", "bases", "residual", "formats", "pseudo"},
+    "evaluation": {"values", "render", "bases", "residual", "formats", "pseudo", "training"},
+    "viewer": {"values", "formats", "residual"},
+    "shell": {"values", "render", "bases", "residual", "formats", "pseudo", "training", "evaluation", "viewer"},
+}
+
+# Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.
+WITH_THE_CORE_ALONE = """
+import importlib, importlib.abc, importlib.metadata as metadata, pkgutil, re, sys
+
+def closure(name, found):
+    key = re.sub(r"[-_.]+", "-", name).lower()
+    if key in found:
+        return found
+    found.add(key)
+    try:
+        requirements = metadata.requires(name) or []
+    except metadata.PackageNotFoundError:
+        return found
+    for requirement in requirements:
+        if "extra ==" not in requirement:
+            closure(re.match(r"[\\w.-]+", requirement).group(), found)
+    return found
+
+core = closure("spackle-nvs", set())
+hidden = set(sys.argv[1:])
+for module, owners in metadata.packages_distributions().items():
+    if not any(re.sub(r"[-_.]+", "-", owner).lower() in core for owner in owners):
+        hidden.add(module)
+
+class Hide(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in hidden:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Hide())
+import spackle
+names = [m.name for m in pkgutil.walk_packages(spackle.__path__, "spackle.") if not m.name.endswith("__main__")]
+for name in names:
+    importlib.import_module(name)
+print(len(names))
+"""
+
+
+def python(code: str, *arguments: str) -> str:
+    """The output of a fresh interpreter."""
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(SOURCES.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(module: str) -> str:
+    """The room of a module of ours; a folder that is no room is its own name, which no list has."""
+    parts = [*module.split(".")[1:], ""]
+    if parts[0] in SHELL:
+        return "shell"
+    return parts[0] if (SOURCES / parts[0]).is_dir() else "values"
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Every module that a file imports, wherever in it; `from a import b` counts as a.b where that is a module."""
+    package = module_of(path) if path.name == "__init__.py" else module_of(path).rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = SOURCES.parent.joinpath(*source.split("."), alias.name)
+                yield f"{source}.{alias.name}" if inner.with_suffix(".py").is_file() or inner.is_dir() else source
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(SOURCES).as_posix()
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_a_room_imports_only_what_the_house_allows(path: Path) -> None:
+    room = room_of(module_of(path))
+    assert room in ALLOWED, f"{room} is no room of the house"
+    for module in imports_of(path):
+        if module.partition(".")[0] == "spackle":
+            assert room_of(module) in ALLOWED[room] | {room}, f"{name_of(path)} imports {module}"
+
+
+def test_modules_import_each_other_in_one_direction() -> None:
+    ours = {module_of(path): path for path in FILES if path.name != "__init__.py"}
+    waiting = {module: {m for m in imports_of(path) if m in ours} for module, path in ours.items()}
+    while free := {module for module, needs in waiting.items() if not needs & set(waiting)}:
+        waiting = {module: needs for module, needs in waiting.items() if module not in free}
+    assert not waiting, "these import each other in a circle"
+
+
+@pytest.mark.parametrize("package", OPTIONAL)
+def test_each_optional_package_is_wrapped_by_one_file_and_never_at_its_top(package: str) -> None:
+    users = [path for path in FILES if any(m.partition(".")[0] == package for m in imports_of(path))]
+    assert len(users) <= 1, [name_of(path) for path in users]
+    for path in users:
+        top = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.Import)]
+        froms = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ImportFrom)]
+        assert package not in {alias.name.partition(".")[0] for node in top for alias in node.names}
+        assert package not in {(node.module or "").partition(".")[0] for node in froms}
+
+
+def test_every_module_imports_with_the_core_dependencies_alone() -> None:
+    assert int(python(WITH_THE_CORE_ALONE, *OPTIONAL)) == sum(
+        path.name != "__main__.py" and path.parent.joinpath("__init__.py").is_file() and path != SOURCES / "__init__.py"
+        for path in FILES
+    )
+
+
+def test_import_spackle_loads_no_optional_package() -> None:
+    loaded = python("import spackle, sys; print(*{name.partition('.')[0] for name in sys.modules})").split()
+    assert "spackle" in loaded
+    assert not set(OPTIONAL) & set(loaded)
