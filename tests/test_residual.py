@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -31,7 +32,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, hole_mask, make_seeds
-from spackle.residual.carve import CLEARANCE, REACH_PX, STEPS, Shield, push_behind
+from spackle.residual.carve import CLEARANCE, MAX_REACH_PX, REACH, SHIELD_PX, STEPS, Shield, push_behind
 from spackle.residual.complete import farthest_first
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.network import IN_CHANNELS, network_input
@@ -426,23 +427,37 @@ def test_an_untrained_network_can_leave_zero() -> None:
 def plain_push(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> tuple[list[float], list[int]]:
     """The factors and the survivors of `push_behind`, one Gaussian at a time."""
 
-    def blocked(point: Tensor) -> bool:
+    def blocked(point: Tensor, covariance: Tensor) -> bool:
         for shield in shields:
-            uv, z = shield.camera.to(dtype=torch.float64).project(point)
-            (u, v), (height, width) = uv.tolist(), shield.depth.shape
-            near = -REACH_PX < u < width + REACH_PX and -REACH_PX < v < height + REACH_PX
-            if float(z) <= 0 or not near:
+            camera = shield.camera.to(dtype=torch.float64)
+            local, (uv, z) = camera.to_camera(point), camera.project(point)
+            if float(z) <= 0:
                 continue
-            row, column = min(max(math.floor(v), 0), height - 1), min(max(math.floor(u), 0), width - 1)
-            if float(z) < float(shield.depth[row, column]) * (1 + CLEARANCE):
-                return True
+            rotation = camera.world_to_camera[:3, :3]
+            spread = rotation @ covariance @ rotation.T
+            reach = []
+            for axis in (0, 1):
+                row = torch.zeros(3, dtype=torch.float64)
+                row[axis], row[2] = 1 / z, -local[axis] / z**2
+                deviation = float(camera.K[axis, axis] * (row @ spread @ row).clamp_min(0).sqrt())
+                reach.append(min(REACH * deviation + 1, MAX_REACH_PX))
+            (u, v), (height, width) = uv.tolist(), shield.depth.shape
+            if not (-reach[0] <= u <= width + reach[0] and -reach[1] <= v <= height + reach[1]):
+                continue
+            across, down = (math.ceil(max(r - SHIELD_PX, 0) / (2 * SHIELD_PX)) for r in reach)
+            for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
+                row_, column = math.floor(v + 2 * SHIELD_PX * j), math.floor(u + 2 * SHIELD_PX * i)
+                seen = shield.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
+                if float(z) < float(seen) * (1 + CLEARANCE):
+                    return True
         return False
 
     factors, kept = [], []
+    covariances = aux.covariances().double()
     for index, mean in enumerate(aux.means.double()):
         for step in range(STEPS):
             factor = 1 / (1 - step / STEPS)
-            if not blocked(eye.double() + factor * (mean - eye.double())):
+            if not blocked(eye.double() + factor * (mean - eye.double()), factor**2 * covariances[index]):
                 factors.append(factor)
                 kept.append(index)
                 break
@@ -481,8 +496,8 @@ def test_a_shield_is_the_farthest_depth_within_reach_and_none_over_holes() -> No
     alpha[:, 20:] = 0.5
     shield = Shield.of(Rendering(torch.zeros(20, 30, 3), depth, alpha), Camera.from_focal(20, 30, 20))
     block = torch.full((20, 30), 3.0)
-    block[:, 20 + REACH_PX :] = 0
-    block[10 - REACH_PX : 11 + REACH_PX, 15 - REACH_PX : 16 + REACH_PX] = 7
+    block[:, 20 + SHIELD_PX :] = 0
+    block[10 - SHIELD_PX : 11 + SHIELD_PX, 15 - SHIELD_PX : 16 + SHIELD_PX] = 7
     assert torch.equal(shield.depth, block)
 
 

@@ -131,6 +131,8 @@ def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]
 
     Any beginning of it is spread evenly over the path.
     """
+    if not cameras:
+        return []
     eyes = torch.stack([camera.position.double() for camera in cameras])
     distance = (eyes - photo_camera.position.double()).norm(dim=-1)
     order: list[int] = []

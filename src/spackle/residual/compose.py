@@ -53,7 +53,9 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, gains: DeltaGai
         return _lift(seeds.uv, seeds.inverse_depth, seeds, seeds.rgb, opacities, camera)
     gains = gains or DeltaGains()
     uv = seeds.uv + gains.xy_px * deltas[:, XY]
-    inverse_depth = _shift_positive(seeds.inverse_depth, gains.inverse_depth * deltas[:, INVERSE_DEPTH].squeeze(1))
+    inverse_depth = _shift_positive(
+        seeds.inverse_depth, gains.inverse_depth * deltas[:, INVERSE_DEPTH].squeeze(1), seeds.unit
+    )
     rgb = _shift_sigmoid(seeds.rgb, gains.color * deltas[:, COLOR])
     opacities = _shift_sigmoid(opacities, gains.opacity * deltas[:, ALPHA].squeeze(1))
     surfels = _lift(uv, inverse_depth, seeds, rgb, opacities, camera)
@@ -68,9 +70,8 @@ def _lift(uv: Tensor, inverse_depth: Tensor, seeds: Seeds, rgb: Tensor, opacitie
     return surface_gaussians(camera, uv, inverse_depth, seeds.slope, SPREAD_PX, srgb_to_linear(rgb), opacities)
 
 
-def _shift_positive(base: Tensor, delta: Tensor) -> Tensor:
-    """softplus(softplus⁻¹(base) + delta), in units in which the view's median is 1."""
-    unit = base.detach().median() if base.numel() else base.new_ones(())
+def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
+    """softplus(softplus⁻¹(base) + delta), both in multiples of `unit`."""
     relative = (base / unit).clamp_min(1e-4)
     return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta)
 

@@ -73,9 +73,8 @@ class ResidualNet(nn.Module):
 
 def network_input(cues: Cues, seeds: Seeds) -> Tensor:
     """Features [1, 10, h, w], centred around zero; depths as log inverse depth over the view's median."""
-    unit = seeds.inverse_depth.median()
-    cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / unit).clamp_min(1e-4).log(), 0.0)
-    seed_depth = (seeds.inverse_depth / unit).clamp_min(1e-4).log()
+    cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
+    seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
     channels = [cues.rgb.permute(2, 0, 1) - 0.5, torch.stack(maps), seeds.rgb.permute(2, 0, 1) - 0.5]
     return torch.cat(channels)[None].detach()

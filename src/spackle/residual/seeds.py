@@ -28,10 +28,11 @@ class Seeds:
     inverse_depth: Tensor  # [h, w]
     slope: Tensor  # [h, w, 2] derivative of the inverse depth by pixel
     rgb: Tensor  # [h, w, 3] sRGB
+    unit: float = 1.0  # the view's median inverse depth, in which depths and their deltas are measured
 
     def select(self, cells: Tensor) -> Seeds:
         """The chosen cells, flat: a boolean grid [h, w] gives fields [n, ...]."""
-        return Seeds(self.uv[cells], self.inverse_depth[cells], self.slope[cells], self.rgb[cells])
+        return Seeds(self.uv[cells], self.inverse_depth[cells], self.slope[cells], self.rgb[cells], self.unit)
 
 
 def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
@@ -56,7 +57,7 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     placed = torch.minimum(filled, cues.farthest_around(RIM_CELLS)) * (1.0 - BEHIND)
     inverse_depth = torch.where(cues.mask, placed, filled)
     slope = surface_slope(inverse_depth) / CELL
-    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0))
+    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
 
 
 def _sources(cues: Cues) -> Tensor:
@@ -86,4 +87,4 @@ def _inside(points: Tensor, camera: Camera) -> Tensor:
 def _empty_view(cues: Cues, camera: Camera) -> Seeds:
     """Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any."""
     uv = cell_centers(camera).to(cues.rgb)
-    return Seeds(uv, torch.full_like(cues.alpha, 0.1), torch.zeros_like(uv), torch.full_like(cues.rgb, 0.5))
+    return Seeds(uv, torch.full_like(cues.alpha, 0.1), torch.zeros_like(uv), torch.full_like(cues.rgb, 0.5), 0.1)
