@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from spackle.rendering import Rendering
     from spackle.residual import Completer, hole_area_ratio, hole_mask
     from spackle.scene import Scene, complete, predict
-    from spackle.trajectory import trajectory
 
 __version__ = "0.1.0"
 
@@ -46,7 +45,6 @@ _HOMES = {
     "load_ply": "spackle.formats",
     "predict": "spackle.scene",
     "save_ply": "spackle.formats",
-    "trajectory": "spackle.trajectory",
 }
 
 __all__ = [
@@ -69,7 +67,6 @@ __all__ = [
     "load_ply",
     "predict",
     "save_ply",
-    "trajectory",
 ]
 
 

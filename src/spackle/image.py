@@ -98,6 +98,8 @@ def load_photo(
         found = focal_from_exif(exif, width, height)
         focal = found or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
         source = "EXIF" if found else "default 30 mm"
+    if not (math.isfinite(focal) and focal > 0):
+        raise InputError(f"{path}: {source} gives a focal length of {focal:g} px: check the value")
     return Photo(rgb, float(focal), source, Path(path))
 
 
