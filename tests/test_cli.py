@@ -1,0 +1,919 @@
+"""The command line as people use it: files in, files out, and one line where something is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import torch
+from photos import (
+    HEIGHT,
+    WIDTH,
+    box,
+    calibration,
+    camera_file,
+    damaged_scene,
+    metres,
+    picture,
+    read_ply,
+    write_depth,
+    write_pair,
+    write_photo,
+)
+from PIL import Image
+from rich.console import Console
+from safetensors.torch import save_file
+
+import spackle
+from spackle import cli
+from spackle.image import film_to_pixels
+from spackle.jobs.progress import Reporter
+from spackle.residual import ResidualNet
+
+SCRIPT = Path(sys.executable).with_name("spackle")
+COMMAND = [str(SCRIPT)] if SCRIPT.exists() else [sys.executable, "-c", "from spackle.cli import main; main()"]
+SHORT = ("--frames", "3")
+FILES = {"base.ply", "scene.ply", "video.mp4", "report.json"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a command line came to."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def lines(self) -> list[str]:
+        return self.err.splitlines()
+
+
+def run(*arguments: object) -> Run:
+    """The entry point within this process: a new one takes seconds to start."""
+    out, err = io.StringIO(), io.StringIO()
+    code: object = 0
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", ["spackle", *map(str, arguments)])
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = end.code or 0
+    assert isinstance(code, int)
+    return Run(code, out.getvalue(), err.getvalue())
+
+
+def predict(photo: Path, depth: Path, out: Path, *options: object) -> Run:
+    """`spackle predict` that has to succeed, three frames long."""
+    result = run("predict", "-i", photo, "--depth", depth, "-o", out, *SHORT, *options)
+    assert result.code == 0, result.err
+    return result
+
+
+def report_of(folder: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
+    return report
+
+
+def names_in(folder: Path) -> set[str]:
+    return set(os.listdir(folder))
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def decode(video: Path) -> list[av.VideoFrame]:
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        return list(container.decode(video=0))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """The folder of one ordinary prediction, and what was said meanwhile."""
+    folder = tmp_path_factory.mktemp("plain")
+    result = predict(*write_pair(folder), folder / "out")
+    return folder / "out" / "photo", result
+
+
+@pytest.fixture(scope="module")
+def scene(plain: tuple[Path, Run]) -> Path:
+    return plain[0] / "scene.ply"
+
+
+# What a prediction leaves behind
+
+
+def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) -> None:
+    folder = plain[0]
+    assert names_in(folder) == FILES
+    assert names_in(folder.parent) == {"photo"}
+    report = report_of(folder)
+    base, merged = (read_ply(folder / name).count for name in ("base.ply", "scene.ply"))
+    assert report["base"] == {"name": "rgbd", "gaussians": base, "depth_filled": 0.0}
+    assert report["aux"]["gaussians"] == merged - base > 0
+    assert report["aux"]["share"] == pytest.approx((merged - base) / base)
+    assert report["merged"] == merged
+    assert report["residual"]["weights"] == "seeds"
+    assert "no trained weights" in report["residual"]["note"]
+    assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.3)
+    assert report["path"] == "rotate_forward"
+    assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
+    assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
+    assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.3", "+0.3"]
+    for view in report["hole_area_ratio"]:
+        assert 0.1 < view["before"] < 1
+        assert view["after"] < 0.01 * view["before"]
+    stages = {"load", "base", "complete", "write", "video", "measure"}
+    assert set(report["seconds"]) == {*stages, "total"}
+    assert report["seconds"]["total"] == pytest.approx(sum(report["seconds"][stage] for stage in stages))
+
+
+def test_a_log_holds_plain_lines(plain: tuple[Path, Run]) -> None:
+    result = plain[1]
+    assert result.out == ""
+    assert len(result.lines) == 2
+    assert all(line.startswith("photo.png: ") for line in result.lines)
+    assert "\x1b" not in result.err
+    assert "aux Gaussians" in result.lines[1]
+
+
+def test_the_base_comes_first_bit_for_bit(plain: tuple[Path, Run]) -> None:
+    base, merged = (read_ply(plain[0] / name) for name in ("base.ply", "scene.ply"))
+    assert merged.names == base.names
+    assert merged.count > base.count
+    assert merged.body[: len(base.body)] == base.body
+    assert f"spackle_base {base.count}" in merged.comments
+
+
+def test_an_independent_reader_finds_the_photo(scene: Path) -> None:
+    ply = read_ply(scene)
+    focal = film_to_pixels(30, WIDTH, HEIGHT)
+    photo, depth = picture(), metres()
+    for index in (0, 1, 777, WIDTH * HEIGHT // 2 + WIDTH // 2, WIDTH * HEIGHT - 1):
+        row = ply.row(index)
+        y, x = divmod(index, WIDTH)
+        z = row["z"]
+        assert z == pytest.approx(depth[y, x], rel=1e-5)
+        assert row["x"] / z * focal + WIDTH / 2 == pytest.approx(x + 0.5, abs=1e-3)
+        assert row["y"] / z * focal + HEIGHT / 2 == pytest.approx(y + 0.5, abs=1e-3)
+        color = [255 * (0.5 + 0.28209479177387814 * row[f"f_dc_{c}"]) for c in range(3)]
+        assert color == pytest.approx(photo[y, x].tolist(), abs=0.01)
+        assert math.hypot(*(row[f"rot_{k}"] for k in range(4))) == pytest.approx(1, abs=1e-5)
+        assert 1 / (1 + math.exp(-row["opacity"])) == pytest.approx(0.99, abs=1e-5)
+        # Half a pixel wide, where the surface faces the camera.
+        assert math.exp(max(row[f"scale_{k}"] for k in range(3))) == pytest.approx(0.5 * z / focal, rel=0.2)
+
+
+def test_our_reader_gives_back_the_camera_and_all_gaussians(scene: Path) -> None:
+    camera = spackle.formats.load_ply_camera(scene)
+    assert camera is not None
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    assert camera.focal == pytest.approx([film_to_pixels(30, WIDTH, HEIGHT)] * 2)
+    assert len(spackle.load_ply(scene)) == read_ply(scene).count
+
+
+@pytest.mark.parametrize(("width", "height", "frames"), [(64, 48, 3), (65, 47, 4), (64, 48, 1)])
+def test_the_video_has_the_frames_and_even_sides(tmp_path: Path, width: int, height: int, frames: int) -> None:
+    photo = write_photo(tmp_path / "a.png", width, height)
+    depth = write_depth(tmp_path / "d.npy", metres(width, height))
+    predict(photo, depth, tmp_path / "out", "--frames", frames)
+    pictures = decode(tmp_path / "out" / "a" / "video.mp4")
+    assert len(pictures) == frames
+    for frame in pictures:
+        assert (frame.width, frame.height) == (width + width % 2, height + height % 2)
+        assert frame.format.name == "yuv420p"
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path: Path, plain: tuple[Path, Run]) -> None:
+    predict(*write_pair(tmp_path), tmp_path / "out")
+    again = tmp_path / "out" / "photo"
+    for name in ("base.ply", "scene.ply"):
+        assert (again / name).read_bytes() == (plain[0] / name).read_bytes()
+    first, second = report_of(plain[0]), report_of(again)
+    del first["seconds"], second["seconds"]
+    assert first == second
+
+
+def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
+    photo, depth = write_pair(tmp_path)
+    predict(photo, depth, tmp_path, "--residual", "none")
+    bare = read_ply(tmp_path / "photo" / "scene.ply").count
+    predict(photo, depth, tmp_path)
+    assert read_ply(tmp_path / "photo" / "scene.ply").count > bare
+    assert names_in(tmp_path / "photo") == FILES
+
+
+def test_no_render_writes_no_video(tmp_path: Path) -> None:
+    predict(*write_pair(tmp_path), tmp_path, "--no-render")
+    assert names_in(tmp_path / "photo") == FILES - {"video.mp4"}
+    assert "video" not in report_of(tmp_path / "photo")["seconds"]
+
+
+@pytest.mark.parametrize("kind", ["swipe", "shake", "rotate", "rotate-forward"])
+def test_every_path_closes_its_holes(tmp_path: Path, kind: str) -> None:
+    predict(*write_pair(tmp_path), tmp_path, "--trajectory", kind, "--disparity", "0.5")
+    report = report_of(tmp_path / "photo")
+    assert report["path"] == kind.replace("-", "_")
+    assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.5", "+0.5"]
+    assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
+
+
+def test_disparity_zero_stays_with_the_photo(tmp_path: Path) -> None:
+    predict(*write_pair(tmp_path), tmp_path, "--disparity", "0")
+    sent = picture().astype(float)
+    for frame in decode(tmp_path / "photo" / "video.mp4")[:1]:
+        assert np.abs(frame.to_ndarray(format="rgb24")[2:-2, 2:-2] - sent[2:-2, 2:-2]).mean() < 8
+
+
+# Options that change what is completed
+
+
+def test_cameras_completes_exactly_the_given_views(tmp_path: Path) -> None:
+    photo, depth = write_pair(tmp_path)
+    views = camera_file(tmp_path / "views.json", rights=[0.0, 0.4, -0.4])
+    predict(photo, depth, tmp_path / "out", "--cameras", views)
+    folder = tmp_path / "out" / "photo"
+    assert names_in(folder) == {*FILES, "views"}
+    expected = {f"{index:04d}{kind}.png" for index in range(3) for kind in ("", "_base", "_mask")}
+    assert names_in(folder / "views") == expected
+    report = report_of(folder)
+    assert (report["path"], report["disparity"]) == (str(views), None)
+    assert [view["view"] for view in report["hole_area_ratio"]] == ["0", "1", "2"]
+    assert all(view["after"] == 0 for view in report["hole_area_ratio"])
+    assert all(view["before"] > 0.05 for view in report["hole_area_ratio"][1:])
+    assert len(decode(folder / "video.mp4")) == 3
+    gaussians, renderer = spackle.load_ply(folder / "scene.ply"), spackle.get_renderer()
+    for index, camera in enumerate(spackle.load_cameras(views)):
+        stored = {kind: pixels(folder / "views" / f"{index:04d}{kind}.png") for kind in ("", "_mask")}
+        drawn = renderer.render(gaussians, camera).rgb.numpy() * 255
+        assert stored[""].shape == (HEIGHT, WIDTH, 3)
+        assert np.abs(stored[""] - drawn).max() < 2  # the file's colours are rounded, as float32 and as 8 bits
+        assert stored["_mask"].mean() / 255 == pytest.approx(report["hole_area_ratio"][index]["before"])
+
+
+def test_cameras_of_several_sizes_make_pictures(tmp_path: Path) -> None:
+    photo, depth = write_pair(tmp_path)
+    views = camera_file(tmp_path / "views.json", rights=[0.2, 0.4], sizes=[(64, 48), (33, 21)])
+    predict(photo, depth, tmp_path / "out", "--cameras", views, "--no-render")
+    assert pixels(tmp_path / "out" / "photo" / "views" / "0001.png").shape == (21, 33, 3)
+
+
+def test_view_mode_completes_each_view_on_its_own(tmp_path: Path) -> None:
+    photo, depth = write_pair(tmp_path)
+    views = camera_file(tmp_path / "views.json", rights=[0.1, 0.4])
+    predict(photo, depth, tmp_path / "out", "--cameras", views, "--mode", "view")
+    folder = tmp_path / "out" / "photo"
+    report = report_of(folder)
+    assert (report["mode"], report["scene_ply_view"]) == ("view", 1)
+    assert all(view["after"] == 0 for view in report["hole_area_ratio"])
+    base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
+    assert merged.body[: len(base.body)] == base.body
+    assert merged.count - base.count == report["aux"]["gaussians"]
+    # The paper's counts: one Gaussian for each 2×2 cell of the view with a hole in it, twice at most.
+    mask = pixels(folder / "views" / "0001_mask.png") > 0
+    cells = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).any(axis=(1, 3)).sum()
+    assert 0 < report["aux"]["gaussians"] <= 2 * cells
+
+
+def test_residual_none_is_the_base_alone(tmp_path: Path) -> None:
+    predict(*write_pair(tmp_path), tmp_path, "--residual", "none")
+    folder = tmp_path / "photo"
+    report = report_of(folder)
+    assert report["aux"] == {"gaussians": 0, "share": 0.0}
+    assert report["residual"] == {"weights": "none"}
+    assert read_ply(folder / "scene.ply") == read_ply(folder / "base.ply")
+    assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
+
+
+def test_residual_weights_are_loaded_and_named(tmp_path: Path, plain: tuple[Path, Run]) -> None:
+    torch.manual_seed(0)
+    network = ResidualNet()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.02)
+    weights = tmp_path / "random.safetensors"
+    save_file(network.state_dict(), weights)
+    predict(*write_pair(tmp_path), tmp_path, "--residual", weights)
+    report = report_of(tmp_path / "photo")
+    assert report["residual"] == {"weights": str(weights)}
+    base = read_ply(plain[0] / "base.ply").body
+    assert (tmp_path / "photo" / "base.ply").read_bytes() == (plain[0] / "base.ply").read_bytes()
+    ours, seeds = (read_ply(folder / "scene.ply").body for folder in (tmp_path / "photo", plain[0]))
+    assert ours[: len(base)] == base
+    assert ours != seeds
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "pixels"),
+    [("--focal-px", 70, 70), ("--focal-mm", 50, film_to_pixels(50, 64, 48)), ("--fov", 90, 32)],
+)
+def test_a_given_focal_length_is_used_and_named(tmp_path: Path, option: str, value: float, pixels: float) -> None:
+    predict(*write_pair(tmp_path), tmp_path, option, value)
+    report = report_of(tmp_path / "photo")
+    assert report["focal_source"] == option
+    assert report["focal_px"] == pytest.approx(pixels, abs=1e-3)
+    row = read_ply(tmp_path / "photo" / "base.ply").row(0)
+    assert row["x"] / row["z"] * pixels == pytest.approx(0.5 - WIDTH / 2, abs=1e-3)
+
+
+def test_middleburys_calibration_gives_depth_and_lens(tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "im0.png")
+    focal, baseline_mm, doffs = 80.0, 200.0, 1.5
+    disparity = (focal * baseline_mm / 1000 / metres() - doffs).astype(np.float32)
+    np.save(tmp_path / "disp0.npy", disparity)
+    calibration(tmp_path / "calib.txt", focal, baseline_mm, doffs)
+    predict(photo, tmp_path / "disp0.npy", tmp_path / "out")
+    report = report_of(tmp_path / "out" / "im0")
+    assert (report["focal_source"], report["focal_px"]) == ("calibration", 80.0)
+    assert read_ply(tmp_path / "out" / "im0" / "base.ply").row(0)["z"] == pytest.approx(6, rel=1e-4)
+    # A calibration that lies elsewhere, and a person who knows better.
+    (tmp_path / "lens").mkdir()
+    (tmp_path / "calib.txt").rename(tmp_path / "lens" / "c.txt")
+    options = ("--calib", tmp_path / "lens" / "c.txt", "--focal-px", 60)
+    predict(photo, tmp_path / "disp0.npy", tmp_path / "out", *options)
+    report = report_of(tmp_path / "out" / "im0")
+    assert (report["focal_source"], report["focal_px"]) == ("--focal-px", 60.0)
+
+
+def test_verbose_times_every_stage(tmp_path: Path) -> None:
+    result = predict(*write_pair(tmp_path), tmp_path, "-v")
+    timed = [line.split(":")[0].strip() for line in result.lines if line.startswith("  ")]
+    assert timed == ["load", "base", "complete", "write", "video", "measure"]
+
+
+def test_a_terminal_gets_bars_and_a_file_does_not() -> None:
+    for terminal in (True, False):
+        console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
+        with Reporter(console=console).stage("complete", {}) as step:
+            step(3, 7)
+        text = console.file.getvalue()  # type: ignore[attr-defined]
+        assert ("complete" in text, "3/7" in text) == (terminal, terminal)
+
+
+# Photos and depth maps that are odd, but fine
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 60), (60, 1), (2, 2), (3, 7), (17, 2)])
+def test_tiny_photos(tmp_path: Path, width: int, height: int) -> None:
+    photo = write_photo(tmp_path / "a.png", width, height)
+    predict(photo, write_depth(tmp_path / "d.npy", metres(width, height)), tmp_path / "out")
+    frame = decode(tmp_path / "out" / "a" / "video.mp4")[0]
+    assert (frame.width, frame.height) == (width + width % 2, height + height % 2)
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P", "1", "CMYK", "I;16"])
+def test_photos_of_any_mode(tmp_path: Path, mode: str) -> None:
+    if mode == "I;16":
+        image = Image.fromarray(picture()[..., 0].astype(np.uint16) * 257)
+    else:
+        image = Image.fromarray(picture()).convert(mode)
+    image.save(tmp_path / ("a.tif" if mode == "CMYK" else "a.png"))
+    photo = next(tmp_path.glob("a.*"))
+    predict(photo, write_depth(tmp_path / "d.npy"), tmp_path / "out")
+    assert report_of(tmp_path / "out" / "a")["photo"]["width"] == WIDTH
+
+
+@pytest.mark.parametrize("name", ["a b.png", "ü 漢字 🎉.png", "[red]x.png", "a\nb.png", "%s.png", "p.tar.png", "-.png"])
+def test_odd_file_names(tmp_path: Path, name: str) -> None:
+    photo = write_photo(tmp_path / "in" / name)
+    result = predict(photo, write_depth(tmp_path / "d.npy"), tmp_path / "out")
+    assert names_in(tmp_path / "out" / photo.stem) == FILES
+    assert all(name.replace("\n", " ") in line for line in result.lines)
+
+
+@pytest.mark.parametrize("name", ["..png", "...png", ".png"])
+def test_no_name_leads_out_of_the_output(tmp_path: Path, name: str) -> None:
+    photo = write_photo(tmp_path / "in" / "a.png").rename(tmp_path / "in" / name)
+    predict(photo, write_depth(tmp_path / "d.npy"), tmp_path / "out" / "deep")
+    assert names_in(tmp_path) == {"in", "out", "d.npy"}
+    assert names_in(tmp_path / "out") == {"deep"}
+    assert names_in(tmp_path / "out" / "deep" / name) == FILES
+
+
+def few_pixels() -> np.ndarray:
+    depth = np.zeros((HEIGHT, WIDTH), np.float32)
+    depth[5, 7], depth[40, 60], depth[20, 30] = 3, 4, 2
+    return depth
+
+
+def shuffled(low: float, high: float) -> np.ndarray:
+    values = np.geomspace(low, high, WIDTH * HEIGHT)
+    return np.random.default_rng(0).permutation(values).reshape(HEIGHT, WIDTH).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [
+        pytest.param(few_pixels(), id="three pixels"),
+        pytest.param(np.where(box(), np.nan, 3).astype(np.float32), id="a hole"),
+        pytest.param(np.full((HEIGHT, WIDTH), 3, np.float32), id="all equal"),
+        pytest.param(np.full((HEIGHT, WIDTH), 3, np.int32), id="whole metres"),
+        pytest.param(metres(10 * WIDTH, 10 * HEIGHT), id="ten times larger"),
+        pytest.param(metres(16, 12), id="four times smaller"),
+        pytest.param(np.sort(shuffled(0.01, 1e5).ravel()).reshape(HEIGHT, WIDTH), id="1 cm to 100 km"),
+        pytest.param(shuffled(0.01, 1e5), id="1 cm to 100 km in disorder"),
+        pytest.param(np.full((HEIGHT, WIDTH), 1e-4, np.float32), id="a tenth of a millimetre"),
+        pytest.param(np.full((HEIGHT, WIDTH), 1e6, np.float32), id="a thousand kilometres"),
+        pytest.param(np.asfortranarray(metres()).astype(">f8"), id="Fortran order, big endian"),
+    ],
+)
+def test_odd_depth_maps(tmp_path: Path, depth: np.ndarray) -> None:
+    np.save(tmp_path / "d.npy", depth)
+    predict(write_photo(tmp_path / "a.png"), tmp_path / "d.npy", tmp_path / "out")
+    assert names_in(tmp_path / "out" / "a") == FILES
+    assert report_of(tmp_path / "out" / "a")["base"]["gaussians"] > WIDTH * HEIGHT
+
+
+def test_missing_depth_is_said_and_counted(tmp_path: Path) -> None:
+    depth = np.where(box(), 0, 3).astype(np.float32)
+    result = predict(write_photo(tmp_path / "a.png"), write_depth(tmp_path / "d.npy", depth), tmp_path / "out")
+    assert report_of(tmp_path / "out" / "a")["base"]["depth_filled"] == pytest.approx(box().mean(), abs=1e-4)
+    assert any("of the depth was missing" in line for line in result.lines)
+
+
+# Folders
+
+
+def test_a_folder_of_photos_with_a_folder_of_depths(tmp_path: Path) -> None:
+    photos, depths = tmp_path / "photos", tmp_path / "depths"
+    for name in ("a.jpg", "a.png", "b.PNG", "c.png", ".hidden.png"):
+        write_photo(photos / name)
+    (photos / "notes.txt").write_text("not a photo")
+    (photos / "folder.png").mkdir()
+    write_depth(depths / "a.npy")
+    write_depth(depths / "a.jpg.npy", metres(far=9))
+    write_depth(depths / "b.png")
+    write_depth(depths / "c.npy")
+    result = predict(photos, depths, tmp_path / "out")
+    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "b", "c"}
+    for name in names_in(tmp_path / "out"):
+        assert names_in(tmp_path / "out" / name) == FILES
+        far = 9 if name == "a.jpg" else 6
+        assert read_ply(tmp_path / "out" / name / "base.ply").row(0)["z"] == pytest.approx(far, rel=1e-3)
+    assert len(result.lines) == 8
+
+
+def test_names_in_a_folder_never_collide(tmp_path: Path) -> None:
+    for name in ("a.jpg", "a.png", "a.jpg.png"):
+        write_photo(tmp_path / "photos" / name)
+    predict(tmp_path / "photos", write_depth(tmp_path / "d.npy"), tmp_path / "out")
+    assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "a.jpg.png"}
+
+
+def test_a_bad_photo_in_a_folder_stops_nothing_else(tmp_path: Path) -> None:
+    photos, depths = tmp_path / "photos", tmp_path / "depths"
+    for name in ("a", "c", "e", "f"):
+        write_photo(photos / f"{name}.png")
+    (photos / "b.png").write_text("not a photo")
+    (photos / "d.png").write_bytes((photos / "a.png").read_bytes()[:100])
+    for name in "abcd":
+        write_depth(depths / f"{name}.npy")
+    write_depth(depths / "f.npy", np.zeros((HEIGHT, WIDTH), np.float32))
+    result = run("predict", "-i", photos, "--depth", depths, "-o", tmp_path / "out", *SHORT)
+    assert result.code == 1
+    assert names_in(tmp_path / "out") == {"a", "c"}
+    errors = [line for line in result.lines if line.startswith("error: ")]
+    for line, culprit in zip(errors, ("b.png", "d.png", "e.png", "f.npy"), strict=True):
+        assert culprit in line
+    assert result.lines[-1] == "4 of 6 photos failed"
+
+
+def test_a_folder_where_everything_fails_leaves_no_output(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").write_text("not a photo")
+    out = tmp_path / "new" / "out"
+    result = run("predict", "-i", tmp_path / "photos", "--depth", write_depth(tmp_path / "d.npy"), "-o", out, *SHORT)
+    assert result.code == 1
+    assert not out.parent.exists()
+
+
+# Bad input: one line, exit code 2, nothing left behind
+
+
+def refuses(result: Run, *named: object) -> None:
+    """One line that names the culprit."""
+    assert result.code == 2, result.err
+    assert result.out == ""
+    assert len(result.lines) == 1, result.err
+    assert result.lines[0].startswith("spackle: ")
+    for name in named:
+        assert str(name) in result.lines[0]
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[Path, Path]:
+    return write_pair(tmp_path)
+
+
+def expect_refusal(tmp_path: Path, *arguments: object, named: object) -> None:
+    """`spackle predict` that must fail before it leaves anything in a new folder."""
+    out = tmp_path / "new" / "out"
+    refuses(run("predict", "-o", out, *SHORT, *arguments), named)
+    assert not out.parent.exists()
+
+
+def truncated(path: Path) -> None:
+    write_photo(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+BAD_PHOTOS: dict[str, Callable[[Path], object]] = {
+    "missing": lambda path: None,
+    "empty": lambda path: path.touch(),
+    "text": lambda path: path.write_text("a photo"),
+    "truncated": truncated,
+    "only a signature": lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n"),
+    "an empty folder": lambda path: path.mkdir(),
+    "a pipe": os.mkfifo,
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PHOTOS)
+def test_bad_photos(tmp_path: Path, kind: str) -> None:
+    photo = tmp_path / "bad.png"
+    BAD_PHOTOS[kind](photo)
+    expect_refusal(tmp_path, "-i", photo, "--depth", write_depth(tmp_path / "d.npy"), named=photo)
+
+
+BAD_DEPTHS: dict[str, Any] = {
+    "another shape": metres(48, 64),
+    "all unknown": np.zeros((HEIGHT, WIDTH), np.float32),
+    "all NaN": np.full((HEIGHT, WIDTH), np.nan, np.float32),
+    "all infinite": np.full((HEIGHT, WIDTH), np.inf, np.float32),
+    "negative": -metres(),
+    "three axes": metres()[..., None],
+    "one axis": metres().ravel(),
+    "no pixels": np.zeros((0, WIDTH), np.float32),
+    "millimetres as integers": (1000 * metres()).astype(np.int32),
+    "text": np.full((HEIGHT, WIDTH), "far"),
+    "beyond float32": np.full((HEIGHT, WIDTH), 1e300),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_DEPTHS)
+def test_bad_depth_values(tmp_path: Path, kind: str) -> None:
+    depth = tmp_path / "bad.npy"
+    np.save(depth, BAD_DEPTHS[kind])
+    expect_refusal(tmp_path, "-i", write_photo(tmp_path / "a.png"), "--depth", depth, named=depth)
+
+
+@pytest.mark.parametrize("kind", BAD_PHOTOS)
+def test_bad_depth_files(tmp_path: Path, kind: str) -> None:
+    depth = tmp_path / "bad.png"
+    BAD_PHOTOS[kind](depth)
+    expect_refusal(tmp_path, "-i", write_photo(tmp_path / "a.png"), "--depth", depth, named=depth)
+
+
+def test_a_photo_as_depth(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[0], named=pair[0])
+
+
+def test_a_disparity_without_its_calibration(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    disparity = pair[1].rename(tmp_path / "disp0.npy")
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", disparity, named=disparity)
+    (tmp_path / "calib.txt").write_text("cam0=[1 2]\n")
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", disparity, named=tmp_path / "calib.txt")
+
+
+def test_names_that_no_file_system_takes(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    long = tmp_path / ("x" * 300)
+    expect_refusal(tmp_path, "-i", long, "--depth", pair[1], named=long)
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", long, named=long)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--focal-px", "0"),
+        ("--focal-px", "-50"),
+        ("--focal-px", "nan"),
+        ("--focal-px", "inf"),
+        ("--focal-px", "1e-30"),
+        ("--focal-mm", "0"),
+        ("--focal-mm", "1e308"),
+        ("--fov", "0"),
+        ("--fov", "180"),
+        ("--focal-px", "50", "--fov", "60"),
+        ("--disparity", "-0.1"),
+        ("--disparity", "2.1"),
+        ("--disparity", "nan"),
+        ("--frames", "0"),
+        ("--frames", "1000000"),
+        ("--base", "sharp9"),
+        ("--device", "cuda"),
+        ("-c", "weights.pt"),
+        ("--residual", "nowhere.safetensors"),
+        ("--cameras", "nowhere.json"),
+        ("--calib", "nowhere.txt"),
+    ],
+    ids=" ".join,
+)
+def test_bad_options(tmp_path: Path, pair: tuple[Path, Path], options: tuple[str, ...]) -> None:
+    named = pair[0] if options[1] == "1e-30" else options[1] if "nowhere" in options[1] else options[0]
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], *options, named=named)
+
+
+def test_no_depth(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    expect_refusal(tmp_path, "-i", pair[0], named="--depth")
+    (tmp_path / "depths").mkdir()
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", tmp_path / "depths", named=pair[0])
+
+
+@pytest.mark.parametrize(
+    "options", [("--trajectory", "spiral"), ("--mode", "x"), ("--frames", "many"), ("--nonsense",)]
+)
+def test_usage_errors(tmp_path: Path, pair: tuple[Path, Path], options: tuple[str, ...]) -> None:
+    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out", *options)
+    assert result.code == 2
+    assert options[0] in result.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"not weights", b"", (2**60).to_bytes(8, "little") + b"{}"])
+def test_damaged_residual_weights(tmp_path: Path, pair: tuple[Path, Path], content: bytes) -> None:
+    weights = tmp_path / "bad.safetensors"
+    weights.write_bytes(content)
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--residual", weights, named=weights)
+
+
+def test_weights_of_another_network(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    weights = tmp_path / "other.safetensors"
+    save_file({"stem.weight": torch.zeros(3)}, weights)
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--residual", weights, named=weights)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "null",
+        "[" * 100_000,
+        "\x89PNG",
+        '{"frames": []}',
+        '{"width": 64, "height": 48, "frames": [{"K": null}]}',
+        '{"width": 64, "height": 48, "frames": [{"K": [[1e-20, 0, 0], [0, 1e-20, 0], [0, 0, 1]]}]}',
+    ],
+    ids=["empty", "cut off", "null", "deep", "binary", "no frames", "no matrix", "no pose"],
+)
+def test_bad_cameras(tmp_path: Path, pair: tuple[Path, Path], text: str) -> None:
+    views = tmp_path / "bad.json"
+    views.write_text(text, encoding="latin-1")
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", views, named=views)
+
+
+def test_cameras_that_make_no_video(tmp_path: Path, pair: tuple[Path, Path], scene: Path) -> None:
+    views = camera_file(tmp_path / "views.json", rights=[0.2, 0.4], sizes=[(64, 48), (32, 24)])
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", views, named="--no-render")
+    refuses(run("render", "-i", scene, "-o", tmp_path / "a.mp4", "--cameras", views), views)
+    huge = camera_file(tmp_path / "huge.json", rights=[0.2], sizes=[(8194, 48)])
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", huge, named=huge)
+    assert not (tmp_path / "a.mp4").exists()
+
+
+OUTPUTS = ["file", "file/deep", "long", *(["/proc/new"] if Path("/proc/self").exists() else [])]
+
+
+@pytest.mark.parametrize("kind", OUTPUTS)
+def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path], scene: Path, kind: str) -> None:
+    (tmp_path / "file").write_text("in the way")
+    out = tmp_path / "new" / ("x" * 300) if kind == "long" else tmp_path / kind  # an absolute kind stays as it is
+    before = names_in(tmp_path)
+    refuses(run("predict", "-i", pair[0], "--depth", pair[1], "-o", out, *SHORT), "output folder", "-o")
+    (tmp_path / "photos").mkdir()
+    shutil.copy(pair[0], tmp_path / "photos")
+    refuses(run("predict", "-i", tmp_path / "photos", "--depth", pair[1], "-o", out, *SHORT), "output folder")
+    refuses(run("render", "-i", scene, "-o", out, *SHORT), "output folder")
+    assert names_in(tmp_path) == {*before, "photos"}
+    assert (tmp_path / "file").read_text() == "in the way"
+
+
+@pytest.mark.parametrize("taken", sorted(FILES))
+def test_a_folder_in_the_place_of_a_result(tmp_path: Path, pair: tuple[Path, Path], taken: str) -> None:
+    obstacle = tmp_path / "out" / "photo" / taken
+    obstacle.mkdir(parents=True)
+    refuses(run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out", *SHORT), obstacle)
+    assert names_in(obstacle.parent) == {taken}  # known before the first file was written
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    refuses_late = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", *SHORT)
+    assert refuses_late.code == 2
+    assert "No space left" in refuses_late.lines[-1]
+    assert not (tmp_path / "new").exists()
+
+
+# Saved scenes
+
+
+def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Path, Run]) -> None:
+    result = run("render", "-i", scene, "-o", tmp_path / "new" / "a.mp4", *SHORT)
+    assert (result.code, len(result.lines)) == (0, 1)
+    assert run("render", "-i", scene, "-o", tmp_path / "folder", *SHORT).code == 0
+    assert names_in(tmp_path / "folder") == {"scene.mp4"}
+    ours, predicted = decode(tmp_path / "new" / "a.mp4"), decode(plain[0] / "video.mp4")
+    assert len(ours) == len(predicted) == 3
+    assert (ours[0].width, ours[0].height, ours[0].format.name) == (WIDTH, HEIGHT, "yuv420p")
+    first = [frames[0].to_ndarray(format="rgb24").astype(float) for frames in (ours, predicted)]
+    assert np.abs(first[0] - first[1]).mean() < 1  # the path starts at the photo's place
+
+
+def test_render_at_another_size_squeezes_nothing(tmp_path: Path, scene: Path) -> None:
+    for size in ("128x96", "128x64", "31x31"):
+        arguments = ("--size", size, "--disparity", 0, "--frames", 1)
+        assert run("render", "-i", scene, "-o", tmp_path / "a.mp4", *arguments).code == 0
+        width, height = map(int, size.split("x"))
+        frame = decode(tmp_path / "a.mp4")[0]
+        assert (frame.width, frame.height) == (width + width % 2, height + height % 2)
+        rgb = frame.to_ndarray(format="rgb24")[:height, :width].astype(float)
+        red = rgb[..., 0] > rgb[..., 2]
+        scale = max(width / WIDTH, height / HEIGHT)
+        for axis in (0, 1):
+            assert red.any(axis=axis).sum() == pytest.approx(scale * box().any(axis=axis).sum(), abs=5)
+
+
+def test_render_given_views(tmp_path: Path, scene: Path) -> None:
+    views = camera_file(tmp_path / "views.json", rights=[0.0, 0.3], sizes=[(64, 48), (32, 24)])
+    result = run("render", "-i", scene, "-o", tmp_path / "out", "--cameras", views)
+    assert result.code == 0
+    assert names_in(tmp_path / "out") == {"0000.png", "0001.png"}
+    assert "no video" in result.lines[0]
+    views = camera_file(tmp_path / "views.json", rights=[0.0, 0.3])
+    assert run("render", "-i", scene, "-o", tmp_path / "out", "--cameras", views).code == 0
+    assert names_in(tmp_path / "out") == {"0000.png", "0001.png", "scene.mp4"}
+
+
+def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> None:
+    bare = damaged_scene(scene, tmp_path / "bare.ply", lambda head: "\n".join(_uncommented(head)))
+    result = run("render", "-i", bare, "-o", tmp_path, "--size", "64x48", *SHORT)
+    assert result.code == 0
+    assert "no camera stored" in result.lines[0]
+    assert len(run("render", "-i", bare, "-o", tmp_path, "--size", "64x48", "--focal-px", 55, *SHORT).lines) == 1
+
+
+def _uncommented(head: str) -> list[str]:
+    return [line for line in head.split("\n") if not line.startswith("comment")]
+
+
+HOSTILE: dict[str, tuple[Callable[[str], str], Callable[[bytes], bytes]]] = {
+    "cut off": (lambda head: head, lambda body: body[:-1]),
+    "no data": (lambda head: head, lambda body: b""),
+    "a negative count": (lambda head: _count(head, "-5"), lambda body: body),
+    "a count of 10^12": (lambda head: _count(head, "1000000000000"), lambda body: body),
+    "a count of 10^400": (lambda head: _count(head, "9" * 400), lambda body: body),
+    "a count that is none": (lambda head: _count(head, "many"), lambda body: body),
+    "no Gaussians": (lambda head: _count(head, "0"), lambda body: body),
+    "a missing property": (lambda head: head.replace("property float rot_2\n", ""), lambda body: body),
+    "a property twice": (lambda head: head.replace("float rot_2", "float rot_1"), lambda body: body),
+    "an unknown type": (lambda head: head.replace("float rot_2", "quaternion rot_2"), lambda body: body),
+    "an unknown format": (lambda head: head.replace("binary_little_endian", "middle_endian"), lambda body: body),
+    "binary as text": (lambda head: head.replace("binary_little_endian", "ascii"), lambda body: body),
+    "a huge element before": (
+        lambda head: head.replace("element vertex", "element x 1000000000000\nproperty float a\nelement vertex"),
+        lambda body: body,
+    ),
+    "NaN": (lambda head: head, lambda body: b"\x00\x00\xc0\x7f" + body[4:]),
+    "all behind the camera": (lambda head: head, lambda body: _negated(body, 2)),
+    "a camera of one number": (lambda head: head.replace("spackle_camera", "spackle_camera 1"), lambda body: body),
+}
+
+
+def _count(head: str, count: str) -> str:
+    return "\n".join(f"element vertex {count}" if line.startswith("element") else line for line in head.split("\n"))
+
+
+def _negated(body: bytes, column: int) -> bytes:
+    table = np.frombuffer(body, "<f4").reshape(-1, 17).copy()
+    table[:, column] *= -1
+    return table.tobytes()
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_scenes(tmp_path: Path, scene: Path, kind: str) -> None:
+    path = damaged_scene(scene, tmp_path / "bad.ply", *HOSTILE[kind])
+    refuses(run("render", "-i", path, "-o", tmp_path / "out", *SHORT), path)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\n" + b"comment x\n" * 10_000, b"\x89PNG", os.urandom(999)])
+def test_files_that_are_no_scenes(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    refuses(run("render", "-i", path, "-o", tmp_path / "out", *SHORT), path)
+    refuses(run("render", "-i", tmp_path / "missing.ply", "-o", tmp_path / "out", *SHORT), "missing.ply")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--size", "0x0"),
+        ("--size", "9000x10"),
+        ("--size", "big"),
+        ("--focal-px", "0"),
+        ("--focal-px", "inf"),
+        ("--disparity", "3"),
+        ("--frames", "0"),
+        ("--device", "cuda"),
+        ("--cameras", "nowhere.json"),
+    ],
+    ids=" ".join,
+)
+def test_bad_render_options(tmp_path: Path, scene: Path, options: tuple[str, str]) -> None:
+    named = options[1] if options[0] == "--cameras" else options[0]
+    refuses(run("render", "-i", scene, "-o", tmp_path / "out", *SHORT, *options), named)
+    assert not (tmp_path / "out").exists()
+
+
+# The real thing, in a process of its own
+
+
+def test_the_installed_command_is_this_one() -> None:
+    commands = [point for point in entry_points(group="console_scripts") if point.name == "spackle"]
+    assert [point.load() for point in commands] == [cli.main]
+
+
+def test_help_does_not_wait_for_torch() -> None:
+    code = "import sys; sys.argv = ['spackle', '--help']\nfrom spackle.cli import main\ntry: main()\n"
+    code += "finally: assert not {'torch', 'numba', 'av'} & set(sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert result.returncode == 0, result.stderr
+    assert all(command in result.stdout for command in ("predict", "render", "demo"))
+
+
+def test_a_process_succeeds_and_fails(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    for depth, code in ((pair[1], 0), (tmp_path / "missing.npy", 2)):
+        arguments = ["predict", "-i", pair[0], "--depth", depth, "-o", tmp_path / f"out{code}", *SHORT]
+        result = subprocess.run([*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+        assert result.returncode == code
+        assert len(result.stderr.splitlines()) == (1 if code else 2)
+        assert "Traceback" not in result.stderr
+    assert names_in(tmp_path / "out0" / "photo") == FILES
+    assert "missing.npy" in result.stderr
+    assert not (tmp_path / "out2").exists()
+
+
+def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("spackle.jobs.predict.complete", interrupted)
+    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", *SHORT)
+    assert result.code == 130
+    assert "Traceback" not in result.err
+    assert not (tmp_path / "new").exists()
+
+
+@contextlib.contextmanager
+def started(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is dead when the block ends."""
+    process = subprocess.Popen([*COMMAND, *map(str, arguments)], stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal here")
+def test_a_killed_run_leaves_whole_files_and_the_next_one_finishes(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    folder = tmp_path / "out" / "photo"
+    arguments = ("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out")
+    with started(*arguments, "--frames", 8000) as process:
+        deadline = time.monotonic() + 240
+        while not list(folder.glob(".video.*.mp4")):
+            assert process.poll() is None, "ended before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    assert names_in(folder) > {"base.ply", "scene.ply"}
+    assert not {"video.mp4", "report.json"} & names_in(folder)  # not finished, so not there
+    base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
+    assert merged.body[: len(base.body)] == base.body
+    (folder / ".other.0123456789ab.ply").touch()  # somebody else's
+    assert run(*arguments, *SHORT).code == 0
+    assert names_in(folder) == {*FILES, ".other.0123456789ab.ply"}
+    assert len(decode(folder / "video.mp4")) == 3
