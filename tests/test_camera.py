@@ -16,7 +16,7 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.trajectory import TRAJECTORIES, DepthRange, extremes, max_offset, trajectory
 
-PROPERTY = settings(deadline=None, max_examples=60)
+PROPERTY = settings(deadline=None, max_examples=40)
 COORDINATES = st.tuples(*[st.floats(-5, 5)] * 3)
 PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
 RANGE = DepthRange(near=2.0, focus=4.0)

@@ -22,7 +22,7 @@ QUATS = st.tuples(UNIT, UNIT, UNIT, UNIT).filter(lambda q: math.hypot(*q) > 1e-2
 OFFSETS = st.tuples(*[st.floats(-20, 20)] * 3)
 FACTORS = st.floats(0.05, 20)
 HALF = math.sqrt(0.5)
-PROPERTY = settings(deadline=None, max_examples=60)
+PROPERTY = settings(deadline=None, max_examples=40)
 
 
 def scipy_matrix(quat: tuple[float, ...]) -> Tensor:

@@ -17,7 +17,7 @@ from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.reference import project_covariances
 from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, neighbours, surface_gaussians, surface_slope
 
-PROPERTY = settings(deadline=None, max_examples=60)
+PROPERTY = settings(deadline=None, max_examples=40)
 SLOPES = st.floats(-0.01, 0.01)
 IMAGES = st.integers(0, 2**32 - 1).flatmap(
     lambda seed: st.tuples(st.just(seed), st.integers(1, 7), st.integers(1, 7), st.sampled_from([0.001, 0.02, 0.5]))
