@@ -62,7 +62,7 @@ def _fill_level(field: Floats, known: Bools, bias: Floats, sweeps: int) -> Float
     """Fill one level [1 + C, H, W] from the next coarser one, then relax it."""
     if known.all():
         return field
-    reference = np.float32(np.median(field[0][known]))
+    reference = np.float32(np.quantile(field[0][known], 0.5, method="lower"))
     coarse, coarse_known, coarse_bias = _coarsen(field, known, bias, reference)
     coarse = _fill_level(coarse, coarse_known, coarse_bias, sweeps)
     holes = np.argwhere(~known).astype(np.int32)
