@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -24,25 +26,28 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> spackle.Scene:
     return spackle.predict(photo, depth)
 
 
-def test_the_three_lines_that_the_package_promises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def promised() -> list[str]:
+    """The package's own example, and the README's."""
     assert spackle.__doc__ is not None
-    lines = spackle.__doc__[spackle.__doc__.index("import spackle") :].splitlines()
-    assert len(lines) == 3
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    blocks = [block.split("```")[0] for block in readme.split("```python\n")[1:]]
+    return [spackle.__doc__[spackle.__doc__.index("import spackle") :], *blocks]
+
+
+@pytest.mark.parametrize("code", promised(), ids=lambda code: f"{len(code)} characters")
+def test_the_three_lines_that_we_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    assert len([line for line in code.splitlines() if line]) == 3
     write_photo(tmp_path / "photo.jpg")
     write_depth(tmp_path / "depth.png")
     monkeypatch.chdir(tmp_path)
-    exec("\n".join(lines), {})
+    exec(code, {})
     with av.open("video.mp4") as container:
         frames = list(container.decode(video=0))
     assert len(frames) == 60
     assert (frames[0].width, frames[0].height) == (WIDTH, HEIGHT)
 
 
-SHADOWED = pytest.mark.xfail(reason="the module of the same name takes its place once it is imported", strict=True)
-NAMES = [pytest.param(name, marks=SHADOWED if name == "trajectory" else ()) for name in spackle.__all__]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", spackle.__all__)
 def test_every_public_name_is_there(name: str) -> None:
     assert not isinstance(getattr(spackle, name), ModuleType)
     assert not isinstance(getattr(spackle, name), ModuleType), "a second look finds the module of that name"
@@ -143,3 +148,14 @@ def test_bad_input_is_a_value_error_that_names_the_file(scene: spackle.Scene, tm
     with pytest.raises(spackle.InputError, match=r"video\.txt"):
         scene.save_video(tmp_path / "video.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["depth.npy", "photo.png", "wrong.npy"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", sorted((Path(__file__).parents[1] / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_the_examples_run(tmp_path: Path, example: Path) -> None:
+    pytest.importorskip("skimage.data")
+    command = [sys.executable, "-W", "error", str(example), str(tmp_path / "new" / "out")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "Look at" in result.stdout
+    assert len(list((tmp_path / "new" / "out").iterdir())) >= 2

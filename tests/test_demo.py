@@ -23,16 +23,26 @@ INPAINTING = "2D inpainting (biharmonic)"
 SPACKLE = "Spackle (seeds)"
 
 
+def run(folder: Path) -> tuple[int, str]:
+    """Exit code and words of `spackle demo`."""
+    code, err = 0, io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", ["spackle", "demo", "-o", str(folder)])
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, err.getvalue()
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The demo's folder, and what it said."""
     pytest.importorskip("skimage.data")
-    folder, err = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", ["spackle", "demo", "-o", str(folder)])
-        with contextlib.suppress(SystemExit):
-            cli.main()
-    return folder, err.getvalue()
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    code, said = run(folder)
+    assert code == 0, said
+    return folder, said
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +102,22 @@ def test_it_prints_the_numbers_of_its_report(demo: tuple[Path, str], report: dic
     assert f"{report['aux_gaussians']:,} aux Gaussians" in said
     assert str(demo[0] / "comparison.png") in said.replace("\n", "")
     assert report["residual"]["weights"] == "seeds"
+
+
+@pytest.mark.parametrize("kind", ["file", "file/deep", "folder"])
+def test_an_output_that_cannot_be_written_is_one_line(tmp_path: Path, kind: str) -> None:
+    pytest.importorskip("skimage.data")
+    (tmp_path / "file").touch()
+    (tmp_path / "folder" / "comparison.png").mkdir(parents=True)
+    code, said = run(tmp_path / kind)
+    assert (code, len(said.splitlines())) == (2, 1)
+    assert str(tmp_path / kind) in said
+    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["comparison.png"]
+
+
+def test_without_scikit_image_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.data", None)
+    code, said = run(tmp_path / "out")
+    assert (code, len(said.splitlines())) == (2, 1)
+    assert "pip install 'spackle-nvs[demo]'" in said
+    assert not (tmp_path / "out").exists()

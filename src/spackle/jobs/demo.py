@@ -20,13 +20,14 @@ from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video
-from spackle.jobs.inputs import make_folder
+from spackle.jobs.inputs import results_folder
 from spackle.jobs.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.scene import Scene, complete, even_camera, scene_path
 from spackle.trajectory import DepthRange, extremes
 
+FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
 DISPARITY = 0.3
 # Middlebury's calibration of the pair at a quarter of its size, as scikit-image ships it.
 FOCAL_PX, CX, CY = 994.978, 311.193, 254.877
@@ -80,10 +81,18 @@ def load_motorcycle() -> StereoPair:
 
 
 def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
-    """Complete the photo, write scene, video and pictures, and print the comparison with the truth."""
-    start = time.perf_counter()
+    """Complete the photo, write scene, video and pictures, and print the comparison with the truth.
+
+    Raises:
+        InputError: where scikit-image is missing, or `output` cannot be written to.
+    """
     pair = load_motorcycle()
-    make_folder(output)
+    with results_folder(output, FILES):
+        return _run(pair, output, reporter)
+
+
+def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
+    start = time.perf_counter()
     renderer = get_renderer()
     seconds: dict[str, float] = {}
     with reporter.stage("base", seconds):
