@@ -25,7 +25,7 @@ from spackle.scene import scene_path
 DISPARITY = 0.3
 TELEA_RADIUS = 3
 COLUMNS = ["scene", "HAR before", "after / before", "hole: Telea", "hole: Spackle"]
-COLUMNS += ["outside: before", "outside: after", "photo", f"photo, scene ±{DISPARITY:g}"]
+COLUMNS += ["outside: before", "outside: after", "photo", f"photo, scene ±{DISPARITY:g}", "worst end, scene"]
 
 
 def psnr(image: Tensor, truth: Tensor, where: Tensor | None = None) -> float:
@@ -56,10 +56,12 @@ def measure(folder: Path) -> list[float]:
     left, right = (load_photo(folder / facts[side]).rgb for side in ("left", "right"))
     camera, beside = cameras(facts, left.shape[1], left.shape[0])
     prediction, renderer = lift(left, load_depth(folder / facts["disparity"]), camera), get_renderer()
-    scene = complete(prediction, [beside], visit_all=True)
+    scene = complete(prediction, [beside], exact=True)
     before, after = renderer.render(scene.base, beside), scene.render(beside)
     hole, photo = hole_mask(before.alpha), renderer.render(scene.base, camera).rgb
-    swipe = complete(prediction, scene_path(scene.base, camera, "swipe", DISPARITY))
+    path = scene_path(scene.base, camera, "swipe", DISPARITY)
+    swipe = complete(prediction, path)
+    ends = [(renderer.render(scene.base, end).alpha, swipe.render(end).alpha) for end in (path[0], path[-1])]
     har = hole_area_ratio(before.alpha)
     return [
         har,
@@ -70,6 +72,7 @@ def measure(folder: Path) -> list[float]:
         psnr(after.rgb, right, ~hole),
         psnr(scene.render(camera).rgb, photo),
         psnr(swipe.render(camera).rgb, photo),
+        max(hole_area_ratio(closed) / hole_area_ratio(open_) for open_, closed in ends),
     ]
 
 
@@ -88,7 +91,7 @@ def main(root: Path) -> None:
 
 def print_row(name: str, row: list[float]) -> None:
     """Ratios with their digits, decibels with two."""
-    cells = [f"{row[0]:.3f}", f"{row[1]:.4f}", *(f"{value:.2f}" for value in row[2:])]
+    cells = [f"{row[0]:.3f}", f"{row[1]:.4f}", *(f"{value:.2f}" for value in row[2:-1]), f"{row[-1]:.4f}"]
     print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 

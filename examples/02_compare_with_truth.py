@@ -27,7 +27,7 @@ def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     pair = load_motorcycle()
     prediction = lift(pair.left, pair.depth, pair.left_camera)
-    scene = spackle.complete(prediction, [pair.right_camera], visit_all=True)
+    scene = spackle.complete(prediction, [pair.right_camera], exact=True)
 
     renderer = spackle.get_renderer()
     with torch.no_grad():

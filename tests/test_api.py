@@ -127,9 +127,7 @@ def test_complete_visits_what_it_is_given(scene: spackle.Scene, tmp_path: Path) 
     prediction = RgbdBase(spackle.load_depth(depth)).predict(spackle.load_photo(photo))
     seen: list[tuple[int, int]] = []
     cameras = scene.path("swipe", disparity=0.4, frames=4)
-    made = spackle.complete(
-        prediction, cameras, visit_all=True, progress=lambda done, total: seen.append((done, total))
-    )
+    made = spackle.complete(prediction, cameras, exact=True, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 1e-3 for camera in cameras)
 

@@ -39,7 +39,7 @@ from spackle.residual.complete import farthest_first
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.network import IN_CHANNELS, network_input
 from spackle.residual.seeds import OPACITY, cell_centers
-from spackle.trajectory import DepthRange, extremes, trajectory
+from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
 CPU = CpuRenderer()
 PROPERTY = settings(deadline=None, max_examples=40)
@@ -640,14 +640,29 @@ def test_a_whole_path_is_closed_by_one_set() -> None:
         assert after <= max(5e-3, 0.03 * hole_area_ratio(CPU.render(completer.base, camera).alpha))
 
 
-def test_scene_completion_stops_when_all_is_quiet_or_visits_every_view() -> None:
+@pytest.mark.parametrize("disparity", [0.3, 0.5])
+@pytest.mark.parametrize("kind", ["rotate_forward", "rotate"])
+def test_a_long_path_and_its_extremes_are_closed_by_one_set(kind: TrajectoryKind, disparity: float) -> None:
+    """As the command line asks for it: the extremes come after the path, and lie beside it."""
     completer, _ = box_view()
-    path = [completer.photo_camera] * 7
-    for visit_all, visits in ((False, 2), (True, 7)):
+    depths = DepthRange.of(completer.base)
+    path = trajectory(kind, completer.photo_camera, disparity, depths, frames=60)
+    sides = extremes(completer.photo_camera, disparity, depths)
+    aux = completer.complete_scene([*path, *sides])
+    for camera in [*path[::4], *sides]:
+        before = hole_area_ratio(CPU.render(completer.base, camera).alpha)
+        after = hole_area_ratio(CPU.render([completer.base, aux], camera).alpha)
+        assert after <= max(2e-3, 0.03 * before)
+
+
+def test_scene_completion_visits_every_view() -> None:
+    completer, _ = box_view()
+    for exact in (False, True):
         calls: list[int] = []
-        aux = completer.complete_scene(path, visit_all, progress=lambda done, _, calls=calls: calls.append(done))
+        path = [completer.photo_camera] * 7
+        aux = completer.complete_scene(path, exact, progress=lambda done, _, calls=calls: calls.append(done))
         assert len(aux) == 0  # the photo has no holes in its own view
-        assert calls[-1] == visits
+        assert calls == list(range(1, 8))
 
 
 def test_a_path_without_cameras_needs_nothing() -> None:

@@ -75,7 +75,7 @@ class Gaussians:
         linear = matrix[:3, :3]
         scale = torch.linalg.det(linear).abs() ** (1 / 3)
         rotation = linear / scale
-        orthogonal = torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-5)
+        orthogonal = torch.allclose(rotation @ rotation.T, torch.eye(3).to(rotation), atol=1e-5)
         if not orthogonal or torch.linalg.det(linear) <= 0:
             raise ValueError("Gaussians.transform takes a rotation, a uniform scale and a translation only")
         dtype = self.means.dtype

@@ -103,14 +103,14 @@ def complete(
     prediction: BasePrediction,
     cameras: Sequence[Camera],
     *,
-    visit_all: bool = False,
+    exact: bool = False,
     network: ResidualNet | None = None,
     renderer: Renderer | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """One scene for all views of a path: see `Completer.complete_scene`."""
     completer = Completer(prediction.gaussians, prediction.camera, renderer or get_renderer(), network)
-    aux = completer.complete_scene(cameras, visit_all=visit_all, progress=progress)
+    aux = completer.complete_scene(cameras, exact=exact, progress=progress)
     return Scene(prediction.gaussians, aux, prediction.camera)
 
 

@@ -19,6 +19,7 @@ TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 NEAR_QUANTILE = 0.001  # z_near: sets how far the eye may go
 FOCUS_QUANTILE = 0.1  # depth that the camera keeps looking at
 MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
+MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
 MAX_ZOOM = 0.15  # forward motion of rotate_forward, in units of z_near
 
 
@@ -58,9 +59,14 @@ def trajectory(
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
+
+    Raises:
+        ValueError: an unknown path, a disparity out of 0..2, or no frame.
     """
     if kind not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {kind!r}: choose one of {', '.join(TRAJECTORIES)}")
+    if not 0 <= disparity <= MAX_DISPARITY:
+        raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if frames < 1:
         raise ValueError(f"a trajectory needs at least one frame, got {frames}")
     offset = max_offset(camera, disparity, depth_range)

@@ -71,7 +71,10 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     gaussians = Gaussians.cat(
         [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
     )
-    return BasePrediction(gaussians, camera, {"depth_filled": round(missing, 4)})
+    notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
+    if depth.depth.shape != inverse_depth.shape:
+        notes["depth_resampled_from"] = f"{depth.depth.shape[1]}×{depth.depth.shape[0]}"
+    return BasePrediction(gaussians, camera, notes)
 
 
 def _inverse_depth(depth: DepthMap, height: int, width: int) -> tuple[Tensor, Tensor]:

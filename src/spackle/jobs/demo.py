@@ -170,7 +170,7 @@ def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Rende
     from skimage.restoration import inpaint_biharmonic
 
     camera = pair.right_camera
-    scene = complete(prediction, [camera], visit_all=True, renderer=renderer)
+    scene = complete(prediction, [camera], exact=True, renderer=renderer)
     before, after = renderer.render(scene.base, camera), scene.render(camera, renderer)
     hole = hole_mask(before.alpha)
     flat = inpaint_biharmonic(before.rgb.numpy(), hole.numpy(), split_into_regions=True, channel_axis=-1)

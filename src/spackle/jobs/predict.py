@@ -84,6 +84,8 @@ def _predict_loaded(
     )
     if missing := float(prediction.notes.get("depth_filled", 0)):
         reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+    if size := prediction.notes.get("depth_resampled_from"):
+        reporter.say(f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}")
     plan = make_plan(photo.path, prediction, options, tools.views)
     with reporter.stage("complete", seconds) as step:
         completed = complete(prediction, plan, options, tools, step)

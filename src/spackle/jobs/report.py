@@ -46,7 +46,7 @@ def make_report(
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
         "mode": options.mode,
-        "path": str(options.cameras) if options.cameras else options.trajectory,
+        "views": options.cameras.name if options.cameras else options.trajectory,
         "disparity": None if options.cameras else options.disparity,
         "hole_area_ratio": holes,
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
@@ -54,7 +54,7 @@ def make_report(
     if tools.residual == "seeds":
         report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
     if completed.saved_view is not None:
-        report["scene_ply_view"] = completed.saved_view
+        report["scene_ply_view"] = completed.saved_view  # the view whose aux Gaussians scene.ply holds
     return report
 
 

@@ -19,11 +19,10 @@ from spackle.jobs.inputs import find_depth
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.weights import SHIPPED, load_residual
-from spackle.trajectory import TrajectoryKind
+from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]
 BASES = ("rgbd",)
-MAX_DISPARITY = 2.0
 MAX_FRAMES = 10_000
 MAX_VIDEO_SIDE = 8192
 

@@ -17,7 +17,7 @@ from spackle.gaussians import Gaussians
 from spackle.jobs.progress import Step
 from spackle.jobs.setup import PredictOptions, Tools
 from spackle.render import Renderer
-from spackle.residual import Completer, farthest_first, hole_area_ratio, hole_mask
+from spackle.residual import Completer, hole_area_ratio, hole_mask
 from spackle.scene import even_camera, scene_path
 from spackle.trajectory import DepthRange, extremes
 
@@ -38,7 +38,7 @@ class Completed:
     base: Gaussians
     aux: Gaussians  # what scene.ply holds besides the base
     by_view: list[Gaussians] | None = None  # in view mode
-    saved_view: int | None = None  # in view mode: the view that `aux` belongs to
+    saved_view: str | None = None  # in view mode: the view that `aux` belongs to
 
     def of_view(self, index: int) -> list[Gaussians]:
         """The sets that a view is drawn with."""
@@ -71,14 +71,19 @@ def complete(prediction: BasePrediction, plan: Plan, options: PredictOptions, to
     completer = Completer(base, prediction.camera, tools.renderer, tools.network)
     if options.mode == "scene":
         given = options.cameras is not None
-        return Completed(base, completer.complete_scene(plan.cameras, visit_all=given, progress=step))
+        return Completed(base, completer.complete_scene(plan.cameras, exact=given, progress=step))
     shields = [completer.photo_shield()]
     by_view = []
     for index, camera in enumerate(plan.cameras):
         by_view.append(completer.complete_view(camera, shields))
         step(index + 1, len(plan.cameras))
-    widest = farthest_first(plan.cameras, prediction.camera)[0]
-    return Completed(base, by_view[widest], by_view, widest)
+    # One file holds one view's Gaussians: those of the widest view that the report names.
+    name, widest = max(plan.checked.items(), key=lambda item: _distance(plan.cameras[item[1]], prediction.camera))
+    return Completed(base, by_view[widest], by_view, name)
+
+
+def _distance(camera: Camera, other: Camera) -> float:
+    return float((camera.position.double() - other.position.double()).norm())
 
 
 def save_plan_video(path: Path, plan: Plan, completed: Completed, renderer: Renderer, step: Step) -> None:

@@ -20,8 +20,8 @@ from spackle.residual.seeds import Seeds, make_seeds
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
-QUIET_HAR = 5e-4  # a view with fewer holes than this needs no completion
-QUIET_VIEWS = 2  # so many in a row, taken from all over a path, end the search for holes
+# What may stay open in a view of a path: little of the picture, and little of the hole that was there.
+QUIET_HAR, VISIBLE_HAR, QUIET_SHARE = 5e-4, 2e-3, 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,37 +63,41 @@ class Completer:
 
     @torch.no_grad()
     def complete_scene(
-        self, cameras: Sequence[Camera], visit_all: bool = False, progress: Callable[[int, int], None] | None = None
+        self, cameras: Sequence[Camera], exact: bool = False, progress: Callable[[int, int], None] | None = None
     ) -> Gaussians:
         """One set of aux Gaussians for a whole path, the same from every frame.
 
-        Keyframes are visited from the widest inwards, spread over the path. Each sees what the earlier
-        ones added, and may add only behind what the photo and the other keyframes show.
+        Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
+        added, and may add only behind what the photo and the views before it show.
 
         Args:
             cameras: the path.
-            visit_all: complete every camera; else stop when nothing new is found all over the path.
-            progress: called with (views visited, views at most).
+            exact: complete every view that has a hole; else what nobody would see may stay open.
+            progress: called with (views visited, views in all).
         """
         order = farthest_first(cameras, self.photo_camera)
-        shields = [self.photo_shield()]
+        shields = [self.photo_shield()] if order else []
         aux = Gaussians.empty()
-        quiet = 0
         for count, index in enumerate(order):
             camera = cameras[index]
             before = self.renderer.render([self.base, aux], camera)
-            if hole_area_ratio(before.alpha, self.threshold) < QUIET_HAR:
-                quiet += 1
-            else:
-                quiet = 0
+            if not self._is_quiet(before, camera, exact):
                 new, after = self._fill(camera, shields, [self.base, aux], before)
                 aux = Gaussians.cat([aux, new])
                 shields.append(Shield.of(after, camera, self.threshold))
             if progress:
                 progress(count + 1, len(order))
-            if quiet >= QUIET_VIEWS and not visit_all:
-                break
         return aux
+
+    def _is_quiet(self, rendering: Rendering, camera: Camera, exact: bool) -> bool:
+        """Whether a view needs no completion."""
+        holes = hole_area_ratio(rendering.alpha, self.threshold)
+        if exact or holes > VISIBLE_HAR:
+            return holes == 0
+        if holes < QUIET_HAR:
+            return True
+        alone = self.renderer.render(self.base, camera)
+        return holes < QUIET_SHARE * hole_area_ratio(alone.alpha, self.threshold)
 
     def _fill(
         self, camera: Camera, shields: Sequence[Shield], there: Sequence[Gaussians], rendering: Rendering
