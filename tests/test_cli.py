@@ -135,7 +135,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert report["residual"]["weights"] == "seeds"
     assert "no trained weights" in report["residual"]["note"]
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.3)
-    assert report["path"] == "rotate_forward"
+    assert report["views"] == "rotate_forward"
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.3", "+0.3"]
@@ -232,7 +232,7 @@ def test_no_render_writes_no_video(tmp_path: Path) -> None:
 def test_every_path_closes_its_holes(tmp_path: Path, kind: str) -> None:
     predict(*write_pair(tmp_path), tmp_path, "--trajectory", kind, "--disparity", "0.5")
     report = report_of(tmp_path / "photo")
-    assert report["path"] == kind.replace("-", "_")
+    assert report["views"] == kind.replace("-", "_")
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.5", "+0.5"]
     assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
 
@@ -256,7 +256,7 @@ def test_cameras_completes_exactly_the_given_views(tmp_path: Path) -> None:
     expected = {f"{index:04d}{kind}.png" for index in range(3) for kind in ("", "_base", "_mask")}
     assert names_in(folder / "views") == expected
     report = report_of(folder)
-    assert (report["path"], report["disparity"]) == (str(views), None)
+    assert (report["views"], report["disparity"]) == (views.name, None)
     assert [view["view"] for view in report["hole_area_ratio"]] == ["0", "1", "2"]
     assert all(view["after"] == 0 for view in report["hole_area_ratio"])
     assert all(view["before"] > 0.05 for view in report["hole_area_ratio"][1:])
@@ -283,7 +283,7 @@ def test_view_mode_completes_each_view_on_its_own(tmp_path: Path) -> None:
     predict(photo, depth, tmp_path / "out", "--cameras", views, "--mode", "view")
     folder = tmp_path / "out" / "photo"
     report = report_of(folder)
-    assert (report["mode"], report["scene_ply_view"]) == ("view", 1)
+    assert (report["mode"], report["scene_ply_view"]) == ("view", "1")
     assert all(view["after"] == 0 for view in report["hole_area_ratio"])
     base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
     assert merged.body[: len(base.body)] == base.body
@@ -494,6 +494,25 @@ def test_a_bad_photo_in_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     for line, culprit in zip(errors, ("b.png", "d.png", "e.png", "f.npy"), strict=True):
         assert culprit in line
     assert result.lines[-1] == "4 of 6 photos failed"
+
+
+def test_a_folder_goes_on_where_a_killed_run_stopped(tmp_path: Path) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    depth = write_depth(tmp_path / "d.npy")
+    for name in "abc":
+        write_photo(photos / f"{name}.png")
+    predict(photos, depth, out)
+    (out / "b" / "report.json").unlink()  # what is written last is missing: b was not finished
+    times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "abc"}
+
+    def redone() -> set[str]:
+        return {name for name in times if (out / name / "scene.ply").stat().st_mtime_ns != times[name]}
+
+    result = predict(photos, depth, out)
+    assert redone() == {"b"}
+    assert sum("done already" in line for line in result.lines) == 2
+    predict(photos, depth, out, "--disparity", "0.2")
+    assert redone() == {"a", "b", "c"}
 
 
 def test_a_folder_where_everything_fails_leaves_no_output(tmp_path: Path) -> None:

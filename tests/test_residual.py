@@ -516,7 +516,7 @@ def test_a_shield_is_the_farthest_depth_within_reach_and_none_over_holes() -> No
 
 def test_pushing_changes_nothing_for_the_eye_that_asked() -> None:
     completer, camera = box_view()
-    aux = completer.complete_view(camera)
+    aux = completer.complete_view(camera, [])
     pushed = push_behind(aux, camera.position, [completer.photo_shield()])
     assert len(pushed) == len(aux)
     assert bool((camera.to_camera(pushed.means)[:, 2] > camera.to_camera(aux.means)[:, 2] + 0.1).any())

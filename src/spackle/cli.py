@@ -90,6 +90,7 @@ def predict(
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the photo.")] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="In a folder: do again what is done already.")] = False,
     verbose: VerboseOption = False,
 ) -> None:
     """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each."""
@@ -113,6 +114,7 @@ def predict(
         focal_px=focal_px,
         focal_mm=focal_mm,
         fov=fov,
+        overwrite=overwrite,
     )
     if predict_all(photo, output, options, Reporter(verbose)):
         raise typer.Exit(1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video
 from spackle.jobs.inputs import results_folder
 from spackle.jobs.progress import Reporter
+from spackle.jobs.report import write_report
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.scene import Scene, complete, even_camera, scene_path
@@ -121,8 +121,7 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
         "residual": {"weights": "seeds", "note": "no trained weights: the seeds alone filled the holes"},
         "seconds": {**seconds, "total": round(time.perf_counter() - start, 3)},
     }
-    with atomic_path(output / "report.json") as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_report(report, output / "report.json")
     reporter.console.print(_table(scores))
     reporter.say(
         f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "

@@ -14,7 +14,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo, resize_photo
 from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.progress import Reporter
-from spackle.jobs.report import focal_source, make_report, summary, write_report
+from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.setup import PredictOptions, Tools, make_base, set_up
 from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
 
@@ -34,6 +34,9 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     with results_folder(output):
         for path, name in found:
             try:
+                if path != photos and not options.overwrite and is_done(output / name, path, options):
+                    reporter.say(f"{path.name}: done already (--overwrite does it again)")
+                    continue
                 predict_one(path, output / name, options, tools, reporter)
             except InputError as error:
                 if path == photos:  # the only one

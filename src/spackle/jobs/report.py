@@ -12,7 +12,7 @@ import spackle
 from spackle.bases.protocol import BasePrediction
 from spackle.formats import atomic_path
 from spackle.image import Photo
-from spackle.jobs.setup import PredictOptions, Tools
+from spackle.jobs.setup import PredictOptions, Tools, request_of
 from spackle.jobs.views import Completed
 
 
@@ -49,6 +49,7 @@ def make_report(
         "views": options.cameras.name if options.cameras else options.trajectory,
         "disparity": None if options.cameras else options.disparity,
         "hole_area_ratio": holes,
+        "request": request_of(photo.path, options),
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
     if tools.residual == "seeds":
@@ -56,6 +57,15 @@ def make_report(
     if completed.saved_view is not None:
         report["scene_ply_view"] = completed.saved_view  # the view whose aux Gaussians scene.ply holds
     return report
+
+
+def is_done(folder: Path, photo: Path, options: PredictOptions) -> bool:
+    """Whether an earlier run with the same files and options has finished: its report was written last."""
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        return bool(report["request"] == request_of(photo, options))
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def write_report(report: dict[str, Any], path: Path) -> None:

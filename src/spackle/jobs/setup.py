@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import spackle
 from spackle.bases.depth_maps import load_depth
 from spackle.bases.protocol import Base
 from spackle.bases.rgbd import RgbdBase
@@ -46,11 +49,31 @@ class PredictOptions:
     focal_px: float | None = None
     focal_mm: float | None = None
     fov: float | None = None
+    overwrite: bool = False  # in a folder, do again what is done already
 
     @property
     def gives_focal(self) -> bool:
         """Whether a person said what the focal length is."""
         return any(value is not None for value in (self.focal_px, self.focal_mm, self.fov))
+
+
+def request_of(photo: Path, options: PredictOptions) -> str:
+    """A digest of all that a result depends on: the version, the options, and what the files hold."""
+    files = [photo, options.calib, options.cameras, options.checkpoint]
+    files += [options.depth and find_depth(options.depth, photo)]
+    if options.residual not in (None, "seeds", "none"):
+        files.append(Path(str(options.residual)))
+    contents = [file and hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
+    for irrelevant in ("overwrite", "residual"):
+        del choices[irrelevant]
+    choices |= {"spackle": spackle.__version__, "residual": _residual(options), "files": contents}
+    return hashlib.sha256(json.dumps(choices, sort_keys=True).encode()).hexdigest()
+
+
+def _residual(options: PredictOptions) -> str:
+    """The weights that --residual means: a file, "seeds" or "none"."""
+    return options.residual or (str(SHIPPED) if SHIPPED.exists() else "seeds")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +99,7 @@ def set_up(options: PredictOptions) -> Tools:
     if options.checkpoint is not None:
         raise InputError(f"-c {options.checkpoint}: the rgbd base has no checkpoint; leave the option out")
     check_path_options(options.disparity, options.frames)
-    residual = options.residual or (str(SHIPPED) if SHIPPED.exists() else "seeds")
+    residual = _residual(options)
     network = None if residual in ("seeds", "none") else load_residual(residual)
     views = load_cameras(options.cameras) if options.cameras else None
     if views and options.render and (problem := video_problem(views)):

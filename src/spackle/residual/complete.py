@@ -46,7 +46,7 @@ class Completer:
     def complete_view(
         self,
         camera: Camera,
-        shields: Sequence[Shield] = (),
+        shields: Sequence[Shield] | None = None,
         aux: Gaussians | None = None,
         rendering: Rendering | None = None,
     ) -> Gaussians:
@@ -54,10 +54,12 @@ class Completer:
 
         Args:
             camera: the view to complete.
-            shields: views whose content must stay in front, the photo's for instance.
+            shields: views whose content must stay in front; the photo's alone where None.
             aux: aux Gaussians that are there already.
             rendering: base and aux from this view, where that is at hand.
         """
+        if shields is None:
+            shields = [self.photo_shield()]
         there = [self.base] if aux is None else [self.base, aux]
         return self._fill(camera, shields, there, rendering or self.renderer.render(there, camera))[0]
 
