@@ -100,11 +100,13 @@ def damaged_scene(
     return path
 
 
-def camera_file(path: Path, rights: list[float], sizes: list[tuple[int, int]] | None = None) -> Path:
+def camera_file(
+    path: Path, rights: list[float], sizes: list[tuple[int, int]] | None = None, focal: float = 55.0
+) -> Path:
     """Views that look straight ahead from places to the right of the photo's."""
     frames = []
     for right, (width, height) in zip(rights, sizes or [(WIDTH, HEIGHT)] * len(rights), strict=True):
-        K = [[55.0, 0, width / 2], [0, 55.0, height / 2], [0, 0, 1]]
+        K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
         pose = [[1, 0, 0, -right], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         frames.append({"K": K, "world_to_camera": pose, "width": width, "height": height})
     path.write_text(json.dumps({"frames": frames}))

@@ -304,6 +304,11 @@ def test_residual_none_is_the_base_alone(tmp_path: Path) -> None:
     assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
 
 
+def test_an_empty_residual_is_none_given(tmp_path: Path) -> None:
+    predict(*write_pair(tmp_path), tmp_path, "--residual", "")
+    assert report_of(tmp_path / "photo")["residual"]["weights"] == "seeds"
+
+
 def test_residual_weights_are_loaded_and_named(tmp_path: Path, plain: tuple[Path, Run]) -> None:
     torch.manual_seed(0)
     network = ResidualNet()
@@ -506,13 +511,44 @@ def test_a_folder_goes_on_where_a_killed_run_stopped(tmp_path: Path) -> None:
     times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "abc"}
 
     def redone() -> set[str]:
-        return {name for name in times if (out / name / "scene.ply").stat().st_mtime_ns != times[name]}
+        before = dict(times)
+        times.update({name: (out / name / "scene.ply").stat().st_mtime_ns for name in times})
+        return {name for name in times if times[name] != before[name]}
 
     result = predict(photos, depth, out)
     assert redone() == {"b"}
     assert sum("done already" in line for line in result.lines) == 2
+    (out / "c" / "video.mp4").unlink()
+    predict(photos, depth, out)
+    assert redone() == {"c"}
+    for options in (("--disparity", "0.2"), ("--overwrite", "--disparity", "0.2")):
+        predict(photos, depth, out, *options)
+        assert redone() == {"a", "b", "c"}
+    write_depth(depth, metres(far=7))
     predict(photos, depth, out, "--disparity", "0.2")
     assert redone() == {"a", "b", "c"}
+
+
+def test_a_changed_calibration_is_not_done_already(tmp_path: Path) -> None:
+    write_photo(tmp_path / "photos" / "disp0.png")
+    disparity = write_depth(tmp_path / "depths" / "disp0.npy")
+    calibration(disparity.with_name("calib.txt"), 80, 200, 0)
+    for focal in (80, 90):
+        calibration(disparity.with_name("calib.txt"), focal, 200, 0)
+        predict(tmp_path / "photos", disparity.parent, tmp_path / "out")
+        assert report_of(tmp_path / "out" / "disp0")["focal_px"] == focal
+
+
+def test_no_old_report_vouches_for_new_files(
+    tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    predict(*pair, tmp_path)
+    monkeypatch.setattr("spackle.jobs.predict.save_plan_video", interrupted)
+    assert run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path, "--disparity", "0.5", *SHORT).code == 130
+    assert names_in(tmp_path / "photo") == FILES - {"report.json"}
 
 
 def test_a_folder_where_everything_fails_leaves_no_output(tmp_path: Path) -> None:
@@ -697,6 +733,14 @@ def test_bad_cameras(tmp_path: Path, pair: tuple[Path, Path], text: str) -> None
     views = tmp_path / "bad.json"
     views.write_text(text, encoding="latin-1")
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", views, named=views)
+
+
+def test_cameras_that_see_too_much(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    views = camera_file(tmp_path / "views.json", rights=[0.2], focal=1e-20)
+    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new", "--cameras", views)
+    assert result.code == 2
+    assert str(views) in result.lines[-1]
+    assert not (tmp_path / "new").exists()
 
 
 def test_cameras_that_make_no_video(tmp_path: Path, pair: tuple[Path, Path], scene: Path) -> None:

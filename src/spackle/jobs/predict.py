@@ -15,7 +15,7 @@ from spackle.image import Photo, load_photo, resize_photo
 from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
-from spackle.jobs.setup import PredictOptions, Tools, make_base, set_up
+from spackle.jobs.setup import PredictOptions, Tools, make_base, request_of, set_up
 from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
 
 FILES_WITHOUT_VIDEO = ("base.ply", "scene.ply", "report.json")
@@ -30,11 +30,12 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     """
     found = find_photos(photos)
     tools = set_up(options)
+    files = _results(options, tools)
     failed = 0
     with results_folder(output):
         for path, name in found:
             try:
-                if path != photos and not options.overwrite and is_done(output / name, path, options):
+                if path != photos and not options.overwrite and is_done(output / name, files, path, options):
                     reporter.say(f"{path.name}: done already (--overwrite does it again)")
                     continue
                 predict_one(path, output / name, options, tools, reporter)
@@ -59,11 +60,12 @@ def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools,
         full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
         base = make_base(full, options)
         photo = resize_photo(full)
+        request = request_of(path, options)  # the files may be others by the time all is done
     with contextlib.ExitStack() as folders:
         folders.enter_context(results_folder(folder, FILES if options.render else FILES_WITHOUT_VIDEO))
         if tools.views:
             folders.enter_context(results_folder(folder / "views", view_files(len(tools.views))))
-        _predict_loaded(photo, base, folder, options, tools, reporter, seconds)
+        _predict_loaded(photo, base, folder, options, tools, reporter, request, seconds)
 
 
 def _predict_loaded(
@@ -73,6 +75,7 @@ def _predict_loaded(
     options: PredictOptions,
     tools: Tools,
     reporter: Reporter,
+    request: str,
     seconds: dict[str, float],
 ) -> None:
     """The stages after loading; nothing is written before all is computed."""
@@ -95,6 +98,7 @@ def _predict_loaded(
         if not _finite(completed.aux):
             raise InputError(f"{options.cameras or photo.path}: views too extreme to complete: check their K")
     with reporter.stage("write", seconds):
+        (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
         count = len(completed.base)
         save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
         merged = Gaussians.cat([completed.base, completed.aux])
@@ -107,9 +111,15 @@ def _predict_loaded(
             save_views(folder / "views", plan, completed, tools.renderer, step)
     with reporter.stage("measure", seconds):
         holes = measure_holes(plan, completed, tools.renderer)
-    report = make_report(photo, prediction, base.name, completed, options, tools, holes, seconds)
+    report = make_report(photo, prediction, base.name, completed, options, tools, holes, request, seconds)
     write_report(report, folder / "report.json")
     reporter.say(f"{name}: {summary(report)} -> {folder}")
+
+
+def _results(options: PredictOptions, tools: Tools) -> list[str]:
+    """All files that a prediction writes."""
+    views = [f"views/{name}" for name in view_files(len(tools.views or []))]
+    return [*(FILES if options.render else FILES_WITHOUT_VIDEO), *views]
 
 
 def _finite(gaussians: Gaussians) -> bool:

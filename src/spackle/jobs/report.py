@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def make_report(
     options: PredictOptions,
     tools: Tools,
     holes: list[dict[str, float | str]],
+    request: str,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """Counts, holes, times and sources of one photo, ready for JSON."""
@@ -49,7 +51,7 @@ def make_report(
         "views": options.cameras.name if options.cameras else options.trajectory,
         "disparity": None if options.cameras else options.disparity,
         "hole_area_ratio": holes,
-        "request": request_of(photo.path, options),
+        "request": request,
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
     if tools.residual == "seeds":
@@ -59,8 +61,10 @@ def make_report(
     return report
 
 
-def is_done(folder: Path, photo: Path, options: PredictOptions) -> bool:
-    """Whether an earlier run with the same files and options has finished: its report was written last."""
+def is_done(folder: Path, results: Sequence[str], photo: Path, options: PredictOptions) -> bool:
+    """Whether an earlier run with the same files and options has finished, and its results are there still."""
+    if not all((folder / name).is_file() for name in results):
+        return False
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         return bool(report["request"] == request_of(photo, options))

@@ -60,14 +60,17 @@ class PredictOptions:
 def request_of(photo: Path, options: PredictOptions) -> str:
     """A digest of all that a result depends on: the version, the options, and what the files hold."""
     files = [photo, options.calib, options.cameras, options.checkpoint]
-    files += [options.depth and find_depth(options.depth, photo)]
-    if options.residual not in (None, "seeds", "none"):
-        files.append(Path(str(options.residual)))
+    if options.depth is not None:
+        depth = find_depth(options.depth, photo)
+        beside = [depth.with_name(name) for name in ("calib.txt", "scene.json")]  # as `load_depth` finds them
+        files += [depth, *(file for file in beside if file.is_file())]
+    if (residual := _residual(options)) not in ("seeds", "none"):
+        files.append(Path(residual))
     contents = [file and hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
     for irrelevant in ("overwrite", "residual"):
         del choices[irrelevant]
-    choices |= {"spackle": spackle.__version__, "residual": _residual(options), "files": contents}
+    choices |= {"spackle": spackle.__version__, "residual": residual, "files": contents}
     return hashlib.sha256(json.dumps(choices, sort_keys=True).encode()).hexdigest()
 
 
