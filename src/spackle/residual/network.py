@@ -13,8 +13,8 @@ from spackle.residual.cues import Cues
 from spackle.residual.seeds import Seeds
 
 IN_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
-WIDTHS = (32, 80, 144, 192, 256)  # channels from the finest grid to the coarsest
-COARSE_BLOCKS = 4  # residual blocks at the coarsest grid, where context is wide and cheap
+WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
+COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
 
 
