@@ -964,7 +964,7 @@ def started(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
 def test_a_killed_run_leaves_whole_files_and_the_next_one_finishes(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     folder = tmp_path / "out" / "photo"
     arguments = ("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out")
-    with started(*arguments, "--frames", 8000) as process:
+    with started(*arguments, "--frames", 1500) as process:
         deadline = time.monotonic() + 240
         while not list(folder.glob(".video.*.mp4")):
             assert process.poll() is None, "ended before it could be killed"
