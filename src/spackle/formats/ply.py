@@ -205,7 +205,7 @@ def _tables(file: IO[bytes], header: Header, vertex: Element, offset: int) -> It
             rows = np.fromfile(file, vertex.dtype, count)
             if len(rows) < count:
                 raise InputError(f"{header.path}: cut off while it was read: try again")
-        with np.errstate(over="ignore"):  # too large for float32 becomes inf, which is counted
+        with np.errstate(over="ignore", invalid="ignore"):  # too large for float32 becomes inf, which is counted
             for k, name in enumerate(_READ):
                 table[k, :count] = rows[name]
         yield start, table
@@ -218,7 +218,7 @@ def _decode(table: NDArray[np.float32], parts: list[Tensor], linear: bool) -> in
     rgb = torch.from_numpy(table[3:6] * np.float32(SH_C0) + np.float32(0.5))
     colors.copy_((rgb.clamp_min(0) if linear else srgb_to_linear(rgb))[:, :rows].T)
     opacities.copy_(torch.from_numpy(table[6:7]).sigmoid()[:, :rows].T)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         table[7:10] = np.exp(table[7:10])
     for part, first in ((means, 0), (scales, 7), (quats, 10)):
         part.copy_(torch.from_numpy(table[first : first + part.shape[1], :rows]).T)
