@@ -270,3 +270,10 @@ def test_shape_against_the_photo(tmp_path: Path) -> None:
     for height, width in [(640, 480), (480, 660), (100, 100)]:
         with pytest.raises(InputError, match=r"is 640×480 but photo a\.jpg is"):
             found.check_shape(height, width, "a.jpg")
+
+
+def test_a_depth_too_small_to_invert_is_unknown(tmp_path: Path) -> None:
+    depth = np.full((4, 5), 2.0, np.float32)
+    depth[1] = 1e-41
+    np.save(tmp_path / "a.npy", depth)
+    assert load_depth(tmp_path / "a.npy").valid.sum() == 15

@@ -87,7 +87,8 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
         depth, valid, unit = _as_disparity(stored, is_png, lens, path)
     with np.errstate(over="ignore"):  # too far for float32 becomes inf, hence unknown
         metres = torch.from_numpy(depth.astype(np.float32))
-    known = torch.from_numpy(valid) & torch.isfinite(metres) & (metres > 0)
+    # A depth without a finite inverse is none (a file with its bytes swapped is full of them).
+    known = torch.from_numpy(valid) & torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {values.size} pixels has a {quantity}")
     integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
