@@ -35,8 +35,8 @@ from spackle.render.pipeline import Canvas, blend, project, wanted_tiles
 from spackle.render.project import View, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
 from spackle.render.sort import sort_by_depth
-from spackle.render.threads import thread_count
 from spackle.render.tiles import list_tiles
+from spackle.threads import thread_count
 
 PHOTO = 1536  # pixels along a side
 GRID = 768  # Gaussians along a side, in each of two layers

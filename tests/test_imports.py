@@ -25,11 +25,15 @@ ALLOWED = {
     "bases": {"values"},
     "residual": {"values", "render"},
     "formats": {"values"},
+    "downloads": {"values"},
     "pseudo": {"values", "render", "bases", "residual"},
     "training": {"values", "render", "bases", "residual", "formats", "pseudo"},
     "evaluation": {"values", "render", "bases", "residual", "formats", "pseudo", "training"},
     "viewer": {"values", "formats", "residual"},
-    "shell": {"values", "render", "bases", "residual", "formats", "pseudo", "training", "evaluation", "viewer"},
+    "shell": {
+        *("values", "render", "bases", "residual", "formats", "downloads"),
+        *("pseudo", "training", "evaluation", "viewer"),
+    },
 }
 
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.

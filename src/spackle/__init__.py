@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spackle.bases.depth_maps import DepthMap, load_depth
+    from spackle.bases.protocol import Base, BasePrediction
+    from spackle.bases.sharp import SharpBase
     from spackle.camera import Camera
     from spackle.errors import InputError
     from spackle.formats import load_cameras, load_ply, save_ply
@@ -26,6 +28,8 @@ __version__ = "0.1.0"
 
 # Loaded at first use: `spackle --help` need not wait for torch.
 _HOMES = {
+    "Base": "spackle.bases.protocol",
+    "BasePrediction": "spackle.bases.protocol",
     "Camera": "spackle.camera",
     "Completer": "spackle.residual",
     "DepthMap": "spackle.bases.depth_maps",
@@ -35,6 +39,7 @@ _HOMES = {
     "Renderer": "spackle.render",
     "Rendering": "spackle.rendering",
     "Scene": "spackle.scene",
+    "SharpBase": "spackle.bases.sharp",
     "complete": "spackle.scene",
     "get_renderer": "spackle.render",
     "hole_area_ratio": "spackle.residual",
@@ -48,6 +53,8 @@ _HOMES = {
 }
 
 __all__ = [
+    "Base",
+    "BasePrediction",
     "Camera",
     "Completer",
     "DepthMap",
@@ -57,6 +64,7 @@ __all__ = [
     "Renderer",
     "Rendering",
     "Scene",
+    "SharpBase",
     "complete",
     "get_renderer",
     "hole_area_ratio",

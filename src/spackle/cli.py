@@ -19,6 +19,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
+app.add_typer(weights, name="weights")
 
 
 class Trajectory(str, Enum):
@@ -35,6 +37,14 @@ class ModeChoice(str, Enum):
 
     scene = "scene"
     view = "view"
+
+
+class PrecisionChoice(str, Enum):
+    """What the base's network computes in."""
+
+    auto = "auto"
+    fp32 = "fp32"
+    bf16 = "bf16"
 
 
 class Device(str, Enum):
@@ -59,7 +69,7 @@ VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how lo
 def predict(
     photo: Annotated[Path, typer.Option("-i", "--input", metavar="PHOTO_OR_FOLDER", help="A photo, or a folder.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")],
-    base: Annotated[str, typer.Option(help="What turns the photo into Gaussians: rgbd.")] = "rgbd",
+    base: Annotated[str, typer.Option(help="What turns the photo into Gaussians: rgbd or sharp.")] = "rgbd",
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -71,6 +81,10 @@ def predict(
         Path | None, typer.Option(metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    precision: Annotated[
+        PrecisionChoice, typer.Option(help="Of the base's network; auto: bf16 where the hardware multiplies it.")
+    ] = PrecisionChoice.auto,
+    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")] = False,
     residual: Annotated[
         str | None,
         typer.Option(
@@ -103,6 +117,8 @@ def predict(
         depth=depth,
         calib=calib,
         checkpoint=checkpoint,
+        precision=precision.value,
+        low_memory=low_memory,
         residual=residual,
         render=render,
         trajectory=trajectory.name,  # type: ignore[arg-type]  # the members are named as the paths are
@@ -161,6 +177,33 @@ def demo(
     from spackle.jobs.progress import Reporter
 
     run_demo(output, Reporter(verbose))
+
+
+@weights.command("get")
+def weights_get(
+    name: Annotated[str, typer.Argument(help="Which weights: sharp.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
+    ] = None,
+    url: Annotated[str | None, typer.Option(help="Download from this mirror.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Download what is there already.")] = False,
+) -> None:
+    """Download weights and record their SHA-256; a broken download goes on where it stopped."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.weights import get_weights
+
+    get_weights(name, output, Reporter(), url=url, force=force)
+
+
+@weights.command("list")
+def weights_list() -> None:
+    """Say which weights are known, and which of them are here."""
+    from rich.console import Console
+
+    from spackle.jobs.weights import list_weights
+
+    list_weights(Console(highlight=False))
 
 
 def main() -> None:

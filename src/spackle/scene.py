@@ -14,7 +14,7 @@ from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
-from spackle.image import Photo, load_photo, resize_photo
+from spackle.image import Photo, load_photo
 from spackle.render import Renderer, get_renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet
@@ -72,18 +72,20 @@ class Scene:
 
 def predict(
     photo: str | os.PathLike[str] | Photo,
-    depth: str | os.PathLike[str] | DepthMap,
+    depth: str | os.PathLike[str] | DepthMap | None = None,
     *,
+    base: Base | None = None,
     kind: TrajectoryKind = "rotate_forward",
     disparity: float = 0.3,
     network: ResidualNet | None = None,
     renderer: Renderer | None = None,
 ) -> Scene:
-    """A photo and its depth to a scene without holes along a camera path.
+    """A photo to a scene without holes along a camera path, by its depth or by a base that needs none.
 
     Args:
-        photo: a file, or a loaded photo of at most 1536 pixels a side.
-        depth: a file, or a loaded depth map.
+        photo: a file, or a loaded photo.
+        depth: a file, or a loaded depth map; None where `base` is given.
+        base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`.
         kind: the path that the scene is completed for.
         disparity: how far the path goes, see `spackle.trajectory.max_offset`.
         network: residual weights; without any the seeds alone fill the holes.
@@ -91,9 +93,14 @@ def predict(
 
     Raises:
         InputError: a photo or a depth map that cannot be used.
+        ValueError: depth and base both given, or neither.
     """
-    loaded = photo if isinstance(photo, Photo) else resize_photo(load_photo(photo))
-    base: Base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
+    if (depth is None) == (base is None):
+        raise ValueError("predict takes either the photo's depth, or a base that needs none")
+    loaded = photo if isinstance(photo, Photo) else load_photo(photo)
+    if depth is not None:
+        base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
+    assert base is not None
     prediction = base.predict(loaded)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
     return complete(prediction, cameras, network=network, renderer=renderer)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Protocol
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
+
+Progress = Callable[[int, int], None]  # (steps done, of how many)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,8 +18,9 @@ class BasePrediction:
     """What the photo shows, as Gaussians in the frame of the photo's camera."""
 
     gaussians: Gaussians
-    camera: Camera  # the photo's, where the base knows the lens better than the photo's file does
+    camera: Camera  # the photo's, at its working size
     notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
+    lens_source: str = ""  # who gave the camera's lens, where it is not the photo's file or a person
 
 
 class Base(Protocol):
@@ -24,6 +28,11 @@ class Base(Protocol):
 
     name: str
 
-    def predict(self, photo: Photo) -> BasePrediction:
-        """Gaussians of everything that the photo shows, and nothing else."""
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Gaussians of everything that the photo shows, and nothing else.
+
+        Args:
+            photo: at its full size. The prediction's camera has the working size (see `working_size`).
+            progress: called as the work advances, where it takes long.
+        """
         ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -9,11 +11,11 @@ from torch.nn.functional import interpolate
 from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, undo_quantisation
 from spackle.bases.depth_maps import DepthMap
 from spackle.bases.missing import fill_missing
-from spackle.bases.protocol import BasePrediction
+from spackle.bases.protocol import BasePrediction, Progress
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.image import Photo, resize_photo
 from spackle.surface import surface_gaussians, surface_slope
 
 # Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
@@ -37,14 +39,16 @@ class RgbdBase:
     def __init__(self, depth: DepthMap) -> None:
         self.depth = depth
 
-    def predict(self, photo: Photo) -> BasePrediction:
-        """Gaussians of the photo's pixels; missing depth is filled and its share reported.
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Gaussians of the pixels of the photo at its working size; missing depth is filled and its share reported.
 
         Raises:
             InputError: where photo and depth map differ in aspect ratio.
         """
         self.depth.check_shape(photo.height, photo.width, photo.path)
-        return lift(photo.rgb, self.depth, self._camera(photo))
+        photo = resize_photo(photo)
+        prediction = lift(photo.rgb, self.depth, self._camera(photo))
+        return dataclasses.replace(prediction, lens_source="" if self.depth.K is None else "calibration")
 
     def _camera(self, photo: Photo) -> Camera:
         """The calibration's lens where there is one, on the photo's pixels; else the photo's."""

@@ -58,14 +58,13 @@ def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools,
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
         full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
-        base = make_base(full, options)
-        photo = resize_photo(full)
+        base = make_base(full, options, tools)
         request = request_of(path, options)  # the files may be others by the time all is done
     with contextlib.ExitStack() as folders:
         folders.enter_context(results_folder(folder, FILES if options.render else FILES_WITHOUT_VIDEO))
         if tools.views:
             folders.enter_context(results_folder(folder / "views", view_files(len(tools.views))))
-        _predict_loaded(photo, base, folder, options, tools, reporter, request, seconds)
+        _predict_loaded(full, base, folder, options, tools, reporter, request, seconds)
 
 
 def _predict_loaded(
@@ -80,10 +79,13 @@ def _predict_loaded(
 ) -> None:
     """The stages after loading; nothing is written before all is computed."""
     name = photo.path.name
-    with reporter.stage("base", seconds):
-        prediction = base.predict(photo)
+    with reporter.stage("base", seconds) as step:
+        prediction = base.predict(photo, step)
         if not _finite(prediction.gaussians):
-            raise InputError(f"{photo.path}: depth times focal length leaves the range of float32: check both")
+            raise InputError(
+                f"{photo.path}: the base's Gaussians leave the range of float32: check depth and focal length"
+            )
+    photo = resize_photo(photo)
     reporter.say(
         f"{name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
         f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source(photo, prediction)})"

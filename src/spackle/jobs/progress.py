@@ -7,8 +7,18 @@ import time
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
+from rich.filesize import decimal
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
 
 Step = Callable[[int, int], None]  # (done, of how many)
 
@@ -34,14 +44,7 @@ class Reporter:
         """Time a stage into `seconds[name]`; yields a function to call as it advances."""
         start = time.perf_counter()
         if self.console.is_terminal:
-            with Progress(
-                TextColumn("{task.description:<12}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                console=self.console,
-                transient=True,
-            ) as bars:
+            with self._bars(MofNCompleteColumn()) as bars:
                 task = bars.add_task(name, total=None)
                 yield lambda done, total: bars.update(task, completed=done, total=total)
         else:
@@ -49,3 +52,31 @@ class Reporter:
         elapsed = time.perf_counter() - start
         seconds[name] = round(seconds.get(name, 0.0) + elapsed, 3)
         self.detail(f"  {name}: {elapsed:.2f} s")
+
+    @contextlib.contextmanager
+    def transfer(self, name: str) -> Iterator[Step]:
+        """Bytes on their way: yields a function of (bytes, of how many); in a log, a line for each tenth."""
+        if self.console.is_terminal:
+            with self._bars(DownloadColumn(), TransferSpeedColumn()) as bars:
+                task = bars.add_task(name, total=None)
+
+                def advance(done: int, total: int) -> None:
+                    if not 0 < bars.tasks[0].completed <= done:  # what was here before says nothing of the speed
+                        bars.reset(task, total=total, completed=done)
+                    bars.update(task, completed=done)
+
+                yield advance
+        else:
+            said = 0
+
+            def tell(done: int, total: int) -> None:
+                nonlocal said
+                if (tenth := done * 10 // total) != said and done < total:
+                    said = tenth
+                    self.say(f"{name}: {decimal(done)} of {decimal(total)}")
+
+            yield tell
+
+    def _bars(self, *columns: ProgressColumn) -> Progress:
+        description = TextColumn("{task.description:<12}")
+        return Progress(description, BarColumn(), *columns, TimeRemainingColumn(), console=self.console, transient=True)

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 import spackle
 from spackle.bases.protocol import BasePrediction
 from spackle.formats import atomic_path
@@ -21,8 +19,7 @@ def focal_source(photo: Photo, prediction: BasePrediction) -> str:
     """Who said what the focal length is: an option, the photo, the base's calibration, or nobody."""
     if photo.focal_source.startswith("--"):  # a person's word beats the calibration's
         return photo.focal_source
-    same = torch.allclose(prediction.camera.K, photo.camera.K, rtol=1e-3)
-    return photo.focal_source if same else "calibration"
+    return prediction.lens_source or photo.focal_source
 
 
 def make_report(

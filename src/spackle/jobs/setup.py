@@ -14,7 +14,9 @@ import spackle
 from spackle.bases.depth_maps import load_depth
 from spackle.bases.protocol import Base
 from spackle.bases.rgbd import RgbdBase
+from spackle.bases.sharp import PRECISIONS, Precision, SharpBase
 from spackle.camera import Camera
+from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import load_cameras
 from spackle.image import Photo
@@ -25,9 +27,10 @@ from spackle.residual.weights import SHIPPED, load_residual
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]
-BASES = ("rgbd",)
+BASES = ("rgbd", "sharp")
 MAX_FRAMES = 10_000
 MAX_VIDEO_SIDE = 8192
+MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +41,8 @@ class PredictOptions:
     depth: Path | None = None  # a depth map, or a folder of depth maps named as the photos
     calib: Path | None = None  # calibration of a disparity map
     checkpoint: Path | None = None  # weights of the base
+    precision: Precision = "auto"  # of the base's network
+    low_memory: bool = False
     residual: str | None = None  # a file, "seeds", "none", or None for the shipped weights if any
     render: bool = True
     trajectory: TrajectoryKind = "rotate_forward"
@@ -59,19 +64,34 @@ class PredictOptions:
 
 def request_of(photo: Path, options: PredictOptions) -> str:
     """A digest of all that a result depends on: the version, the options, and what the files hold."""
-    files = [photo, options.calib, options.cameras, options.checkpoint]
+    files = [photo, options.calib, options.cameras, _checkpoint(options)]
     if options.depth is not None:
         depth = find_depth(options.depth, photo)
         beside = [depth.with_name(name) for name in ("calib.txt", "scene.json")]  # as `load_depth` finds them
         files += [depth, *(file for file in beside if file.is_file())]
     if (residual := _residual(options)) not in ("seeds", "none"):
         files.append(Path(residual))
-    contents = [file and hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    contents = [file and _fingerprint(file) for file in files]
     choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
     for irrelevant in ("overwrite", "residual"):
         del choices[irrelevant]
     choices |= {"spackle": spackle.__version__, "residual": residual, "files": contents}
     return hashlib.sha256(json.dumps(choices, sort_keys=True).encode()).hexdigest()
+
+
+def _fingerprint(file: Path) -> str:
+    """The digest of what a file holds; of gigabytes, which would take seconds to read, size and time of change."""
+    status = file.stat()
+    if status.st_size > MAX_HASHED:
+        return f"{status.st_size} bytes of {status.st_mtime_ns}"
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _checkpoint(options: PredictOptions) -> Path | None:
+    """The base's weights: those that were given, else those that were downloaded, if any."""
+    if options.base != "sharp":
+        return options.checkpoint
+    return options.checkpoint or installed("sharp")
 
 
 def _residual(options: PredictOptions) -> str:
@@ -84,6 +104,7 @@ class Tools:
     """What is set up once for all photos."""
 
     renderer: Renderer
+    base: Base | None  # one that needs nothing beside the photo
     network: ResidualNet | None
     residual: str  # for the report: a path, "seeds" or "none"
     views: list[Camera] | None  # of --cameras
@@ -97,17 +118,47 @@ def set_up(options: PredictOptions) -> Tools:
     """
     if options.base not in BASES:
         raise InputError(f"--base {options.base}: unknown base; this version has: {', '.join(BASES)}")
-    if options.depth is None:
-        raise InputError("--base rgbd needs the photo's depth: give --depth FILE, or --depth FOLDER for many photos")
-    if options.checkpoint is not None:
-        raise InputError(f"-c {options.checkpoint}: the rgbd base has no checkpoint; leave the option out")
+    _check_base_options(options)
     check_path_options(options.disparity, options.frames)
     residual = _residual(options)
     network = None if residual in ("seeds", "none") else load_residual(residual)
     views = load_cameras(options.cameras) if options.cameras else None
     if views and options.render and (problem := video_problem(views)):
         raise InputError(f"{options.cameras}: {problem}, so they make no video: add --no-render for pictures only")
-    return Tools(get_renderer(options.device), network, residual, views)
+    renderer = get_renderer(options.device)
+    base = _load_sharp(options) if options.base == "sharp" else None  # last, because it takes seconds
+    return Tools(renderer, base, network, residual, views)
+
+
+def _check_base_options(options: PredictOptions) -> None:
+    if options.precision not in PRECISIONS:
+        raise InputError(f"--precision {options.precision}: unknown; there are {', '.join(PRECISIONS)}")
+    if options.base == "sharp":
+        for name, value in (("--depth", options.depth), ("--calib", options.calib)):
+            if value is not None:
+                raise InputError(f"{name} {value}: the sharp base finds depth itself; leave the option out")
+        return
+    if options.depth is None:
+        raise InputError(
+            "--base rgbd needs the photo's depth: give --depth FILE, or --depth FOLDER for many photos; "
+            "--base sharp needs none"
+        )
+    if options.checkpoint is not None:
+        raise InputError(f"-c {options.checkpoint}: the rgbd base has no checkpoint; leave the option out")
+
+
+def _load_sharp(options: PredictOptions) -> SharpBase:
+    """SHARP with the weights that were given or downloaded; a download is held to its record first."""
+    path = _checkpoint(options)
+    if path is None:
+        raise InputError(
+            "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
+            "(2.8 GB, for research only), -c FILE takes a local copy"
+        )
+    if options.checkpoint is None:
+        check_recorded(path)
+    device = None if options.device == "auto" else options.device
+    return SharpBase.load(path, precision=options.precision, low_memory=options.low_memory, device=device)
 
 
 def check_path_options(disparity: float, frames: int) -> None:
@@ -128,12 +179,14 @@ def video_problem(cameras: Sequence[Camera]) -> str | None:
     return None
 
 
-def make_base(photo: Photo, options: PredictOptions) -> Base:
+def make_base(photo: Photo, options: PredictOptions, tools: Tools) -> Base:
     """The base for one photo, given at its full size.
 
     Raises:
         InputError: a depth map that cannot be used, or none for this photo.
     """
+    if tools.base is not None:
+        return tools.base
     assert options.depth is not None  # set_up has refused it
     path = find_depth(options.depth, photo.path)
     depth = load_depth(path, calib=options.calib)

@@ -18,9 +18,9 @@ from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_arra
 from spackle.render.project import View
 from spackle.render.project_backward import project_backward
 from spackle.render.protocol import TILE
-from spackle.render.threads import run_chunks, thread_count
 from spackle.render.walk import SUMS
 from spackle.rendering import Rendering
+from spackle.threads import run_chunks, thread_count
 
 Array = npt.NDArray[Any]
 

@@ -15,9 +15,9 @@ from spackle.gaussians import Gaussians
 from spackle.render.blend import blend_tiles
 from spackle.render.project import Splats, View, count_before, project_chunk
 from spackle.render.sort import sort_by_depth
-from spackle.render.threads import run_chunks
 from spackle.render.tiles import TileLists, list_tiles
 from spackle.rendering import Rendering
+from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from spackle._numba import kernel
 from spackle.render.sort import even_spans, starts_of
-from spackle.render.threads import run_chunks, thread_count
+from spackle.threads import run_chunks, thread_count
 
 Array = npt.NDArray[Any]
 

@@ -53,7 +53,7 @@ def _executor() -> ThreadPoolExecutor:
     global _pool
     with _pool_lock:
         if _pool is None:
-            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="spackle-render")
+            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="spackle")
         return _pool
 
 

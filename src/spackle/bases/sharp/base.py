@@ -1,0 +1,90 @@
+"""The SHARP base: a photo alone to 1,179,648 metric Gaussians."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sharp.checkpoint import load_network
+from spackle.bases.sharp.network import SharpNetwork
+from spackle.bases.sharp.precision import Precision, pick_dtype
+from spackle.bases.sharp.start import compose
+from spackle.bases.sharp.unproject import stretch_gaussians
+from spackle.camera import Camera
+from spackle.image import Photo, working_size
+
+WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
+WINDOWS_AT_ONCE_GPU = 35
+
+
+class SharpBase:
+    """Apple's SHARP (2025), frozen. The published weights are for research only."""
+
+    name = "sharp"
+
+    def __init__(self, network: SharpNetwork, *, low_memory: bool = False, weights: str = "") -> None:
+        """Use a network that is loaded already; `weights` is what the report calls it."""
+        self.network = network
+        self.low_memory = low_memory
+        self.weights = weights
+
+    @staticmethod
+    def load(
+        path: str | os.PathLike[str],
+        *,
+        precision: Precision = "auto",
+        low_memory: bool = False,
+        device: torch.device | str | None = None,
+    ) -> SharpBase:
+        """Read a checkpoint.
+
+        Args:
+            path: Apple's .pt file, or a .safetensors file with the same names.
+            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively.
+            low_memory: take less memory and a little more time.
+            device: a CUDA device where there is one, else the processor.
+
+        Raises:
+            InputError: a file that is not SHARP's weights. Nothing in it is executed.
+        """
+        target = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        network = load_network(path, pick_dtype(precision, target), target)
+        return SharpBase(network, low_memory=low_memory, weights=Path(path).name)
+
+    @property
+    def precision(self) -> str:
+        """What the heavy arithmetic runs in: fp32 or bf16."""
+        return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
+
+    @torch.inference_mode()
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Two layers of Gaussians in metres, the nearer one first, each in row-major order.
+
+        Args:
+            photo: at its full size: the network looks at a square picture made from all of its pixels.
+            progress: called with windows done and their number.
+        """
+        device = next(self.network.parameters()).device
+        image = to_square(photo.rgb.to(device), self.network.config.side)
+        output = self.network(image, photo.focal_px / photo.width, self._batch(device), progress)
+        stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
+        gaussians = stretch_gaussians(compose(output.start, output.deltas), stretch).to("cpu")
+        camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
+        notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
+        return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
+
+    def _batch(self, device: torch.device) -> int:
+        if self.low_memory:
+            return 1
+        return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
+
+
+def to_square(rgb: Tensor, side: int) -> Tensor:
+    """[H, W, 3] sRGB to [1, 3, side, side], bilinear with the corner pixels on the corners, as SHARP was trained."""
+    image = rgb.permute(2, 0, 1)[None].contiguous()
+    return interpolate(image, size=(side, side), mode="bilinear", align_corners=True)

@@ -1,0 +1,116 @@
+"""`spackle weights`: fetch what others publish, and say what is here."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rich.console import Console
+from rich.filesize import decimal
+from rich.table import Table
+
+from spackle.downloads import (
+    WEIGHTS,
+    KnownWeights,
+    Record,
+    check_recorded,
+    download,
+    known_weights,
+    read_record,
+    weights_folder,
+)
+from spackle.errors import InputError
+from spackle.jobs.inputs import results_folder
+from spackle.jobs.progress import Reporter
+
+
+def get_weights(
+    name: str, output: Path | None, reporter: Reporter, *, url: str | None = None, force: bool = False
+) -> Path:
+    """Download known weights unless they are there; returns their file.
+
+    Args:
+        name: as in `WEIGHTS`.
+        output: a folder, or a file name with the weights' suffix; the folder of weights where None.
+        reporter: says the terms of use when the first bytes come, and where the file lies.
+        url: a mirror.
+        force: download what is there already.
+
+    Raises:
+        InputError: an unknown name, a file that cannot be had or not be written, or one that is there and damaged.
+    """
+    known = known_weights(name)
+    path = _place(known, output)
+    if os.path.isfile(path) and not force:
+        _say_present(known, path, reporter)
+        return path
+    with results_folder(path.parent, [path.name]):
+        record = _download(known, url or known.url, path, reporter)
+    hint = "" if output is None else "; --checkpoint names it to predict"
+    reporter.say(f"{_summary(known, record)} -> {path}{hint}")
+    return path
+
+
+def list_weights(console: Console) -> None:
+    """A table of the known weights; of those that are here the size alone is checked, which takes no time."""
+    table = Table(box=None, pad_edge=False)
+    for header in ("name", "state", "file", "licence"):
+        table.add_column(header, overflow="fold")
+    folder = weights_folder()
+    for known in WEIGHTS.values():
+        table.add_row(known.name, _state(folder / known.file), known.file, known.licence)
+    console.print(table)
+    console.print(f"in {folder} (SPACKLE_WEIGHTS names another)", markup=False, soft_wrap=True)
+
+
+def _place(known: KnownWeights, output: Path | None) -> Path:
+    if output is None:
+        return weights_folder() / known.file
+    named = output.suffix == Path(known.file).suffix and not os.path.isdir(output)
+    return output if named else output / known.file
+
+
+def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> None:
+    with reporter.stage("check", {}):
+        record = check_recorded(path)
+    if record is None:
+        reporter.say(f"{known.name}: there already, unchecked for want of a record; --force downloads it again: {path}")
+    else:
+        reporter.say(f"{_summary(known, record)}, there already and intact: {path}")
+
+
+def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> Record:
+    noticed = False
+    with reporter.transfer(known.name) as step:
+
+        def advance(done: int, total: int) -> None:
+            nonlocal noticed
+            if not noticed:  # not before: where nothing comes, nothing needs a licence
+                noticed = True
+                for line in known.notice:
+                    reporter.say(line)
+            step(done, total)
+
+        try:
+            return download(url, path, advance)
+        except KeyboardInterrupt:
+            if noticed:
+                reporter.say(f"{known.name}: what has come is kept; the same command goes on from there")
+            raise
+
+
+def _summary(known: KnownWeights, record: Record) -> str:
+    return f"{known.name}: {decimal(record.size)}, SHA-256 {record.sha256}"
+
+
+def _state(path: Path) -> str:
+    if not os.path.isfile(path):
+        return "not here"
+    size = os.path.getsize(path)
+    try:
+        record = read_record(path)
+    except InputError:
+        return f"{decimal(size)}, damaged record"
+    if record is None:
+        return f"{decimal(size)}, no record"
+    return f"{decimal(size)}, whole" if size == record.size else f"damaged: {size:,} of {record.size:,} bytes"

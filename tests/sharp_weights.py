@@ -1,0 +1,51 @@
+"""SHARP in small sizes with weights that anyone can make, and the picture that its golden numbers belong to."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from spackle.bases.sharp.checkpoint import expected_shapes
+from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.network import SharpNetwork
+from spackle.bases.sharp.recipe import deterministic_weights
+
+DATA = Path(__file__).parent / "data"
+# A ninth of the tiny network's pixels: quick, and of no checkpoint's size.
+MICRO = dataclasses.replace(TINY, window=128)
+
+
+def tiny_weights() -> dict[str, Tensor]:
+    """A whole state dict, with what inference never uses."""
+    return deterministic_weights(expected_shapes(TINY))
+
+
+def write_tiny(path: Path) -> Path:
+    """A checkpoint of the tiny network, .pt or .safetensors by the name."""
+    if path.suffix == ".safetensors":
+        save_file(tiny_weights(), path)
+    else:
+        torch.save(tiny_weights(), path)
+    return path
+
+
+def micro_network() -> SharpNetwork:
+    """131,072 Gaussians from 512² pixels, in float32."""
+    network = SharpNetwork(MICRO).eval().requires_grad_(False)
+    weights = deterministic_weights(expected_shapes(MICRO))
+    network.load_state_dict({name: weights[name] for name in network.state_dict()})
+    return network
+
+
+def waves(side: int = 1536) -> Tensor:
+    """The golden numbers' picture, [1, 3, side, side]."""
+    y, x = np.mgrid[:side, :side] / side
+    red = 0.5 + 0.5 * np.sin(2 * np.pi * (3 * x + 2 * y))
+    green = 0.5 + 0.5 * np.cos(2 * np.pi * (5 * x * y + y))
+    blue = 0.5 + 0.25 * np.sin(40 * x) * np.cos(30 * y) + 0.25 * x
+    return torch.from_numpy(np.stack([red, green, blue]).astype(np.float32))[None]

@@ -1,0 +1,104 @@
+"""A web server on this machine for one file, which can do what servers and networks do wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import re
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+
+@dataclasses.dataclass
+class Site:
+    """What the server has and how it behaves; `requests` is what it was asked."""
+
+    url: str
+    content: bytes
+    etag: bool = True
+    ranges: bool = True
+    if_range: bool = True  # False: gives the rest of whatever it has
+    status: int = 200
+    headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None: left out
+    drops: list[int] = dataclasses.field(default_factory=list)  # bytes before each of the next answers breaks off
+    hang_after: int | None = None  # bytes of an answer, then nothing until `go_on` is set
+    go_on: threading.Event = dataclasses.field(default_factory=threading.Event)
+    requests: list[dict[str, str]] = dataclasses.field(default_factory=list)
+    paths: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def tag(self) -> str:
+        return f'"{hashlib.md5(self.content).hexdigest()}"'
+
+
+@contextlib.contextmanager
+def serve(content: bytes) -> Iterator[Site]:
+    """A site with that content until the block ends."""
+    server = _Server(("127.0.0.1", 0), _Handler)
+    server.site = Site(f"http://127.0.0.1:{server.server_port}/weights.pt", content)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    try:
+        yield server.site
+    finally:
+        server.site.go_on.set()
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = False  # so that closing waits for them
+    site: Site
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that hangs up is what many tests are about."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        site = self.server.site
+        site.requests.append(dict(self.headers))
+        site.paths.append(self.path)
+        start = self._start(site)
+        status = site.status if site.status != 200 else 206 if start else 200
+        size = len(site.content)
+        if start and start >= size:
+            status, body = 416, b""
+        else:
+            body = site.content[start or 0 :]
+        headers: dict[str, str | None] = {"Content-Length": str(len(body)), "Content-Type": "application/octet-stream"}
+        if site.etag:
+            headers["ETag"] = site.tag
+        if status == 206:
+            headers["Content-Range"] = f"bytes {start}-{size - 1}/{size}"
+        self.send_response(status)
+        for name, value in (headers | site.headers).items():
+            if value is not None:
+                self.send_header(name, value)
+        self.end_headers()
+        self._send(site, body)
+
+    def _start(self, site: Site) -> int:
+        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        if not (wanted and site.ranges):
+            return 0
+        fits = self.headers.get("If-Range") in (None, site.tag, site.headers.get("Last-Modified"))
+        return int(wanted[1]) if fits or not site.if_range else 0
+
+    def _send(self, site: Site, body: bytes) -> None:
+        if site.drops:
+            body = body[: site.drops.pop(0)]
+        elif site.hang_after is not None:
+            self.wfile.write(body[: site.hang_after])
+            body = body[site.hang_after :]
+            site.go_on.wait(60)
+        self.wfile.write(body)
