@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
-import json
 import math
 import os
 import shutil
@@ -22,6 +20,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from command import FILES, Run, names_in, report_of, run
 from photos import (
     HEIGHT,
     WIDTH,
@@ -49,34 +48,6 @@ from spackle.residual import ResidualNet
 SCRIPT = Path(sys.executable).with_name("spackle")
 COMMAND = [str(SCRIPT)] if SCRIPT.exists() else [sys.executable, "-c", "from spackle.cli import main; main()"]
 SHORT = ("--frames", "3")
-FILES = {"base.ply", "scene.ply", "video.mp4", "report.json"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What a command line came to."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def lines(self) -> list[str]:
-        return self.err.splitlines()
-
-
-def run(*arguments: object) -> Run:
-    """The entry point within this process: a new one takes seconds to start."""
-    out, err = io.StringIO(), io.StringIO()
-    code: object = 0
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", ["spackle", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code or 0
-    assert isinstance(code, int)
-    return Run(code, out.getvalue(), err.getvalue())
 
 
 def predict(photo: Path, depth: Path, out: Path, *options: object) -> Run:
@@ -84,15 +55,6 @@ def predict(photo: Path, depth: Path, out: Path, *options: object) -> Run:
     result = run("predict", "-i", photo, "--depth", depth, "-o", out, *SHORT, *options)
     assert result.code == 0, result.err
     return result
-
-
-def report_of(folder: Path) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
-    return report
-
-
-def names_in(folder: Path) -> set[str]:
-    return set(os.listdir(folder))
 
 
 def pixels(path: Path) -> np.ndarray:

@@ -11,11 +11,12 @@ from torch.nn.functional import interpolate
 
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.network import SharpNetwork
+from spackle.bases.sharp.network import SharpNetwork, SharpOutput
 from spackle.bases.sharp.precision import Precision, pick_dtype
 from spackle.bases.sharp.start import compose
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
+from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
 
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
@@ -61,7 +62,6 @@ class SharpBase:
         """What the heavy arithmetic runs in: fp32 or bf16."""
         return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
 
-    @torch.inference_mode()
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Two layers of Gaussians in metres, the nearer one first, each in row-major order.
 
@@ -69,19 +69,27 @@ class SharpBase:
             photo: at its full size: the network looks at a square picture made from all of its pixels.
             progress: called with windows done and their number.
         """
-        device = next(self.network.parameters()).device
-        image = to_square(photo.rgb.to(device), self.network.config.side)
-        output = self.network(image, photo.focal_px / photo.width, self._batch(device), progress)
-        stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
-        gaussians = stretch_gaussians(compose(output.start, output.deltas), stretch).to("cpu")
+        gaussians = to_metric(self.look(photo, progress), photo).to("cpu")
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
 
-    def _batch(self, device: torch.device) -> int:
-        if self.low_memory:
-            return 1
-        return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
+    @torch.no_grad()
+    def look(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
+        """What the network says about a photo; `to_metric` makes Gaussians of it."""
+        device = next(self.network.parameters()).device
+        batch = WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
+        image = to_square(photo.rgb.to(device), self.network.config.side)
+        output: SharpOutput = self.network(
+            image, photo.focal_px / photo.width, 1 if self.low_memory else batch, progress
+        )
+        return output
+
+
+def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
+    """Gaussians in metres, on the network's device: the normalised space is x and y in -1..1 times z."""
+    stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
+    return stretch_gaussians(compose(output.start, output.deltas), stretch)
 
 
 def to_square(rgb: Tensor, side: int) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -40,15 +41,18 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, expected_shapes(config), path)
     with torch.device("meta"):
         network = SharpNetwork(config)
-    network.load_state_dict({name: tensors[name] for name in network.state_dict()}, assign=True)
-    network.eval().requires_grad_(False)
     try:
+        network.load_state_dict({name: tensors[name].float() for name in network.state_dict()}, assign=True)
+        network.eval().requires_grad_(False)
         set_precision(network, dtype)  # reads what is on the disk still
         if dtype != torch.float32:  # most is copied by now: with the rest, the file can be let go
             for parameter in network.parameters():
                 parameter.data = parameter.data.clone()
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read to its end: {_line(error)}") from error
+    broken = [name for name, tensor in network.state_dict().items() if not tensor.sum().isfinite()]
+    if broken:
+        raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): download it again")
     return network.to(device)
 
 
@@ -62,8 +66,11 @@ def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     try:
         if Path(path).suffix == ".safetensors":
             with safe_open(path, framework="pt") as file:
-                return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
-        loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+                loaded = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
+        else:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # about old pickles, which are refused or fine
+                loaded = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except pickle.UnpicklingError as error:
         raise InputError(
             f"{path}: holds more than tensors, or is damaged; nothing in it was run: "
@@ -73,9 +80,9 @@ def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         raise InputError(f"{path}: not a checkpoint, or cut off ({_line(error)}): download it again") from error
     if not isinstance(loaded, Mapping) or not loaded:
         raise InputError(f"{path}: holds no named tensors: give SHARP's checkpoint")
-    others = [name for name, value in loaded.items() if not (isinstance(name, str) and isinstance(value, Tensor))]
-    if others:
-        raise InputError(f"{path}: {others[0]!s:.60} is no tensor: give the state dict of SHARP alone")
+    for name, value in loaded.items():
+        if not (isinstance(name, str) and isinstance(value, Tensor) and value.is_floating_point()):
+            raise InputError(f"{path}: {name!s:.120} is no tensor of floats: give SHARP's weights alone")
     return dict(loaded)
 
 

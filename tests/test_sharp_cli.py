@@ -1,0 +1,120 @@
+"""`spackle predict --base sharp` as people use it, with a small checkpoint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from command import FILES, names_in, report_of, run
+from photos import picture, read_ply, write_photo
+from PIL import Image
+from sharp_weights import tiny_weights, write_tiny
+
+from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.precision import pick_dtype
+
+QUICK = ("--no-render", "--residual", "none")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny(tmp_path_factory.mktemp("weights") / "tiny.pt")
+
+
+@pytest.fixture(autouse=True)
+def _no_weights_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
+
+
+def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(tmp_path: Path, weights: Path) -> None:
+    photo = write_photo(tmp_path / "photo.jpg")
+    result = run("predict", "-i", photo, "-o", tmp_path / "out", "--base", "sharp", "-c", weights, "--frames", 3)
+    assert result.code == 0, result.err
+    assert names_in(tmp_path / "out" / "photo") == FILES
+    report = report_of(tmp_path / "out" / "photo")
+    native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
+    precision = "bf16" if native else "fp32"
+    expected = {"name": "sharp", "gaussians": TINY.gaussians, "precision": precision, "weights": "tiny.pt"}
+    assert report["base"] == expected
+    assert report["photo"] == {"file": "photo.jpg", "width": 64, "height": 48}
+    assert report["focal_source"] == "default 30 mm"
+    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == TINY.gaussians
+    for row in report["hole_area_ratio"]:
+        assert row["after"] < 0.01 < row["before"]
+
+
+def test_precision_and_memory_are_options(tmp_path: Path, weights: Path) -> None:
+    photo = write_photo(tmp_path / "photo.png")
+    options = ("--base", "sharp", "-c", weights, "--precision", "fp32", "--low-memory", "--focal-px", 50, *QUICK)
+    result = run("predict", "-i", photo, "-o", tmp_path / "out", *options)
+    assert result.code == 0, result.err
+    report = report_of(tmp_path / "out" / "photo")
+    assert report["base"]["precision"] == "fp32"
+    assert (report["focal_px"], report["focal_source"]) == (50, "--focal-px")
+    result = run("predict", "-i", photo, "-o", tmp_path / "out", "--base", "sharp", "--precision", "fp8")
+    assert result.code == 2
+    assert "fp32" in result.err
+
+
+def test_downloaded_weights_are_found_and_held_to_their_record(tmp_path: Path) -> None:
+    photo, folder = write_photo(tmp_path / "photo.png"), tmp_path / "weights"
+    folder.mkdir()
+    file = write_tiny(folder / "sharp_2572gikvuh.pt")
+    arguments = ("predict", "-i", photo, "-o", tmp_path / "out", "--base", "sharp", *QUICK)
+    assert run(*arguments).code == 0
+    assert report_of(tmp_path / "out" / "photo")["base"]["weights"] == file.name
+    record = f'{{"url": "https://x", "size": {file.stat().st_size}, "sha256": "{"0" * 64}"}}'
+    (folder / "sharp_2572gikvuh.pt.json").write_text(record)
+    result = run(*arguments)
+    assert result.code == 2
+    assert "SHA-256 is not that of what was downloaded" in result.err
+
+
+def test_without_weights_one_line_says_both_ways(tmp_path: Path) -> None:
+    result = run("predict", "-i", write_photo(tmp_path / "photo.png"), "-o", tmp_path / "out", "--base", "sharp")
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert "spackle weights get sharp" in result.err
+    assert "-c FILE" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", ["--depth", "--calib"])
+def test_depth_beside_sharp_is_refused(tmp_path: Path, weights: Path, option: str) -> None:
+    photo = write_photo(tmp_path / "photo.png")
+    arguments = ("--base", "sharp", "-c", weights, option, tmp_path / "d")
+    result = run("predict", "-i", photo, "-o", tmp_path / "out", *arguments)
+    assert result.code == 2
+    assert option in result.err
+
+
+def test_a_checkpoint_that_is_none_is_one_line_and_nothing_is_written(tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "photo.png")
+    result = run("predict", "-i", photo, "-o", tmp_path / "out", "--base", "sharp", "-c", photo)
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert str(photo) in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_goes_on_and_other_weights_do_it_again(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        write_photo(tmp_path / "photos" / name)
+    weights = write_tiny(tmp_path / "w.pt")
+    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
+    assert run(*arguments).code == 0
+    assert run(*arguments).err.count("done already") == 2
+    changed = tiny_weights()
+    changed["prediction_head.texture_prediction_head.bias"] += 0.1
+    torch.save(changed, weights)
+    assert "done already" not in run(*arguments).err
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3000, 3), (10, 2000)])
+def test_photos_of_odd_shapes_go_all_the_way(tmp_path: Path, weights: Path, size: tuple[int, int]) -> None:
+    Image.fromarray(picture()).resize(size).save(tmp_path / "odd.png")
+    options = ("--base", "sharp", "-c", weights, "--frames", 2)
+    result = run("predict", "-i", tmp_path / "odd.png", "-o", tmp_path / "out", *options)
+    assert result.code == 0, result.err
+    assert names_in(tmp_path / "out" / "odd") == FILES
