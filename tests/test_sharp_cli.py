@@ -11,6 +11,7 @@ from photos import picture, read_ply, write_photo
 from PIL import Image
 from sharp_weights import tiny_weights, write_tiny
 
+from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.config import TINY
 from spackle.bases.sharp.precision import pick_dtype
 
@@ -118,3 +119,17 @@ def test_photos_of_odd_shapes_go_all_the_way(tmp_path: Path, weights: Path, size
     result = run("predict", "-i", tmp_path / "odd.png", "-o", tmp_path / "out", *options)
     assert result.code == 0, result.err
     assert names_in(tmp_path / "out" / "odd") == FILES
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_anyone_can_make_weights_to_try_it_with(tmp_path: Path, suffix: str) -> None:
+    for name in ("one", "two"):
+        result = run("weights", "make", tmp_path / f"{name}{suffix}", "--size", "tiny")
+        assert result.code == 0, result.err
+        assert "show no scene" in result.err
+    network = load_network(tmp_path / f"one{suffix}", torch.float32)
+    for name, tensor in load_network(tmp_path / f"two{suffix}", torch.float32).state_dict().items():
+        assert torch.equal(tensor, network.state_dict()[name])
+    result = run("weights", "make", tmp_path / "three.bin", "--size", "tiny")
+    assert result.code == 2
+    assert ".safetensors" in result.err

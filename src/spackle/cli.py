@@ -47,6 +47,13 @@ class PrecisionChoice(str, Enum):
     bf16 = "bf16"
 
 
+class NetworkSize(str, Enum):
+    """Sizes of SHARP's network."""
+
+    full = "full"
+    tiny = "tiny"
+
+
 class Device(str, Enum):
     """Where to render."""
 
@@ -194,6 +201,18 @@ def weights_get(
     from spackle.jobs.weights import get_weights
 
     get_weights(name, output, Reporter(), url=url, force=force)
+
+
+@weights.command("make")
+def weights_make(
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
+    size: Annotated[NetworkSize, typer.Option(help="The published size, or one for tests.")] = NetworkSize.full,
+) -> None:
+    """Make random weights of SHARP's shape, the same each time, to try everything without Apple's."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.weights import make_weights
+
+    make_weights(output, size.value, Reporter())
 
 
 @weights.command("list")

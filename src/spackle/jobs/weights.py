@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.filesize import decimal
 from rich.table import Table
+from safetensors.torch import save_file
 
+from spackle.bases.sharp.checkpoint import expected_shapes
+from spackle.bases.sharp.config import CONFIGS
+from spackle.bases.sharp.recipe import deterministic_weights
 from spackle.downloads import (
     WEIGHTS,
     KnownWeights,
@@ -20,6 +25,7 @@ from spackle.downloads import (
     weights_folder,
 )
 from spackle.errors import InputError
+from spackle.formats import atomic_path
 from spackle.jobs.inputs import results_folder
 from spackle.jobs.progress import Reporter
 
@@ -49,6 +55,31 @@ def get_weights(
     hint = "" if output is None else "; --checkpoint names it to predict"
     reporter.say(f"{_summary(known, record)} -> {path}{hint}")
     return path
+
+
+def make_weights(output: Path, size: str, reporter: Reporter) -> None:
+    """Write weights that anyone can make (see `deterministic_weights`): .pt as Apple's, or .safetensors.
+
+    Args:
+        output: the file.
+        size: "full" or "tiny".
+        reporter: says what has been written.
+
+    Raises:
+        InputError: another suffix, or a file that cannot be written.
+    """
+    if output.suffix not in (".pt", ".safetensors"):
+        raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
+    with atomic_path(output) as temporary:
+        tensors = deterministic_weights(expected_shapes(CONFIGS[size]))
+        if output.suffix == ".pt":
+            torch.save(tensors, temporary)
+        else:
+            save_file(tensors, temporary)
+    count = sum(tensor.numel() for tensor in tensors.values())
+    reporter.say(
+        f"sharp ({size}): {count / 1e6:.2f} M random numbers, the same each time; they show no scene -> {output}"
+    )
 
 
 def list_weights(console: Console) -> None:
