@@ -188,3 +188,35 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path, weights: dict[s
 def test_a_base_says_which_weights_it_has(tmp_path: Path) -> None:
     base = SharpBase.load(write_tiny(tmp_path / "mine.pt"), precision="fp32", device="cpu")
     assert (base.name, base.weights, base.precision) == ("sharp", "mine.pt", "fp32")
+
+
+def odd_tensors() -> dict[str, Tensor]:
+    hiding = torch.zeros(16)
+    hiding.float = "x"  # type: ignore[method-assign,assignment]
+    return {
+        "meta": torch.zeros(16, device="meta"),
+        "sparse": torch.ones(16).to_sparse(),
+        "hiding": hiding,
+    }
+
+
+@pytest.mark.parametrize("kind", odd_tensors())
+def test_tensors_of_odd_kinds_are_refused(tmp_path: Path, weights: dict[str, Tensor], kind: str) -> None:
+    torch.save({**weights, "feature_model.fusion.out_conv.bias": odd_tensors()[kind]}, tmp_path / "w.pt")
+    assert "no plain tensor of floats" in refused(tmp_path / "w.pt")
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_a_file_that_changes_later_changes_nothing(tmp_path: Path, suffix: str) -> None:
+    path = write_tiny(tmp_path / f"weights{suffix}")
+    network = load_network(path, FP32)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    size = path.stat().st_size
+    with open(path, "r+b") as file:
+        file.write(b"\0" * size)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
+
+
+def test_an_unknown_precision_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="none of auto, fp32, bf16"):
+        SharpBase.load(write_tiny(tmp_path / "w.pt"), precision="fp8")  # type: ignore[arg-type]

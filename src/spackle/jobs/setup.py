@@ -155,8 +155,7 @@ def _load_sharp(options: PredictOptions) -> SharpBase:
             "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
             "(2.8 GB, for research only), -c FILE takes a local copy"
         )
-    if options.checkpoint is None:
-        check_recorded(path)
+    check_recorded(path)  # where there is a record
     device = None if options.device == "auto" else options.device
     return SharpBase.load(path, precision=options.precision, low_memory=options.low_memory, device=device)
 

@@ -45,9 +45,8 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
         network.load_state_dict({name: tensors[name].float() for name in network.state_dict()}, assign=True)
         network.eval().requires_grad_(False)
         set_precision(network, dtype)  # reads what is on the disk still
-        if dtype != torch.float32:  # most is copied by now: with the rest, the file can be let go
-            for parameter in network.parameters():
-                parameter.data = parameter.data.clone()
+        for parameter in network.parameters():  # what becomes of the file no longer matters
+            parameter.data = parameter.data.clone()
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read to its end: {_line(error)}") from error
     broken = [name for name, tensor in network.state_dict().items() if not tensor.sum().isfinite()]
@@ -81,9 +80,19 @@ def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     if not isinstance(loaded, Mapping) or not loaded:
         raise InputError(f"{path}: holds no named tensors: give SHARP's checkpoint")
     for name, value in loaded.items():
-        if not (isinstance(name, str) and isinstance(value, Tensor) and value.is_floating_point()):
-            raise InputError(f"{path}: {name!s:.120} is no tensor of floats: give SHARP's weights alone")
+        if not (isinstance(name, str) and _is_plain(value)):
+            shown = ascii(name)[:120] if isinstance(name, str) else type(name).__name__
+            raise InputError(f"{path}: {shown} is no plain tensor of floats: give SHARP's weights alone")
     return dict(loaded)
+
+
+def _is_plain(value: object) -> bool:
+    """A dense tensor of floats with nothing attached: a file can give a tensor attributes that hide its methods."""
+    if type(value) not in (Tensor, torch.nn.Parameter) or vars(value):
+        return False
+    assert isinstance(value, Tensor)
+    dense = not value.is_nested and value.layout == torch.strided and value.device.type == "cpu"
+    return dense and value.is_floating_point()
 
 
 def expected_shapes(config: SharpConfig) -> Shapes:

@@ -39,6 +39,8 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """The type that --precision means on a device: `auto` is bfloat16 where the hardware multiplies it natively."""
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
     if precision == "auto":
         return torch.bfloat16 if multiplies_bf16(device) else torch.float32
     return torch.float32 if precision == "fp32" else torch.bfloat16
