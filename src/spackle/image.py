@@ -17,7 +17,7 @@ from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 
 T = TypeVar("T")
 
@@ -175,8 +175,9 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
     except UnidentifiedImageError:
         raise InputError(f"{path}: not an image in any format that is known here: give a JPEG, PNG or HEIC") from None
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path}: cannot be decoded ({reason}): the file is damaged or cut off") from error
+        raise InputError(
+            f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged or cut off"
+        ) from error
 
 
 def check_file(path: str | os.PathLike[str], kind: str) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.image import MAX_PIXELS, check_file, read_image
 
 Array = NDArray[Any]
@@ -228,7 +228,7 @@ def _read(path: StrPath) -> tuple[Array, bool]:
     except InputError:
         raise
     except Exception as error:  # NumPy and zip at work on a stranger's bytes raise anything
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = reason_in_a_line(error)
         raise InputError(f"{path}: cannot be decoded ({reason}): the file is damaged or cut off") from error
     raise InputError(f"{path}: not a depth map: give .npy, .npz or .pfm in metres, or a 16-bit .png in millimetres")
 

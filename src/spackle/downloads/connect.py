@@ -11,7 +11,7 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 
 TIMEOUT = 30.0  # seconds without a byte
 
@@ -90,5 +90,4 @@ def reason_of(error: Exception) -> str:
         return f"the server's certificate is not trusted ({cause.verify_message}): check the clock and SSL_CERT_FILE"
     if isinstance(cause, TimeoutError):
         return f"no answer within {TIMEOUT:g} seconds: check the connection and try again"
-    reason = " ".join(str(cause).split())[:200] or type(cause).__name__
-    return f"no connection ({reason}): check the network and try again"
+    return f"no connection ({reason_in_a_line(cause)}): check the network and try again"

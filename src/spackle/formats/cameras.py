@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.formats.atomic import atomic_path
 from spackle.image import check_file
 
@@ -41,7 +41,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         with open(path, encoding="utf-8") as file:
             content = json.load(file)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON: {' '.join(str(error).split())[:200]}") from error
+        raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f'{path}: needs a list "frames" with at least one camera')

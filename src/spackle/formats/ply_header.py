@@ -9,7 +9,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_EXTRA_ROWS = 64  # SHARP's elements after the vertices hold at most 16 numbers
@@ -90,7 +90,7 @@ def read_header(file: IO[bytes], path: str | os.PathLike[str]) -> Header:
     try:
         order, elements = _parse(lines[1:-1])
     except (ValueError, KeyError, IndexError) as error:
-        raise InputError(f"{path}: broken PLY header: {' '.join(str(error).split())[:200]}") from error
+        raise InputError(f"{path}: broken PLY header: {reason_in_a_line(error)}") from error
     comments = {words[1]: words[2:] for words in lines if words[:1] == ["comment"] and len(words) > 1}
     return Header(order == "=", elements, start, path, comments)
 

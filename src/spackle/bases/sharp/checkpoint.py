@@ -17,7 +17,7 @@ from spackle.bases.sharp.config import CONFIGS, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.unused import Shapes, unused_shapes
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 
 NAMED = 3  # how many of the names that differ are spelled out
@@ -45,10 +45,11 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
         network.load_state_dict({name: tensors[name].float() for name in network.state_dict()}, assign=True)
         network.eval().requires_grad_(False)
         set_precision(network, dtype)  # reads what is on the disk still
-        for parameter in network.parameters():  # what becomes of the file no longer matters
-            parameter.data = parameter.data.clone()
+        for name, parameter in network.named_parameters():
+            if parameter.data_ptr() == tensors[name].data_ptr():  # not copied yet: the file may change later
+                parameter.data = parameter.data.clone()
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be read to its end: {_line(error)}") from error
+        raise InputError(f"{path}: cannot be read to its end: {reason_in_a_line(error)}") from error
     broken = [name for name, tensor in network.state_dict().items() if not tensor.sum().isfinite()]
     if broken:
         raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): download it again")
@@ -76,7 +77,9 @@ def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
             "give Apple's checkpoint as it was downloaded, or a .safetensors file"
         ) from error
     except Exception as error:  # a stranger's bytes can raise anything
-        raise InputError(f"{path}: not a checkpoint, or cut off ({_line(error)}): download it again") from error
+        raise InputError(
+            f"{path}: not a checkpoint, or cut off ({reason_in_a_line(error)}): download it again"
+        ) from error
     if not isinstance(loaded, Mapping) or not loaded:
         raise InputError(f"{path}: holds no named tensors: give SHARP's checkpoint")
     for name, value in loaded.items():
@@ -126,7 +129,3 @@ def _config_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
 def _some(names: list[str]) -> str:
     more = len(names) - NAMED
     return ", ".join(name[:120] for name in names[:NAMED]) + (f", and {more} more" if more > 0 else "")
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
