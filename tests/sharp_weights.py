@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.checkpoint import expected_shapes
-from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.config import LAYERS, STRIDE, TINY, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.recipe import deterministic_weights
 
@@ -40,6 +40,11 @@ def micro_network() -> SharpNetwork:
     weights = deterministic_weights(expected_shapes(MICRO))
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
     return network
+
+
+def gaussians_of(config: SharpConfig) -> int:
+    """How many come out."""
+    return LAYERS * (config.side // STRIDE) ** 2
 
 
 def waves(side: int = 1536) -> Tensor:

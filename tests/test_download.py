@@ -10,6 +10,7 @@ import io
 import json
 import os
 import random
+import re
 import signal
 import socket
 import ssl
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from email.message import Message
 from pathlib import Path
@@ -110,6 +112,7 @@ def test_a_download_is_the_file_and_its_record(site: Site, target: Path) -> None
     assert steps == sorted(set(steps))
     assert (steps[0], steps[-1]) == ((0, len(CONTENT)), (len(CONTENT), len(CONTENT)))
     assert ranges(site) == [None]
+    assert site.requests[0]["Accept-Encoding"] == "identity"
 
 
 def test_an_older_file_stays_until_the_new_one_is_whole(site: Site, target: Path) -> None:
@@ -192,12 +195,27 @@ def test_a_file_that_changed_starts_over(site: Site, begun: Path, size: int, if_
         lambda part, version: version.write_text("{"),
         lambda part, version: version.write_text("[]"),
         lambda part, version: version.write_text('{"size": "large"}'),
+        lambda part, version: version.write_text("[" * 100_000),
+        lambda part, version: version.write_text(version.read_text().replace(str(len(CONTENT)), "1e400")),
+        lambda part, version: version.write_text(re.sub('"etag": .*', '"etag": 5,', version.read_text())),
         lambda part, version: version.write_text(version.read_text().replace("127.0.0.1", "127.0.0.2")),
         lambda part, version: part.unlink(),
         lambda part, version: part.write_bytes(b""),
         lambda part, version: part.write_bytes(b"x" * (len(CONTENT) + 1)),
     ],
-    ids=["no version", "cut off", "no fields", "few fields", "other address", "no part", "empty", "too long"],
+    ids=[
+        "no version",
+        "cut off",
+        "no fields",
+        "few fields",
+        "too deep",
+        "endless",
+        "no tag",
+        "other address",
+        "no part",
+        "empty",
+        "too long",
+    ],
 )
 def test_what_cannot_be_gone_on_with_is_dropped(site: Site, begun: Path, spoil: Callable[[Path, Path], object]) -> None:
     spoil(begun.with_name("weights.pt.part"), begun.with_name("weights.pt.part.json"))
@@ -276,6 +294,9 @@ def test_a_second_download_at_the_same_time_is_refused(site: Site, target: Path)
         (500, {}, ("HTTP 500", "later")),
         (206, {}, ("something else",)),
         (200, {"Content-Type": "text/html"}, ("something else",)),
+        (200, {"Content-Encoding": "gzip"}, ("packs", "gzip", "another address")),
+        (200, {"Content-Encoding": "identity, br"}, ("packs", "br")),
+        (200, {"Content-Type": "text/html", "Content-Encoding": "gzip"}, ("something else",)),
         (200, {"Content-Length": None}, ("length",)),
         (200, {"Content-Length": "many"}, ("length",)),
         (200, {"Content-Length": "0"}, ("empty",)),
@@ -290,6 +311,14 @@ def test_answers_that_are_no_file(
     site.status, site.headers = status, headers
     refused(site.url, target, site.url, *words)
     assert names_in(target) == set()
+
+
+def test_a_rest_that_is_packed_is_refused(site: Site, begun: Path) -> None:
+    site.headers = {"Content-Encoding": "gzip"}
+    refused(site.url, begun, "packs")
+    site.headers = {"Content-Encoding": "Identity"}
+    is_whole(begun, site, download(site.url, begun))
+    assert ranges(site) == [f"bytes={BREAK}-"] * 2
 
 
 def test_a_file_that_never_gets_to_its_length(site: Site, target: Path) -> None:
@@ -351,11 +380,57 @@ def test_https_is_not_given_up_on_the_way() -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["", "weights.pt", "file:///etc/hostname", "ftp://a.org/w.pt", "data:,x", "http://", "https://[/", "http://a:b/"],
+    [
+        "",
+        "weights.pt",
+        "file:///etc/hostname",
+        "ftp://a.org/w.pt",
+        "data:,x",
+        "http://",
+        "https://[/",
+        "http://a:b/",
+        "http://a:0/",
+    ],
 )
 def test_addresses_that_are_none(target: Path, url: str) -> None:
     refused(url, target, repr(url))
     refused(f"{url}\n", target)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://me:secret@127.0.0.1:1/w.pt",
+        "https://secret@127.0.0.1:1/w.pt",
+        "ftp://me:secret@127.0.0.1:1/w.pt",
+        "http://me:secret@/w.pt",
+        "http://me:secret@[/w.pt",
+        "http://me:secret@127.0.0.1:port/w.pt",
+        "http://me:secret/more@127.0.0.1:1/w.pt",
+        "me:secret@127.0.0.1:1/w.pt",
+    ],
+)
+def test_a_password_in_an_address_is_refused_and_not_shown(target: Path, url: str) -> None:
+    with pytest.raises(InputError, match="password") as caught:
+        download(url, target)
+    assert "secret" not in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+    assert names_in(target) == set()
+
+
+@pytest.mark.parametrize("scheme", ["http", "ftp"])
+@pytest.mark.parametrize("place", ["127.0.0.1:1", "127.0.0.1:port"])
+def test_nor_is_one_that_a_server_sends_on_to(site: Site, target: Path, scheme: str, place: str) -> None:
+    site.status, site.headers = 302, {"Location": f"{scheme}://me:secret@{place}/w.pt"}
+    with pytest.raises(InputError, match="password") as caught:
+        download(site.url, target)
+    assert str(caught.value).startswith(f"{site.url}: the server sends on to ")
+    assert "secret" not in str(caught.value)
+
+
+def test_an_at_sign_in_a_path_is_no_password(site: Site, target: Path) -> None:
+    url = site.url.replace("weights.pt", "sharp@1.0/weights.pt")
+    assert download(url, target).url == url
 
 
 def test_places_that_cannot_be_written(site: Site, tmp_path: Path) -> None:
@@ -378,6 +453,7 @@ def test_a_full_disk(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) 
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(total=10, free=1))
         refused(site.url, target, str(target.parent), "make room")
+        assert names_in(target) == set()
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -386,6 +462,18 @@ def test_a_full_disk(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) 
         patch.setattr(os, "fsync", full)
         refused(site.url, target, "No space left on device: make room or choose")
     is_whole(target, site, download(site.url, target))
+
+
+def test_what_makes_way_counts_as_room(site: Site, begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.content = random.Random(6).randbytes(len(CONTENT))
+    part, needed = begun.with_name("weights.pt.part"), len(CONTENT) - BREAK
+    came = part.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(total=needed, free=needed - 1))
+        refused(site.url, begun, "make room")
+    assert part.read_bytes() == came
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(total=needed, free=needed))
+    is_whole(begun, site, download(site.url, begun))
 
 
 # Records
@@ -418,7 +506,20 @@ def test_files_of_your_own_have_no_record(target: Path) -> None:
         assert check_recorded(target) is None
 
 
-@pytest.mark.parametrize("text", ["", "{", "\0", '{"sha256": "00"}', '{"sha256": "00", "url": "", "size": "large"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "\0",
+        '{"sha256": "00"}',
+        '{"sha256": "00", "url": "", "size": "large"}',
+        '{"sha256": "00", "url": "", "size": 1e400}',
+        '{"sha256": "00", "url": "", "size": NaN}',
+        "[" * 100_000,
+    ],
+    ids=["empty", "cut off", "no text", "few fields", "no size", "endless", "no number", "too deep"],
+)
 def test_a_record_that_makes_no_sense_is_not_passed_over(target: Path, text: str) -> None:
     target.write_bytes(b"mine")
     target.with_name("weights.pt.json").write_text(text)
@@ -519,7 +620,7 @@ def test_get_leaves_a_file_of_your_own(weights: Path) -> None:
 
 
 def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -> None:
-    for output, path in (("a/b", f"a/b/{FILE}"), ("a/c.pt", "a/c.pt")):
+    for output, path in (("a/b", f"a/b/{FILE}"), ("a/c.pt", "a/c.pt"), ("a/d.PT", "a/d.PT")):
         result = run("get", "sharp", "--url", site.url, "-o", tmp_path / output)
         assert result.code == 0, result.err
         assert check_recorded(tmp_path / path)
@@ -531,9 +632,24 @@ def test_get_in_one_line_where_it_fails(site: Site, weights: Path) -> None:
     refuses(run("get", "nothing"), "nothing", "sharp")
     refuses(run("get", "sharp", "--url", closed()), closed(), "check the network")
     refuses(run("get", "sharp", "--url", "file:///etc/hostname"), "file:///etc/hostname")
+    refuses(run("get", "sharp", "--url", "http://me:secret@127.0.0.1:1/"), "address at 127.0.0.1 with", "password")
     site.status = 404
     refuses(run("get", "sharp", "--url", site.url), site.url, "404")
     assert not weights.exists()
+
+
+def test_get_takes_no_address_for_none(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(WEIGHTS, "sharp", dataclasses.replace(WEIGHTS["sharp"], url=closed()))
+    refuses(run("get", "sharp", "--url", ""), "'': not an address")
+
+
+@pytest.mark.parametrize(("small", "capital"), [("a.pt", "b.PT"), ("a.safetensors", "b.SAFETENSORS")])
+def test_make_takes_suffixes_in_capitals(tmp_path: Path, small: str, capital: str) -> None:
+    for name in (small, capital):
+        result = run("make", tmp_path / name, "--size", "tiny")
+        assert result.code == 0, result.err
+    assert (tmp_path / small).stat().st_size == (tmp_path / capital).stat().st_size
+    assert zipfile.is_zipfile(tmp_path / capital) == small.endswith(".pt")  # a .pt file is a zip archive
 
 
 def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

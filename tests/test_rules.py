@@ -167,7 +167,7 @@ def test_a_completed_view_behind_the_photos_shield_shows_the_photo_as_the_base_d
 TWINS = {
     "_numba.py": "the decorators",
     "bases/missing.py": "test_rgbd.py",
-    "bases/sharp/unproject.py": "test_sharp_unproject.py",
+    "bases/sharp/jacobi.py": "test_sharp_unproject.py",
     "fill.py": "test_fill.py",
     "render": "test_render.py",
     "residual/carve.py": "test_residual.py",

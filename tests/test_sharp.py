@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +12,17 @@ import torch
 from photos import picture
 from PIL import Image
 from scenes import psnr
-from sharp_weights import DATA, MICRO, micro_network, tiny_weights, waves
+from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights, waves, write_tiny
 from torch import Tensor, nn
 
 import spackle
 from spackle.bases.sharp import SharpBase, precision
-from spackle.bases.sharp.base import to_square
+from spackle.bases.sharp.base import to_metric, to_square
 from spackle.bases.sharp.checkpoint import expected_shapes
 from spackle.bases.sharp.config import FULL, TINY
 from spackle.bases.sharp.decoder import GroupNorm
-from spackle.bases.sharp.network import SharpNetwork, SharpOutput
+from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
+from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import multiplies_bf16, pick_dtype, set_precision
 from spackle.bases.sharp.pyramid import FULL_WINDOWS, HALF_WINDOWS, WINDOWS, cut, merge
 from spackle.bases.sharp.start import compose, make_start
@@ -35,14 +37,17 @@ STRETCH = (1600 / (2 * 1200), 1200 / (2 * 1200), 1.0)  # of the golden numbers' 
 
 
 @functools.cache
-def run_tiny(dtype: torch.dtype) -> tuple[SharpOutput, spackle.Gaussians]:
+def run_tiny(dtype: torch.dtype) -> tuple[Tensor, spackle.Gaussians]:
+    """What the depth head says, [2, side, side], and the Gaussians in normalised space."""
     network = SharpNetwork(TINY).eval()
     weights = tiny_weights()
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
     set_precision(network, dtype)
+    heard: list[Tensor] = []
+    network.monodepth_model.monodepth_predictor.head.register_forward_hook(lambda head, x, out: heard.append(out[0]))
     with torch.inference_mode():
         output = network(waves(), 0.8, batch=5)
-        return output, compose(output.start, output.deltas)
+        return heard[0], compose(output.start, output.deltas)
 
 
 def off(found: Tensor, golden: np.ndarray) -> float:
@@ -55,12 +60,12 @@ def test_the_published_checkpoint_has_exactly_these_tensors() -> None:
     published = {name: tuple(int(n) for n in shape.split(",")) for name, shape in map(str.split, lines)}
     assert expected_shapes(FULL) == published
     assert (len(published), sum(int(np.prod(shape)) for shape in published.values())) == (1038, 702_305_169)
-    assert FULL.gaussians == 1_179_648
+    assert gaussians_of(FULL) == 1_179_648
 
 
 def test_the_tiny_network_says_what_the_original_says_about_depth() -> None:
-    output, _ = run_tiny(torch.float32)
-    assert off(output.disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
+    disparity, _ = run_tiny(torch.float32)
+    assert off(disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
 
 
 @pytest.mark.parametrize("attribute", COLUMNS)
@@ -96,7 +101,7 @@ def test_the_number_of_windows_at_once_changes_nothing(batch: int) -> None:
     with torch.inference_mode():
         expected = network(waves(MICRO.side), 0.8, batch=5)
         found = network(waves(MICRO.side), 0.8, batch, lambda done, total: seen.append((done, total)))
-    torch.testing.assert_close(found.disparity, expected.disparity, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
     assert seen[-1] == (WINDOWS, WINDOWS)
     assert len(seen) == -(-WINDOWS // batch)
@@ -176,7 +181,7 @@ def test_odd_photos_become_gaussians_in_front_of_their_camera(tmp_path: Path, na
     prediction = SharpBase(micro_network()).predict(photo, lambda done, total: seen.append((done, total)))
     camera, gaussians = prediction.camera, prediction.gaussians
     assert (camera.width, camera.height) == ((1536, 2) if name == "long.png" else image.size)
-    assert len(gaussians) == MICRO.gaussians
+    assert len(gaussians) == gaussians_of(MICRO)
     assert seen[-1] == (35, 35)
     uv, z = camera.project(gaussians.means)
     assert all(bool(torch.isfinite(t).all()) for t in gaussians.tensors)
@@ -231,10 +236,159 @@ def test_auto_is_bf16_on_ampere_and_later(
     assert precision.multiplies_bf16(torch.device("cuda")) is native
 
 
+def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", "banana", "ban\x1b[31mana\n", "meta", "mps", ""])
+def test_a_device_that_is_not_there_is_one_line_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    no_cuda(monkeypatch)
+    monkeypatch.setattr("spackle.bases.sharp.base.load_network", lambda *args: pytest.fail("read"))
+    with pytest.raises(spackle.InputError, match="give cpu") as caught:
+        SharpBase.load(tmp_path / "any.pt", device=device)
+    assert str(caught.value).isprintable()
+
+
+def test_a_device_that_is_there_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    no_cuda(monkeypatch)
+    assert pick_device(None) == pick_device("cpu") == pick_device(CPU) == CPU
+    two_gpus(monkeypatch)
+    assert (pick_device(None), pick_device("cpu")) == (torch.device("cuda"), CPU)
+    assert pick_device("cuda:1") == torch.device("cuda:1")
+    with pytest.raises(spackle.InputError, match="the last CUDA device is cuda:1"):
+        pick_device("cuda:2")
+
+
+SHORTAGES = {
+    "processor": RuntimeError(
+        "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes."
+    ),
+    "Windows": RuntimeError("[enforce fail] not enough memory: you tried to allocate 9 bytes."),
+    "GPU": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."),
+    "cuBLAS": RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+    "mapping": RuntimeError("unable to mmap 9 bytes from file <w.pt>: Cannot allocate memory (12)"),
+    "Python": MemoryError(),
+}
+
+
+@pytest.mark.parametrize("kind", SHORTAGES)
+def test_too_little_memory_is_one_line(kind: str) -> None:
+    with pytest.raises(spackle.InputError, match=r"^not enough memory .*: try this, or close other programs$"):  # noqa: SIM117
+        with enough_memory("try this"):
+            raise SHORTAGES[kind]
+
+
+def test_other_errors_are_not_taken_for_too_little_memory() -> None:
+    with pytest.raises(RuntimeError, match="shapes"), enough_memory():
+        raise RuntimeError("shapes do not fit")
+
+
+def too_much(*arguments: object, **options: object) -> Tensor:
+    """What the allocator really says when a computer has no such memory."""
+    return torch.empty(2**60, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("low_memory", [False, True])
+def test_too_little_memory_to_predict_is_one_line(monkeypatch: pytest.MonkeyPatch, low_memory: bool) -> None:
+    base = SharpBase(micro_network(), low_memory=low_memory)
+    monkeypatch.setattr(base.network, "forward", too_much)
+    with pytest.raises(spackle.InputError, match="not enough memory for SHARP") as caught:
+        base.predict(Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg")))
+    assert ("--low-memory" in str(caught.value)) is not low_memory
+
+
+def too_much_for_a_device(network: SharpNetwork, *device: object, **layout: object) -> object:
+    """`to` that fails for a device, and leaves the rest as it is."""
+    return too_much() if device else network
+
+
+@pytest.mark.parametrize(
+    ("kind", "method", "failing"),
+    [(Tensor, "clone", too_much), (Tensor, "float", too_much), (SharpNetwork, "to", too_much_for_a_device)],
+)
+def test_too_little_memory_to_load_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, method: str, failing: Callable[..., object]
+) -> None:
+    path = write_tiny(tmp_path / "w.pt")
+    monkeypatch.setattr(kind, method, failing)
+    with pytest.raises(spackle.InputError, match="not enough memory for SHARP: try --precision bf16, or close"):
+        SharpBase.load(path, precision="fp32", device="cpu")
+
+
+def test_too_little_memory_to_map_the_file_is_no_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "load", too_much)
+    with pytest.raises(spackle.InputError, match="not enough memory for SHARP"):
+        SharpBase.load(write_tiny(tmp_path / "w.pt"), device="cpu")
+
+
+def test_the_callers_autocast_stays_outside() -> None:
+    base, photo = SharpBase(micro_network()), Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg"))
+    expected = base.look(photo)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = base.look(photo)
+        metric = to_metric(found, photo)
+        assert torch.is_autocast_enabled("cpu")
+    assert torch.equal(found.deltas, expected.deltas)
+    assert torch.equal(found.start.disparity_map, expected.start.disparity_map)
+    assert all(map(torch.equal, metric.tensors, to_metric(expected, photo).tensors))
+
+
+def tf32_switches() -> list[str]:
+    return [torch.backends.cuda.matmul.fp32_precision, torch.backends.cudnn.conv.fp32_precision]
+
+
+@pytest.fixture
+def _own_tf32_switches() -> Iterator[None]:
+    matmul, conv = tf32_switches()
+    yield
+    torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = True
+    torch.backends.fp32_precision = "none"
+    torch.backends.cuda.matmul.fp32_precision, torch.backends.cudnn.conv.fp32_precision = matmul, conv
+
+
+def allow_by_the_older_switch() -> None:
+    torch.backends.cuda.matmul.allow_tf32 = True
+
+
+def allow_by_the_newer_switch() -> None:
+    torch.backends.cuda.matmul.fp32_precision = "tf32"
+
+
+def allow_everywhere() -> None:
+    torch.backends.fp32_precision = "tf32"
+
+
+@pytest.mark.usefixtures("_own_tf32_switches")
+@pytest.mark.parametrize("allow", [allow_by_the_older_switch, allow_by_the_newer_switch, allow_everywhere])
+def test_tf32_is_off_on_a_gpu_and_then_as_the_caller_had_it(allow: Callable[[], None]) -> None:
+    """The switches exist without a GPU too."""
+    allow()
+    before = tf32_switches()
+    assert "tf32" in before
+    with own_arithmetic(CPU):
+        assert tf32_switches() == before
+    with own_arithmetic(torch.device("cuda")):
+        assert tf32_switches() == ["ieee", "ieee"]
+    assert tf32_switches() == before
+    with pytest.raises(RuntimeError), own_arithmetic(torch.device("cuda")):
+        torch.zeros(2) + torch.zeros(3)
+    assert tf32_switches() == before
+    if allow is allow_by_the_older_switch:
+        assert torch.backends.cuda.matmul.allow_tf32  # it refuses to be read where the two disagree
+
+
 def test_the_three_lines_work_with_sharp_too() -> None:
     photo = Photo(torch.from_numpy(picture()).float() / 255, 60.0, "EXIF", Path("a.jpg"))
     scene = spackle.predict(photo, base=SharpBase(micro_network()))
-    assert len(scene.base) == MICRO.gaussians
+    assert len(scene.base) == gaussians_of(MICRO)
     for arguments in ({}, {"depth": "d.npy", "base": SharpBase(micro_network())}):
         with pytest.raises(ValueError, match="either the photo's depth, or a base"):
             spackle.predict(photo, **arguments)  # type: ignore[arg-type]

@@ -16,8 +16,10 @@ from sharp_weights import tiny_weights, write_tiny
 from torch import Tensor
 
 import spackle
-from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp import SharpBase, checkpoint
 from spackle.bases.sharp.checkpoint import load_network
+from spackle.bases.sharp.config import TINY, SharpConfig
+from spackle.bases.sharp.network import SharpNetwork
 
 FP32 = torch.float32
 
@@ -113,6 +115,61 @@ def test_a_zip_whose_tensor_is_cut_is_refused(tmp_path: Path) -> None:
     refused(tmp_path / "cut.pt")
 
 
+def repacked(source: Path, target: Path, method: int = zipfile.ZIP_STORED, byteorder: bytes = b"little") -> Path:
+    """What a checkpoint becomes when another program packs it."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", method) as new:
+        for entry in old.infolist():
+            new.writestr(entry.filename, byteorder if entry.filename.endswith("/byteorder") else old.read(entry))
+    return target
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_that_was_compressed_is_refused(tmp_path: Path, method: int) -> None:
+    path = write_tiny(tmp_path / "w.pt")
+    assert "zipped again by another program" in refused(repacked(path, tmp_path / "packed.pt", method))
+
+
+def test_a_zip_that_was_packed_again_without_compression_is_read(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    network = load_network(repacked(write_tiny(tmp_path / "w.pt"), tmp_path / "packed.pt"), FP32)
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
+
+
+@pytest.mark.parametrize(("order", "said"), [(b"big", "big-endian"), (b"", "endian"), (b"middle", "endian")])
+def test_numbers_in_another_byte_order_are_refused(tmp_path: Path, order: bytes, said: str) -> None:
+    path = repacked(write_tiny(tmp_path / "w.pt"), tmp_path / "turned.pt", byteorder=order)
+    assert said in refused(path)
+
+
+def test_a_zip_with_one_changed_byte_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    path = write_tiny(tmp_path / "w.pt")
+    content = bytearray(path.read_bytes())
+    number = content.index(weights["feature_model.fusion.out_conv.weight"].numpy().tobytes())
+    content[number + 40] ^= 1  # a last digit
+    path.write_bytes(content)
+    assert "damaged at " in refused(path)
+
+
+def test_a_zip_that_was_written_without_sums_is_read(tmp_path: Path) -> None:
+    torch.serialization.set_crc32_options(False)
+    try:
+        path = write_tiny(tmp_path / "w.pt")
+    finally:
+        torch.serialization.set_crc32_options(True)
+    load_network(path, FP32)
+
+
+def test_a_checkpoint_from_before_zips_is_refused_with_the_way_out(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    torch.save(weights, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    assert "save it again with a current torch.save" in refused(tmp_path / "old.pt")
+
+
+@pytest.mark.parametrize("name", ["w.SAFETENSORS", "w.pt", "w"])
+def test_a_files_kind_is_told_from_its_content(tmp_path: Path, name: str) -> None:
+    for suffix in (".pt", ".safetensors"):
+        write_tiny(tmp_path / f"w{suffix}").rename(tmp_path / name)
+        load_network(tmp_path / name, FP32)
+
+
 def files_of_other_kinds() -> dict[str, bytes]:
     zipped = io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as archive:
@@ -126,6 +183,7 @@ def files_of_other_kinds() -> dict[str, bytes]:
     return {
         "empty.pt": b"",
         "text.pt": b"<html>not found</html>",
+        "answer.json": b'{"data":{"error": "gone"}}',
         "noise.pt": bytes(range(256)) * 40,
         "zip.pt": zipped.getvalue(),
         "list.pt": numbers.getvalue(),
@@ -139,7 +197,9 @@ def files_of_other_kinds() -> dict[str, bytes]:
 @pytest.mark.parametrize("name", files_of_other_kinds())
 def test_files_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(files_of_other_kinds()[name])
-    refused(tmp_path / name)
+    line = refused(tmp_path / name)
+    known = name in ("empty.pt", "zip.pt", "list.pt", "nested.pt", "numbered.pt")
+    assert ("neither a PyTorch checkpoint nor a safetensors file" in line) is not known
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
@@ -172,6 +232,28 @@ def test_what_inference_never_uses_is_checked_all_the_same(tmp_path: Path, weigh
     assert name in refused(tmp_path / "w.safetensors")
 
 
+def odd_names() -> dict[str, object]:
+    nested: tuple[object, ...] = ()
+    for _ in range(200):
+        nested = (nested,)
+    return {
+        "escapes": "\x1b[31mred\x1b[0m\r\n\u202e",
+        "long": "\x07" * 100_000,
+        "nested": nested,
+        "number": 10**5000,
+        "pair": ("a\n", "b\x1b"),
+    }
+
+
+@pytest.mark.parametrize("value", [torch.zeros(1), torch.zeros(1, dtype=torch.int32)], ids=["float", "int"])
+@pytest.mark.parametrize("kind", odd_names())
+def test_odd_names_do_not_reach_the_terminal(
+    tmp_path: Path, weights: dict[str, Tensor], kind: str, value: Tensor
+) -> None:
+    torch.save({**weights, odd_names()[kind]: value}, tmp_path / "w.pt")
+    assert refused(tmp_path / "w.pt").isprintable()
+
+
 @pytest.mark.parametrize("dtype", [torch.int32, torch.complex64, torch.bool])
 def test_tensors_that_are_no_floats_are_refused(tmp_path: Path, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
     torch.save({**weights, "feature_model.fusion.out_conv.bias": torch.zeros(16, dtype=dtype)}, tmp_path / "w.pt")
@@ -183,6 +265,24 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path, weights: dict[s
     spoiled[3] = torch.nan
     save_file({**weights, "feature_model.fusion.out_conv.bias": spoiled}, tmp_path / "w.safetensors")
     assert "not finite" in refused(tmp_path / "w.safetensors")
+
+
+def test_large_numbers_whose_sum_overflows_are_finite_all_the_same(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    name = "feature_model.fusion.out_conv.bias"
+    save_file({**weights, name: torch.full((16,), 3e38)}, tmp_path / "w.safetensors")
+    assert float(load_network(tmp_path / "w.safetensors", FP32).state_dict()[name].max()) == pytest.approx(3e38)
+
+
+def test_the_network_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, built = write_tiny(tmp_path / "w.pt"), []
+
+    def build(config: SharpConfig) -> SharpNetwork:
+        built.append(config)
+        return SharpNetwork(config)
+
+    monkeypatch.setattr(checkpoint, "SharpNetwork", build)
+    load_network(path, FP32)
+    assert built == [TINY]
 
 
 def test_a_base_says_which_weights_it_has(tmp_path: Path) -> None:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from command import FILES, names_in, report_of, run
 from photos import picture, read_ply, write_photo
 from PIL import Image
-from sharp_weights import tiny_weights, write_tiny
+from sharp_weights import gaussians_of, tiny_weights, write_tiny
 
+from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.config import TINY
 from spackle.bases.sharp.precision import pick_dtype
+from spackle.image import Photo
+from spackle.jobs import predict
 
 QUICK = ("--no-render", "--residual", "none")
 
@@ -36,11 +40,11 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(tmp_path: Path, weig
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
     precision = "bf16" if native else "fp32"
-    expected = {"name": "sharp", "gaussians": TINY.gaussians, "precision": precision, "weights": "tiny.pt"}
+    expected = {"name": "sharp", "gaussians": gaussians_of(TINY), "precision": precision, "weights": "tiny.pt"}
     assert report["base"] == expected
     assert report["photo"] == {"file": "photo.jpg", "width": 64, "height": 48}
     assert report["focal_source"] == "default 30 mm"
-    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == TINY.gaussians
+    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == gaussians_of(TINY)
     for row in report["hole_area_ratio"]:
         assert row["after"] < 0.01 < row["before"]
 
@@ -110,6 +114,73 @@ def test_a_folder_goes_on_and_other_weights_do_it_again(tmp_path: Path) -> None:
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
     assert "done already" not in run(*arguments).err
+
+
+def test_less_memory_gives_the_same_result_and_so_is_not_done_again(tmp_path: Path, weights: Path) -> None:
+    write_photo(tmp_path / "photos" / "a.png")
+    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
+    assert run(*arguments).code == 0
+    assert "done already" in run(*arguments, "--low-memory").err
+
+
+def test_weights_that_change_before_they_are_read_stop_the_whole_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.png", "b.png"):
+        write_photo(tmp_path / "photos" / name)
+    weights = write_tiny(tmp_path / "w.pt")
+    load_photo = predict.load_photo
+
+    def replace_weights(*args: Any, **options: Any) -> Photo:
+        changed = tiny_weights()
+        changed["prediction_head.texture_prediction_head.bias"] += 0.1
+        torch.save(changed, weights)
+        return load_photo(*args, **options)
+
+    monkeypatch.setattr("spackle.jobs.predict.load_photo", replace_weights)
+    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
+    result = run(*arguments)
+    assert result.code == 2
+    assert "changed while this was running" in result.err
+    assert result.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_that_go_while_a_folder_is_worked_on_are_not_missed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.png", "b.png"):
+        write_photo(tmp_path / "photos" / name)
+    weights = write_tiny(tmp_path / "w.pt")
+    write_report = predict.write_report
+
+    def remove_weights(*args: Any) -> None:
+        weights.unlink(missing_ok=True)
+        write_report(*args)
+
+    monkeypatch.setattr("spackle.jobs.predict.write_report", remove_weights)
+    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
+    assert run(*arguments).code == 0
+    assert names_in(tmp_path / "out") == {"a", "b"}
+
+
+@pytest.mark.parametrize("problem", ["photo", "focal", "output", "done"])
+def test_the_network_is_not_loaded_for_a_photo_that_does_not_need_it(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, problem: str
+) -> None:
+    photo = write_photo(tmp_path / "photos" / "a.png")
+    base = ("--base", "sharp", "-c", weights, *QUICK)
+    if problem == "done":
+        assert run("predict", "-i", photo.parent, "-o", tmp_path / "out", *base).code == 0
+    monkeypatch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
+    (tmp_path / "file").touch()
+    wrong = {
+        "photo": ("-i", tmp_path / "missing.png", "-o", tmp_path / "out"),
+        "focal": ("-i", photo, "-o", tmp_path / "out", "--focal-px", 1e9),
+        "output": ("-i", photo, "-o", tmp_path / "file"),
+        "done": ("-i", photo.parent, "-o", tmp_path / "out"),
+    }
+    assert run("predict", *wrong[problem], *base).code == (0 if problem == "done" else 2)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3000, 3), (10, 2000)])

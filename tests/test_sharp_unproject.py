@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from spackle.bases.sharp.unproject import BLOCK, GRAIN, plain_stretch, stretch_gaussians
+from spackle.bases.sharp.jacobi import BLOCK
+from spackle.bases.sharp.unproject import GRAIN, plain_stretch, stretch_gaussians
 from spackle.gaussians import Gaussians
 
 PROPERTY = settings(deadline=None, max_examples=40)

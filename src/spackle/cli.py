@@ -6,11 +6,14 @@ import os
 import sys
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
+from typer.exceptions import TyperException
 
 from spackle.errors import InputError
+
+INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 
 app = typer.Typer(
     name="spackle",
@@ -115,9 +118,9 @@ def predict(
     verbose: VerboseOption = False,
 ) -> None:
     """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each."""
+    from spackle.jobs.options import PredictOptions
     from spackle.jobs.predict import predict_all
     from spackle.jobs.progress import Reporter
-    from spackle.jobs.setup import PredictOptions
 
     options = PredictOptions(
         base=base,
@@ -231,10 +234,17 @@ def main() -> None:
     # that makes completion three to five times slower.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        app()
+        code = app(standalone_mode=False)
     except InputError as error:
-        print(f"spackle: {' '.join(str(error).splitlines())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
+        _fail(str(error))
+    except TyperException as error:  # an unknown option, a number that is none
+        _fail(error.format_message())
+    if code == INTERRUPTED:
         print("spackle: interrupted", file=sys.stderr)
-        sys.exit(130)
+    sys.exit(code)
+
+
+def _fail(message: str) -> NoReturn:
+    if message:  # there is none where the help was asked for by giving nothing
+        print(f"spackle: {' '.join(message.splitlines())}", file=sys.stderr)
+    sys.exit(2)

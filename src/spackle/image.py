@@ -26,6 +26,7 @@ MAX_SIDE = 1536  # long side of the working size
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter real lens sits on a small sensor: SHARP's crude rule
+LENSES = (0.01, 10_000.0)  # focal lengths that are believed, in long sides of the photo: 178° to 0.006°
 PLAUSIBLE_MM = (3.0, 3000.0)  # 35 mm equivalents outside this come from a broken tag
 
 _EXIF_IFD = 0x8769
@@ -98,8 +99,12 @@ def load_photo(
         found = focal_from_exif(exif, width, height)
         focal = found or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
         source = "EXIF" if found else "default 30 mm"
-    if not (math.isfinite(focal) and focal > 0):
-        raise InputError(f"{path}: {source} gives a focal length of {focal:g} px: check the value")
+    shortest, longest = (lens * max(width, height) for lens in LENSES)
+    if not shortest <= focal <= longest:
+        raise InputError(
+            f"{path}: {source} gives a focal length of {focal:g} px, "
+            f"but it must lie between {shortest:g} and {longest:g} px: check the value"
+        )
     return Photo(rgb, float(focal), source, Path(path))
 
 

@@ -125,11 +125,16 @@ class _Calibration:
         return self
 
 
+def calibrations_beside(path: Path) -> tuple[Path, Path]:
+    """Where a map's calibration is looked for, whether it is there or not: scene.json, calib.txt."""
+    return path.with_name("scene.json"), path.with_name("calib.txt")
+
+
 def _find_calibration(path: Path, calib: StrPath | None) -> _Calibration | None:
     if calib is not None:
         check_file(calib, "calibration")
         return _read_scene(calib, None) if Path(calib).suffix.lower() == ".json" else _read_calib(calib)
-    scene, text, stem = path.with_name("scene.json"), path.with_name("calib.txt"), path.stem.lower()
+    (scene, text), stem = calibrations_beside(path), path.stem.lower()
     if scene.is_file() and (lens := _read_scene(scene, path.name)):
         return lens
     if stem.startswith("disp") and text.is_file():

@@ -29,14 +29,27 @@ class Changed(Exception):
 
 
 def check_url(url: str) -> None:
-    """InputError for anything but http:// and https://, such as file://."""
+    """InputError for anything but http:// and https://, such as file://, and for a password in it."""
     try:
         parts = urlsplit(url)
-        good = parts.scheme in ("http", "https") and bool(parts.hostname) and url.isprintable() and " " not in url
+        host = parts.hostname if parts.port != 0 else None  # a port that is no number is a ValueError
+        good = parts.scheme in ("http", "https") and bool(host) and url.isprintable() and " " not in url
     except ValueError:
         good = False
     if not good:
-        raise InputError(f"{url!r}: not an address to download from: give one that begins with https:// or http://")
+        raise InputError(
+            f"{_shown(url)}: not an address to download from: give one that begins with https:// or http://"
+        )
+    if "@" in parts.netloc:
+        raise InputError(
+            f"an address at {host} with a user name or password in it: spackle logs in nowhere (nor by ~/.netrc): "
+            "give an address that works without"
+        )
+
+
+def _shown(url: str) -> str:
+    """An address for a message; one that is none may hold a password all the same, where nobody can tell."""
+    return "an address (not shown, its @ may follow a password)" if "@" in url else repr(url)
 
 
 def connect(url: str, headers: dict[str, str]) -> HTTPResponse:
@@ -47,7 +60,7 @@ def connect(url: str, headers: dict[str, str]) -> HTTPResponse:
         Changed: it has no bytes in the Range that the headers name.
         InputError: it does not give the file.
     """
-    request = Request(url, headers={"User-Agent": "spackle", **headers})
+    request = Request(url, headers={"User-Agent": "spackle", "Accept-Encoding": "identity", **headers})
     try:
         response: HTTPResponse = build_opener(_SafeRedirects).open(request, timeout=TIMEOUT)
         return response
@@ -68,7 +81,7 @@ def connect(url: str, headers: dict[str, str]) -> HTTPResponse:
 
 
 class _SafeRedirects(HTTPRedirectHandler):
-    """Follows redirects, but not from https to http, and to nothing else."""
+    """Follows redirects, but not from https to http, and to nothing that we would not take as an address."""
 
     def redirect_request(
         self, req: Request, fp: IO[bytes], code: int, msg: str, headers: Message, newurl: str
@@ -76,8 +89,13 @@ class _SafeRedirects(HTTPRedirectHandler):
         if urlsplit(newurl).scheme not in ("https", urlsplit(req.full_url).scheme):
             fp.close()
             raise InputError(
-                f"{req.full_url}: the server sends on to {newurl!r}, which is not https: give another address"
+                f"{req.full_url}: the server sends on to {_shown(newurl)}, which is not https: give another address"
             )
+        try:
+            check_url(newurl)
+        except InputError as error:
+            fp.close()
+            raise InputError(f"{req.full_url}: the server sends on to {error}") from error
         return super().redirect_request(req, fp, code, msg, headers, newurl)  # type: ignore[arg-type]
 
 

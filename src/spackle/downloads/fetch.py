@@ -49,7 +49,7 @@ def download(url: str, path: str | os.PathLike[str], progress: Progress | None =
     for the rest only, unless the remote file has changed or the server cannot do that.
 
     Args:
-        url: http:// or https://; proxies are those of the environment.
+        url: http:// or https://, without a password; proxies are those of the environment.
         path: the file's name here, in a folder that exists.
         progress: called before the first block (what came in an earlier call is done) and after each.
 
@@ -88,7 +88,7 @@ def read_record(path: str | os.PathLike[str]) -> Record | None:
         if fields is None or "sha256" not in fields:  # somebody's notes on a file of their own
             return None
         return Record(str(fields["url"]), int(fields["size"]), str(fields["sha256"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:  # the last: a size of 1e400
         raise InputError(f"{place}: this record of a download cannot be read: delete it and {AGAIN}") from error
 
 

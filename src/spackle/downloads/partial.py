@@ -64,6 +64,7 @@ def _receive_once(url: str, part: Path, progress: Progress) -> tuple[int, str]:
         with open(part, "rb") as file:
             return offset, digest(file).hexdigest()
     with ask(url, begun, offset) as answer:
+        _check_room(answer, part)  # first: a file that is refused leaves nothing
         if answer.start == 0:
             forget(part)
             part.touch()
@@ -75,18 +76,27 @@ def _begun(url: str, part: Path) -> Version | None:
     """The version of which `part` is the beginning; None where there is nothing to go on with."""
     try:
         version = Version(**(read_json(version_file(part)) or {}))
-        usable = version.url == url and version.validator and 0 < part.stat().st_size <= version.size
+        sensible = isinstance(version.size, int) and all(
+            isinstance(sign, str | None) for sign in (version.etag, version.modified)
+        )
+        usable = sensible and version.url == url and version.validator and 0 < part.stat().st_size <= version.size
     except (TypeError, ValueError, FileNotFoundError):
         return None
     return version if usable else None
 
 
+def _check_room(answer: Answer, part: Path) -> None:
+    usage = shutil.disk_usage(part.parent)
+    needed, free = answer.version.size - answer.start, usage.free
+    if answer.start == 0 and part.exists():  # it makes way
+        free += part.stat().st_size
+    if usage.total and free < needed:  # some network folders say 0 of 0
+        gigabytes = f"{needed / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free"
+        raise InputError(f"{part.parent}: {gigabytes}: make room or choose another folder")
+
+
 def _append(answer: Answer, part: Path, progress: Progress) -> tuple[int, str]:
     size, done = answer.version.size, answer.start
-    usage = shutil.disk_usage(part.parent)
-    if usage.total and usage.free < size - done:  # some network folders say 0 of 0
-        gigabytes = f"{(size - done) / 1e9:.1f} GB are needed, {usage.free / 1e9:.1f} GB are free"
-        raise InputError(f"{part.parent}: {gigabytes}: make room or choose another folder")
     with open(part, "r+b") as file:
         sha256 = digest(file)
         progress(done, size)
@@ -112,13 +122,15 @@ def read_json(path: Path) -> dict[str, Any] | None:
     """The fields in a file; None where there is no file, or something else in it.
 
     Raises:
-        ValueError: this is no JSON.
+        ValueError: this is no JSON, or none that we can read.
         OSError: it cannot be read.
     """
     try:
         fields = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
+    except RecursionError as error:  # brackets in brackets, thousands deep
+        raise ValueError("nested too deep") from error
     return fields if isinstance(fields, dict) else None
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from http.client import HTTPException, HTTPResponse
 
 from spackle.downloads.connect import Changed, Dropped, connect, reason_of
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 
 BLOCK = 1 << 18  # bytes at most that are taken at once
 
@@ -55,13 +55,18 @@ def ask(url: str, begun: Version | None = None, offset: int = 0) -> Iterator[Ans
 
 
 def _answer(response: HTTPResponse, url: str, begun: Version | None, offset: int) -> Answer:
-    if response.status == 206 and begun is not None:
-        if not _continues(response, begun, offset):
-            raise Changed
-        return Answer(begun, offset, _blocks(response, begun.size - offset))
-    size = response.length
-    if response.status != 200 or response.headers.get_content_type() == "text/html":
+    rest = begun if response.status == 206 else None
+    if not rest and (response.status != 200 or response.headers.get_content_type() == "text/html"):
         raise InputError(f"{url}: the server answers with something else than a file: check the address in a browser")
+    coding = response.headers["Content-Encoding"] or "identity"
+    if coding.strip().lower() != "identity":  # its bytes and its length would be those of the packed file
+        named = reason_in_a_line(coding)
+        raise InputError(f"{url}: the server packs the file ({named}), which was not asked for: give another address")
+    if rest:
+        if not _continues(response, rest, offset):
+            raise Changed
+        return Answer(rest, offset, _blocks(response, rest.size - offset))
+    size = response.length
     if not size:
         problem = "is empty there" if size == 0 else "comes without its length, so a part could pass for the whole"
         raise InputError(f"{url}: the file {problem}: give another address")

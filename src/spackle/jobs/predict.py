@@ -7,15 +7,16 @@ from pathlib import Path
 
 import torch
 
-from spackle.bases.protocol import Base
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo, resize_photo
 from spackle.jobs.inputs import find_photos, results_folder
+from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
-from spackle.jobs.setup import PredictOptions, Tools, make_base, request_of, set_up
+from spackle.jobs.request import request_of
+from spackle.jobs.setup import BaseError, Tools, make_base, set_up
 from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
 
 FILES_WITHOUT_VIDEO = ("base.ply", "scene.ply", "report.json")
@@ -35,12 +36,13 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     with results_folder(output):
         for path, name in found:
             try:
-                if path != photos and not options.overwrite and is_done(output / name, files, path, options):
+                request = request_of(path, options, tools.digest)
+                if path != photos and not options.overwrite and is_done(output / name, files, request):
                     reporter.say(f"{path.name}: done already (--overwrite does it again)")
                     continue
-                predict_one(path, output / name, options, tools, reporter)
+                predict_one(path, output / name, options, tools, reporter, request)
             except InputError as error:
-                if path == photos:  # the only one
+                if path == photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
                     raise
                 failed += 1
                 reporter.say(f"error: {error}")
@@ -49,7 +51,9 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     return failed
 
 
-def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools, reporter: Reporter) -> None:
+def predict_one(
+    path: Path, folder: Path, options: PredictOptions, tools: Tools, reporter: Reporter, request: str
+) -> None:
     """One photo to `folder`: base.ply, scene.ply, video.mp4, report.json, and views/ with --cameras.
 
     Raises:
@@ -58,18 +62,15 @@ def predict_one(path: Path, folder: Path, options: PredictOptions, tools: Tools,
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
         full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
-        base = make_base(full, options, tools)
-        request = request_of(path, options)  # the files may be others by the time all is done
     with contextlib.ExitStack() as folders:
         folders.enter_context(results_folder(folder, FILES if options.render else FILES_WITHOUT_VIDEO))
         if tools.views:
             folders.enter_context(results_folder(folder / "views", view_files(len(tools.views))))
-        _predict_loaded(full, base, folder, options, tools, reporter, request, seconds)
+        _predict_loaded(full, folder, options, tools, reporter, request, seconds)
 
 
 def _predict_loaded(
     photo: Photo,
-    base: Base,
     folder: Path,
     options: PredictOptions,
     tools: Tools,
@@ -79,6 +80,8 @@ def _predict_loaded(
 ) -> None:
     """The stages after loading; nothing is written before all is computed."""
     name = photo.path.name
+    with reporter.stage("prepare", seconds):
+        base = make_base(photo, options, tools)
     with reporter.stage("base", seconds) as step:
         prediction = base.predict(photo, step)
         if not _finite(prediction.gaussians):

@@ -17,8 +17,8 @@ from spackle.formats import load_cameras, load_ply, load_ply_camera, save_png, s
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.jobs.inputs import results_folder
+from spackle.jobs.options import MAX_VIDEO_SIDE, check_path_options, video_problem
 from spackle.jobs.progress import Reporter, Step
-from spackle.jobs.setup import MAX_VIDEO_SIDE, check_path_options, video_problem
 from spackle.render import Renderer, get_renderer
 from spackle.scene import scene_path
 from spackle.trajectory import TrajectoryKind

@@ -11,7 +11,8 @@ import spackle
 from spackle.bases.protocol import BasePrediction
 from spackle.formats import atomic_path
 from spackle.image import Photo
-from spackle.jobs.setup import PredictOptions, Tools, request_of
+from spackle.jobs.options import PredictOptions
+from spackle.jobs.setup import Tools
 from spackle.jobs.views import Completed
 
 
@@ -58,13 +59,13 @@ def make_report(
     return report
 
 
-def is_done(folder: Path, results: Sequence[str], photo: Path, options: PredictOptions) -> bool:
+def is_done(folder: Path, results: Sequence[str], request: str) -> bool:
     """Whether an earlier run with the same files and options has finished, and its results are there still."""
     if not all((folder / name).is_file() for name in results):
         return False
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        return bool(report["request"] == request_of(photo, options))
+        return bool(report["request"] == request)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -72,7 +73,7 @@ def is_done(folder: Path, results: Sequence[str], photo: Path, options: PredictO
 def write_report(report: dict[str, Any], path: Path) -> None:
     """Write a report as JSON, whole or not at all."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(report: dict[str, Any]) -> str:

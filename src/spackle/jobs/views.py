@@ -14,8 +14,9 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
+from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Step
-from spackle.jobs.setup import PredictOptions, Tools
+from spackle.jobs.setup import Tools
 from spackle.render import Renderer
 from spackle.residual import Completer, hole_area_ratio, hole_mask
 from spackle.scene import even_camera, scene_path

@@ -51,7 +51,7 @@ def get_weights(
         _say_present(known, path, reporter)
         return path
     with results_folder(path.parent, [path.name]):
-        record = _download(known, url or known.url, path, reporter)
+        record = _download(known, known.url if url is None else url, path, reporter)
     hint = "" if output is None else "; --checkpoint names it to predict"
     reporter.say(f"{_summary(known, record)} -> {path}{hint}")
     return path
@@ -68,11 +68,12 @@ def make_weights(output: Path, size: str, reporter: Reporter) -> None:
     Raises:
         InputError: another suffix, or a file that cannot be written.
     """
-    if output.suffix not in (".pt", ".safetensors"):
+    suffix = output.suffix.lower()
+    if suffix not in (".pt", ".safetensors"):
         raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
     with atomic_path(output) as temporary:
         tensors = deterministic_weights(expected_shapes(CONFIGS[size]))
-        if output.suffix == ".pt":
+        if suffix == ".pt":
             torch.save(tensors, temporary)
         else:
             save_file(tensors, temporary)
@@ -97,7 +98,7 @@ def list_weights(console: Console) -> None:
 def _place(known: KnownWeights, output: Path | None) -> Path:
     if output is None:
         return weights_folder() / known.file
-    named = output.suffix == Path(known.file).suffix and not os.path.isdir(output)
+    named = output.suffix.lower() == Path(known.file).suffix and not os.path.isdir(output)
     return output if named else output / known.file
 
 

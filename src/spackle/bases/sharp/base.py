@@ -11,6 +11,7 @@ from torch.nn.functional import interpolate
 
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
+from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput
 from spackle.bases.sharp.precision import Precision, pick_dtype
 from spackle.bases.sharp.start import compose
@@ -45,15 +46,19 @@ class SharpBase:
         """Read a checkpoint.
 
         Args:
-            path: Apple's .pt file, or a .safetensors file with the same names.
-            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively.
-            low_memory: take less memory and a little more time.
-            device: a CUDA device where there is one, else the processor.
+            path: Apple's .pt file, or a safetensors file with the same names.
+            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively. In either,
+                the last bits of the Gaussians depend on the number of threads, because sums run in another order;
+                bf16's last bits are coarser.
+            low_memory: take less memory and a little more time to predict.
+            device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:
-            InputError: a file that is not SHARP's weights. Nothing in it is executed.
+            InputError: a device that is not there, a file that is not SHARP's weights, or too little memory.
+                Nothing in the file is executed.
+            ValueError: an unknown precision.
         """
-        target = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
         return SharpBase(network, low_memory=low_memory, weights=Path(path).name)
 
@@ -68,8 +73,13 @@ class SharpBase:
         Args:
             photo: at its full size: the network looks at a square picture made from all of its pixels.
             progress: called with windows done and their number.
+
+        Raises:
+            InputError: too little memory.
         """
-        gaussians = to_metric(self.look(photo, progress), photo).to("cpu")
+        advice = [] if self.low_memory else ["try --low-memory"]
+        with enough_memory(*advice):
+            gaussians = to_metric(self.look(photo, progress), photo).to("cpu")
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
@@ -80,16 +90,18 @@ class SharpBase:
         device = next(self.network.parameters()).device
         batch = WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
         image = to_square(photo.rgb.to(device), self.network.config.side)
-        output: SharpOutput = self.network(
-            image, photo.focal_px / photo.width, 1 if self.low_memory else batch, progress
-        )
+        with own_arithmetic(device):
+            output: SharpOutput = self.network(
+                image, photo.focal_px / photo.width, 1 if self.low_memory else batch, progress
+            )
         return output
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
     """Gaussians in metres, on the network's device: the normalised space is x and y in -1..1 times z."""
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
-    return stretch_gaussians(compose(output.start, output.deltas), stretch)
+    with own_arithmetic(output.deltas.device):
+        return stretch_gaussians(compose(output.start, output.deltas), stretch)
 
 
 def to_square(rgb: Tensor, side: int) -> Tensor:

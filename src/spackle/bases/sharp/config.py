@@ -34,11 +34,6 @@ class SharpConfig:
         """Tokens of a window's side."""
         return self.window // self.patch
 
-    @property
-    def gaussians(self) -> int:
-        """How many Gaussians come out."""
-        return LAYERS * (self.side // STRIDE) ** 2
-
 
 FULL = SharpConfig()
 TINY = SharpConfig(

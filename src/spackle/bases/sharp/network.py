@@ -23,7 +23,6 @@ GEOMETRY, TEXTURE = 3, 11  # delta channels: offset; scale 3, quaternion 4, colo
 class SharpOutput:
     """What the network says about one picture."""
 
-    disparity: Tensor  # [2, side, side] of both layers, before the lens is taken into account
     start: Start  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32, to be applied to them
 
@@ -56,7 +55,7 @@ class SharpNetwork(nn.Module):
         depth = disparity_factor / disparity.clamp(*DISPARITY_RANGE)
         start = make_start(image, depth)
         texture, geometry = self.feature_model(torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
-        return SharpOutput(disparity[0], start, self.prediction_head(texture, geometry))
+        return SharpOutput(start, self.prediction_head(texture, geometry))
 
 
 class DepthNetwork(nn.Module):

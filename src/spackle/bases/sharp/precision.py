@@ -1,4 +1,8 @@
-"""Which of SHARP's arithmetic runs in bfloat16, and where the hardware multiplies it natively."""
+"""Which of SHARP's arithmetic runs in bfloat16, and where the hardware multiplies it natively.
+
+Neither type repeats bit for bit with another number of threads: sums run in another order. With the same
+number they do.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,11 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The type that --precision means on a device: `auto` is bfloat16 where the hardware multiplies it natively."""
+    """The type that --precision means on a device: `auto` is bfloat16 where the hardware multiplies it natively.
+
+    Raises:
+        ValueError: an unknown precision.
+    """
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
     if precision == "auto":
