@@ -15,7 +15,7 @@ import spackle
 SOURCES = Path(spackle.__file__).parent
 FILES = sorted(SOURCES.rglob("*.py"))
 
-OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage")
+OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage", "yaml", "tensorboard")
 
 # Rooms in the order in which the data flows; each may import itself and what is named here.
 SHELL = {"", "__main__", "cli", "jobs", "scene"}  # thin, on top of everything; "" is the package itself

@@ -38,6 +38,7 @@ from spackle.residual.carve import CLEARANCE, MAX_REACH_PX, REACH, SHIELD_PX, ST
 from spackle.residual.complete import farthest_first
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.network import IN_CHANNELS, network_input
+from spackle.residual.rim import Rim
 from spackle.residual.seeds import OPACITY, cell_centers
 from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
@@ -394,7 +395,8 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
         eye = camera.world_to_camera.clone()
         eye[:3, 3] *= unit
         scaled = dataclasses.replace(camera, world_to_camera=eye)
-        return network_input(cues, make_seeds(cues, scaled, completer.photo_camera))
+        seeds = make_seeds(cues, scaled, completer.photo_camera)
+        return network_input(cues, seeds, Rim.of(cues, seeds, scaled, completer.photo_camera))
 
     found = features(1.0)
     assert found.shape == (1, IN_CHANNELS, 36, 48)
@@ -409,9 +411,10 @@ def test_a_rendered_loss_trains_the_network_and_leaves_the_base_alone() -> None:
     network = copy.deepcopy(trained())
     cues = Cues.of(CPU.render(base, camera))
     seeds = make_seeds(cues, camera, scene.camera)
-    deltas = network(network_input(cues, seeds))[0].permute(1, 2, 0)[cues.mask]
+    features = network_input(cues, seeds, Rim.of(cues, seeds, camera, scene.camera))
+    deltas = network(features)[0].permute(1, 2, 0)[cues.mask]
     aux = compose(seeds.select(cues.mask), deltas, camera)
-    assert not any(t.requires_grad for t in network_input(cues, seeds))
+    assert not features.requires_grad
     view = CPU.render([base.detach(), aux], camera)
     (view.rgb.mean() + view.depth.mean() + view.alpha.mean()).backward()
     for name, parameter in network.named_parameters():
@@ -427,7 +430,8 @@ def test_an_untrained_network_can_leave_zero() -> None:
     network = ResidualNet()
     cues = Cues.of(CPU.render(base, camera))
     seeds = make_seeds(cues, camera, scene.camera)
-    deltas = network(network_input(cues, seeds))[0].permute(1, 2, 0)[cues.mask]
+    features = network_input(cues, seeds, Rim.of(cues, seeds, camera, scene.camera))
+    deltas = network(features)[0].permute(1, 2, 0)[cues.mask]
     CPU.render([base, compose(seeds.select(cues.mask), deltas, camera)], camera).rgb.mean().backward()
     for head in (network.geometry, network.texture):
         assert head[-1].weight.grad is not None

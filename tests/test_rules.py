@@ -171,6 +171,7 @@ TWINS = {
     "fill.py": "test_fill.py",
     "render": "test_render.py",
     "residual/carve.py": "test_residual.py",
+    "residual/rim.py": "test_rim.py",
 }
 
 

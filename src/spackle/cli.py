@@ -189,6 +189,24 @@ def demo(
     run_demo(output, Reporter(verbose))
 
 
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Option("--recipe", metavar="FILE.yaml", help="What to learn from, and how.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where OUT holds a run.")] = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Train the residual: best.safetensors, last.safetensors, run.json, pictures and logs."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.train import train_recipe
+
+    if train_recipe(recipe, overrides or [], output, Reporter(verbose), overwrite=overwrite) == "stopped":
+        raise typer.Exit(INTERRUPTED)
+
+
 @weights.command("get")
 def weights_get(
     name: Annotated[str, typer.Argument(help="Which weights: sharp.")],

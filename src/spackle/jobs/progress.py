@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -52,6 +53,22 @@ class Reporter:
         elapsed = time.perf_counter() - start
         seconds[name] = round(seconds.get(name, 0.0) + elapsed, 3)
         self.detail(f"  {name}: {elapsed:.2f} s")
+
+    @contextlib.contextmanager
+    def steps(self, name: str, start: int, total: int) -> Iterator[Callable[[int, str], None]]:
+        """Many steps of equal length, from `start` on: yields a function of (done, a remark); in a log, a line each."""
+        if self.console.is_terminal:
+            with self._bars(MofNCompleteColumn(), TextColumn("{task.fields[remark]}")) as bars:
+                task = bars.add_task(name, total=total, completed=start, remark="")
+                yield lambda done, remark: bars.update(task, completed=done, remark=remark)
+        else:
+            begin = time.monotonic()
+
+            def tell(done: int, remark: str) -> None:
+                left = (time.monotonic() - begin) / max(1, done - start) * (total - done)
+                self.say(f"{name}: {done} of {total}, {remark}, {timedelta(seconds=round(left))} left")
+
+            yield tell
 
     @contextlib.contextmanager
     def transfer(self, name: str) -> Iterator[Step]:

@@ -16,6 +16,7 @@ from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
 from spackle.residual.cues import MASK_THRESHOLD, Cues, hole_area_ratio
 from spackle.residual.network import ResidualNet, network_input
+from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds, make_seeds
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
@@ -122,13 +123,14 @@ class Completer:
         if not bool(cues.mask.any()):
             return Gaussians.empty()
         seeds = make_seeds(cues, camera, self.photo_camera)
-        return compose(seeds.select(cues.mask), self._deltas(cues, seeds), camera)
+        return compose(seeds.select(cues.mask), self._deltas(cues, seeds, camera), camera)
 
-    def _deltas(self, cues: Cues, seeds: Seeds) -> Tensor | None:
+    def _deltas(self, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor | None:
         """[n, 14] for the masked cells, or None without a network."""
         if self.network is None:
             return None
-        field: Tensor = self.network(network_input(cues, seeds))
+        rim = Rim.of(cues, seeds, camera, self.photo_camera)
+        field: Tensor = self.network(network_input(cues, seeds, rim))
         return field[0].permute(1, 2, 0)[cues.mask]
 
 

@@ -78,7 +78,12 @@ def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
 
 def _shift_sigmoid(base: Tensor, delta: Tensor) -> Tensor:
     """sigmoid(sigmoid⁻¹(base) + delta), the base kept off 0 and 1."""
-    return torch.sigmoid(torch.logit(base.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN / 2)) + delta)
+    return torch.sigmoid(color_logit(base) + delta)
+
+
+def color_logit(value: Tensor) -> Tensor:
+    """sigmoid⁻¹ of colours or opacities, kept off 0 and 1."""
+    return torch.logit(value.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN / 2))
 
 
 def _scale_factor(delta: Tensor, low: float, high: float) -> Tensor:

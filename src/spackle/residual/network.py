@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.residual.compose import GEOMETRY_CHANNELS, TEXTURE_CHANNELS
+from spackle.residual.compose import COLOR, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.cues import Cues
+from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds
 
-IN_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
+CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
+NEAR = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
+MIRRORED = slice(NEAR.stop, NEAR.stop + 3)  # and into the one mirrored at the rim
+IN_CHANNELS = MIRRORED.stop + 1  # and the distance to the rim
+COPIES = 2  # channels that say how much of each to take
+RIM_CELLS = 16.0  # a typical distance to the rim
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
+STEM_GAIN = 3.0  # the features are of order 0.3
 
 
 class ResidualBlock(nn.Module):
@@ -28,8 +36,6 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.first = nn.Conv2d(channels, channels, 3, padding=1)
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, h, w] to the same shape."""
@@ -53,10 +59,11 @@ class ResidualNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairs)
         self.decode = nn.ModuleList(ResidualBlock(width) for width in WIDTHS[:-1])
         self.geometry = _head(WIDTHS[0], GEOMETRY_CHANNELS)
-        self.texture = _head(WIDTHS[0], TEXTURE_CHANNELS)
+        self.texture = _head(WIDTHS[0], TEXTURE_CHANNELS + COPIES)
+        _initialise(self)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features [B, 10, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
+        """Features [B, 17, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
         height, width = features.shape[-2:]
         x = self.stem(pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate"))
         skips = []
@@ -67,21 +74,35 @@ class ResidualNet(nn.Module):
         x = self.coarse(x)
         for up, decode, skip in reversed(list(zip(self.up, self.decode, skips, strict=True))):
             x = decode(skip + interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False))
-        deltas = torch.cat([self.geometry(x), self.texture(x)], dim=1)
-        return deltas[..., :height, :width]
+        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
+        deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
+        # Colours that are there need not be learnt: it is enough to say how much of them to take.
+        taken = copies[:, :1] * features[:, NEAR] + copies[:, 1:] * features[:, MIRRORED]
+        return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
 
 
-def network_input(cues: Cues, seeds: Seeds) -> Tensor:
-    """Features [1, 10, h, w], centred around zero; depths as log inverse depth over the view's median."""
+def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+    """Features [1, 17, h, w], centred around zero; depths as log inverse depth over the view's median."""
     cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
-    channels = [cues.rgb.permute(2, 0, 1) - 0.5, torch.stack(maps), seeds.rgb.permute(2, 0, 1) - 0.5]
-    return torch.cat(channels)[None].detach()
+    own = color_logit(seeds.rgb)
+    channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5]
+    channels += [color_logit(rim.rgb) - own, color_logit(rim.mirrored) - own]
+    channels += [(rim.distance / RIM_CELLS).log1p()[..., None]]
+    return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
-    last = nn.Conv2d(width, channels, 1)
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)  # type: ignore[arg-type]
-    return nn.Sequential(ResidualBlock(width), nn.ReLU(), last)
+    return nn.Sequential(ResidualBlock(width), nn.ReLU(), nn.Conv2d(width, channels, 1))
+
+
+def _initialise(network: ResidualNet) -> None:
+    """Numbers of order one at every scale, blocks that start as the identity, and heads that start at zero."""
+    for name, module in network.named_modules():
+        if not isinstance(module, nn.Conv2d):
+            continue
+        zero = name.endswith("second") or name in ("geometry.2", "texture.2")
+        gain = 0.0 if zero else STEM_GAIN if name == "stem" else math.sqrt(2) if name.endswith("first") else 1.0
+        nn.init.normal_(module.weight, std=gain / math.sqrt(module.weight[0].numel()))
+        nn.init.zeros_(module.bias)  # type: ignore[arg-type]

@@ -1,0 +1,42 @@
+"""What a run took place on, for its report."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+import spackle
+from spackle.threads import thread_count
+
+
+def versions() -> dict[str, str]:
+    """Ours, and those of what computes."""
+    ours = {"spackle": spackle.__version__, "python": platform.python_version()}
+    return {**ours, "torch": torch.__version__, "numba": numba.__version__, "numpy": np.__version__}
+
+
+def hardware(device: torch.device) -> dict[str, Any]:
+    """Processor, cores and threads, and the GPU where that is the device."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:  # not a Linux
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    facts = {"cpu": names[0] if names else platform.machine(), "cores": os.cpu_count(), "threads": thread_count()}
+    return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
+
+
+def without_nan(value: Any) -> Any:
+    """JSON knows no NaN."""
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

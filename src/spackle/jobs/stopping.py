@@ -1,0 +1,32 @@
+"""Ending a long job between two steps, where nothing is half done."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+
+@contextlib.contextmanager
+def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM came, which then ends the run between two steps.
+
+    A second Ctrl-C ends it at once; not so under torchrun, which passes on what the terminal has sent already.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # signals are not for this one
+        yield asked.is_set
+        return
+
+    def note(number: int, frame: object) -> None:
+        asked.set()
+        if alone:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

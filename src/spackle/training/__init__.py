@@ -1,0 +1,1 @@
+"""How the residual learns: its samples, its losses, and the loop."""

@@ -1,0 +1,132 @@
+"""What a run needs to go on, and the weights that come out of it: whole files, or the ones before them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from spackle.errors import InputError, reason_in_a_line
+from spackle.formats import atomic_path
+from spackle.training.recipe import differences
+
+NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
+BEST, LAST, RUN, PICTURES, LOGS, BAD = (
+    "best.safetensors", "last.safetensors", "run.json", "pictures", "logs", "bad_batch",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How far a run has come, as plain numbers."""
+
+    step: int = 0  # steps done
+    best: float | None = None  # validation loss; None before the first validation
+    best_step: int = 0
+    stale: int = 0  # validations since then
+    seconds: float = 0.0  # of all sessions together
+    history: tuple[dict[str, float], ...] = ()  # what each validation found
+
+    def judged(self, found: dict[str, float], min_delta: float) -> Progress:
+        """After a validation."""
+        history = (*self.history, found)
+        best = math.inf if self.best is None else self.best
+        if math.isfinite(found["loss"]) and found["loss"] < best - min_delta:
+            return dataclasses.replace(self, best=found["loss"], best_step=self.step, stale=0, history=history)
+        return dataclasses.replace(self, stale=self.stale + 1, history=history)
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """Everything that the next step depends on; which samples come next follows from the step."""
+
+    progress: Progress
+    network: dict[str, Tensor]
+    average: dict[str, Tensor]
+    optimizer: dict[str, Any]
+    recipe: dict[str, Any]
+    digest: str  # of the samples
+
+
+def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
+    """Write checkpoint.pt; the one before it stays as checkpoint.previous.pt.
+
+    Raises:
+        InputError: where it cannot be written, or the disk is full; what was there stays.
+    """
+    state = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
+    progress = dataclasses.asdict(checkpoint.progress)
+    state["progress"] = {**progress, "history": list(progress["history"])}
+    buffer = io.BytesIO()  # torch's own writer hides that a disk is full
+    torch.save(state, buffer)
+    newest = folder / NEWEST
+    with atomic_path(newest) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
+        if newest.exists():
+            os.replace(newest, folder / PREVIOUS)
+
+
+def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
+    """The last whole checkpoint of a folder or None, and what is wrong with a newer one, if anything.
+
+    Raises:
+        InputError: there are checkpoints, but none can be read.
+    """
+    problem = None
+    for path in (folder / NEWEST, folder / PREVIOUS):
+        if not path.exists():
+            continue
+        try:
+            return _read(path), problem
+        except Exception as error:  # a damaged file can raise anything
+            problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
+    if problem:
+        raise InputError(f"{problem}, nor is there one before it: --overwrite starts anew")
+    return None, None
+
+
+def _read(path: Path) -> Checkpoint:
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    history = tuple(state["progress"].pop("history"))
+    return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)})
+
+
+def check_same_run(checkpoint: Checkpoint, recipe: dict[str, Any], digest: str, folder: Path) -> None:
+    """InputError where a checkpoint is of another recipe, or of other samples."""
+    other = differences(checkpoint.recipe, recipe)
+    if not other and checkpoint.digest != digest:
+        other = ["the files that data names"]
+    if other:
+        more = f" and {len(other) - 1} more" if len(other) > 1 else ""
+        raise InputError(
+            f"{folder}: holds a run of another recipe ({other[0]}{more} differs): choose another with -o, "
+            "or --overwrite to start anew"
+        )
+
+
+def export_weights(network: nn.Module, path: Path) -> None:
+    """Write weights with half precision, as `spackle.residual.weights.load_residual` reads them.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(tensors))
+
+
+def remove_run(folder: Path) -> None:
+    """Delete what an earlier run left, but not its samples."""
+    for name in (NEWEST, PREVIOUS, BEST, LAST, RUN):
+        (folder / name).unlink(missing_ok=True)
+    for name in (PICTURES, LOGS, BAD):
+        for path in sorted((folder / name).glob("*")):
+            if path.is_file():
+                path.unlink()

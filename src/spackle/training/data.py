@@ -1,0 +1,127 @@
+"""A recipe's data as files of samples, made where they are not there yet."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from spackle.errors import InputError
+from spackle.render import Renderer
+from spackle.training.cache import Cache, digest_of
+from spackle.training.recipe import DataRecipe, plain
+from spackle.training.sources import PHOTO_SUFFIXES, Composites, RgbdFrames, Source, StereoPairs
+
+TRAIN, VALIDATION = "train", "validation"
+Step = Callable[[int, int], None]  # (done, of how many)
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleFiles:
+    """What a run learns from, and what it is judged by."""
+
+    train: Sequence[Path]
+    validation: Sequence[Path]
+    digest: str  # of everything that decides what is in them, but not of where they lie
+
+
+@dataclasses.dataclass(frozen=True)
+class Supply:
+    """Where samples come from: the files that were found for a recipe."""
+
+    data: DataRecipe
+    sources: Sequence[Source]
+    shares: Sequence[float]
+    names: Sequence[str]  # of all files, relative to their folders
+
+    @staticmethod
+    def of(data: DataRecipe, renderer: Renderer) -> Supply:
+        """Look for a recipe's files.
+
+        Raises:
+            InputError: a folder that is missing or without such files, or no data at all.
+        """
+        sources: list[Source] = []
+        shares: list[float] = []
+        names: list[str] = []
+
+        def add(source: Source, share: float, folder: Path, files: Sequence[Path]) -> None:
+            if share > 0:
+                sources.append(source)
+                shares.append(share)
+                names.extend([source.name, *(file.relative_to(folder).as_posix() for file in files)])
+
+        if data.photos is not None:
+            photos = _find(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+            add(Composites(photos, renderer, data.disparity), data.shares.composites, data.photos, photos)
+        found = [_find(frames.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for frames in data.rgbd]
+        for camera, frames in zip(data.rgbd, found, strict=True):
+            share = data.shares.rgbd * len(frames) / sum(map(len, found))  # every frame counts alike
+            source = RgbdFrames(frames, renderer, data.disparity, camera.focal_px, camera.unit_m)
+            add(source, share, camera.folder, frames)
+        if data.stereo is not None:
+            scenes = [file.parent for file in _find(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
+            for reverse, share, name in ((True, data.shares.stereo, "stereo"), (False, data.shares.pairs, "pairs")):
+                add(StereoPairs(scenes, renderer, data.disparity, reverse, name), share, data.stereo, scenes)
+        if not sources:
+            raise InputError(
+                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a share above 0"
+            )
+        return Supply(data, sources, shares, names)
+
+    @property
+    def digest(self) -> str:
+        """Twelve digits: the same samples have the same ones, wherever the files lie and however many are made."""
+        facts: dict[str, Any] = plain(self.data)
+        for name in ("photos", "stereo", "cache", "views", "validation_views"):
+            facts.pop(name)
+        for camera in facts["rgbd"]:
+            camera.pop("folder")
+        return digest_of((facts, list(self.shares), list(self.names)))
+
+    def samples(self, folder: Path, train: Step, validation: Step, warn: Callable[[str], None]) -> SampleFiles:
+        """The samples in a folder, which many recipes may share; what is missing is made.
+
+        Args:
+            folder: for a folder of the digest's name, with train/ and validation/ in it.
+            train: told how many views are there.
+            validation: likewise.
+            warn: told of each view that was passed over, and why.
+
+        Raises:
+            InputError: where nothing can be written, or no view has a hole to learn from.
+        """
+        data, digest = self.data, self.digest
+
+        def fill(name: str, seed: int, views: int, progress: Step) -> list[Path]:
+            place = folder / digest / name
+            # Other seeds, other views: no view is in both.
+            cache = Cache(place, self.sources, self.shares, seed, data.crops, data.cells)
+            files = cache.fill(views, progress, warn)
+            if not files:
+                raise InputError(
+                    f"{place}: none of {views} views gave a sample: photos must be readable, larger than "
+                    f"{2 * data.cells} pixels each way, and seen from aside (data.disparity)"
+                )
+            return files
+
+        judged = fill(VALIDATION, 2 * data.seed + 1, data.validation_views, validation)
+        learned = fill(TRAIN, 2 * data.seed, data.views, train)
+        return SampleFiles(learned, judged, digest)
+
+
+def _find(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
+    """All files below a folder whose names end so, in order.
+
+    Raises:
+        InputError: no folder, or no such file in it.
+    """
+    if not os.path.isdir(folder):
+        raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
+    found = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(endings) and file.is_file())
+    found = [file for file in found if not file.name.startswith(".")]
+    if not found:
+        raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
+    return found

@@ -1,0 +1,213 @@
+"""The four terms that the residual is trained with, as pure functions: paper, "Training Details and Loss Weights".
+
+Each is a mean over the pixels of an image that it speaks about, then over the images of the batch: a small hole counts
+as much as a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the
+mean of the losses of its images, however they are divided between processes. Where `valid` says that the target is
+not known it may be anything, NaN too: it has no part in a loss, nor in a gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spackle.training.features import FeatureNet
+
+ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
+TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """How much each term counts; the defaults are the paper's."""
+
+    color: float = 10.0
+    alpha: float = 0.5
+    perceptual: float = 1.0
+    preserve: float = 5.0
+
+
+PAPER_WEIGHTS = LossWeights()
+
+
+def color_loss(rgb: Tensor, target: Tensor, hole: Tensor) -> Tensor:
+    """mean |rgb - target| over a hole's pixels and the channels ("Training Details and Loss Weights").
+
+    Args:
+        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
+        target: [B, H, W, 3] what it should show.
+        hole: [B, H, W] bool.
+
+    Returns:
+        [] the images' mean, in which one without a hole is 0.
+    """
+    # Cleared before abs: the gradient of an unknown (NaN) difference would be NaN times zero.
+    apart = torch.where(hole[..., None], rgb - target, 0).abs()
+    return _mean_of_images(apart.mean(-1), hole)
+
+
+def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
+    """mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1 ("Training Details and Loss Weights").
+
+    The clamp holds the loss under 6.9 and its gradient under 1000. It costs nothing: a pixel below it shows no
+    Gaussian at all, because a splat under 1/255 is not drawn.
+
+    Args:
+        alpha: [B, H, W] opacity of the completed view, 0..1.
+        hole: [B, H, W] bool.
+
+    Returns:
+        [] the images' mean, in which one without a hole is 0.
+    """
+    opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
+    return _mean_of_images(-opaque.log(), hole)
+
+
+def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
+    """mean |rgb - base_rgb| over pixels outside of the hole, and channels ("Training Details and Loss Weights").
+
+    Args:
+        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
+        base_rgb: [B, H, W, 3] the same view of the base alone; detached here.
+        hole: [B, H, W] bool.
+
+    Returns:
+        [] the images' mean, in which one that is all hole is 0.
+    """
+    return color_loss(rgb, base_rgb.detach(), ~hole)
+
+
+def perceptual_loss(
+    features: FeatureNet,
+    rgb: Tensor,
+    target: Tensor,
+    hole: Tensor,
+    *,
+    dilation: int = 21,
+    size: int | None = 512,
+    valid: Tensor | None = None,
+) -> Tensor:
+    """Feature reconstruction and Gram statistics near the hole ("Training Details and Loss Weights").
+
+    Near is the hole grown by a max-pool of `dilation`; elsewhere the prediction is replaced by the target. For each
+    layer, F and T are the features [C, h, w] of prediction and target, both divided by the root mean square of T (one
+    number for each image and layer, no gradient), so that every layer and every network speaks in the same units;
+    w [h, w] is the share of each cell that is near. Then the loss is the sum over layers of
+
+        sum(w |F - T|) / (C sum(w))  +  mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
+
+    The mean over the C² entries is what makes the second term independent of C. Each term is between about 0.1 and 1 a
+    layer for very different images.
+
+    Args:
+        features: the frozen network.
+        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
+        target: [B, H, W, 3] what it should show.
+        hole: [B, H, W] bool.
+        dilation: side of the max-pool in pixels of `hole`, odd; 1 grows nothing.
+        size: the longer side of the images that the network sees; None leaves them as they are.
+        valid: [B, H, W] bool, where the target is known; elsewhere both images show the prediction, and nothing counts.
+
+    Returns:
+        [] the images' mean, in which one without a hole is 0.
+
+    Raises:
+        ValueError: an even dilation.
+    """
+    if valid is not None:
+        hole, target = hole & valid, torch.where(valid[..., None], target, rgb.detach())
+    near = dilate(hole, dilation) if valid is None else dilate(hole, dilation) & valid
+    if not near.any():
+        return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
+    ours = features(_resized(torch.where(near[..., None], rgb, target), size))
+    with torch.no_grad():
+        theirs = features(_resized(target, size))
+    terms = [_layer_terms(f, t, covered(near, f)) for f, t in zip(ours, theirs, strict=True)]
+    return torch.stack([term for both in terms for term in both]).sum()
+
+
+def total_loss(
+    rgb: Tensor,
+    alpha: Tensor,
+    target: Tensor,
+    base_rgb: Tensor,
+    hole: Tensor,
+    *,
+    features: FeatureNet | None = None,
+    weights: LossWeights = PAPER_WEIGHTS,
+    valid: Tensor | None = None,
+    dilation: int = 21,
+    size: int | None = 512,
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The weighted sum that is minimised ("Training Details and Loss Weights").
+
+    Args:
+        rgb, alpha, target, base_rgb, hole: as in the terms above.
+        features: None leaves the perceptual term out.
+        weights: one number for each term.
+        valid: [B, H, W] bool, where the target is known; colour and perceptual terms look at hole & valid. Opacity
+            needs no target: it is asked for in the whole hole.
+        dilation, size: as in `perceptual_loss`.
+
+    Returns:
+        [] the loss, and its terms by the names of `LossWeights`, each [], unweighted and detached.
+    """
+    known = hole if valid is None else hole & valid
+    terms = {
+        "color": color_loss(rgb, target, known),
+        "alpha": alpha_loss(alpha, hole),
+        "preserve": preserve_loss(rgb, base_rgb, hole),
+    }
+    if features is not None:
+        terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size, valid=valid)
+    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+    return total, {name: term.detach() for name, term in terms.items()}
+
+
+def dilate(mask: Tensor, side: int) -> Tensor:
+    """[B, H, W] bool, grown by a square of `side` pixels around each; ValueError where that is even."""
+    if side % 2 != 1:
+        raise ValueError(f"a dilation of {side} has no centre: give an odd number")
+    rows = F.max_pool2d(mask.float()[:, None], (side, 1), stride=1, padding=(side // 2, 0))  # a square is separable
+    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, side // 2))[:, 0] > 0
+
+
+def covered(mask: Tensor, features: Tensor) -> Tensor:
+    """[B, 1, h, w] the share, 0..1, that a mask [B, H, W] has of each cell of a feature map [B, C, h, w]."""
+    height, width = features.shape[-2:]
+    return F.adaptive_avg_pool2d(mask[:, None].to(features.dtype), (height, width))
+
+
+def _mean_of_images(values: Tensor, where: Tensor) -> Tensor:
+    """[] of values [B, H, W] that are 0 outside of a mask: the mean over each image's mask, then over the images."""
+    return (values.sum((1, 2)) / where.sum((1, 2)).clamp_min(1)).mean()
+
+
+def _resized(images: Tensor, size: int | None) -> Tensor:
+    """[B, H, W, 3] as [B, 3, h, w], the longer side `size`."""
+    images = images.movedim(-1, 1)
+    height, width = images.shape[-2:]
+    if size is None or size == max(height, width):
+        return images
+    scale = size / max(height, width)
+    small = max(1, round(height * scale)), max(1, round(width * scale))
+    return F.interpolate(images, small, mode="bilinear", antialias=True, align_corners=False)
+
+
+def _layer_terms(ours: Tensor, theirs: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The feature and the Gram term of one layer: [B, C, h, w] twice, and [B, 1, h, w] how much each cell counts."""
+    rms = (theirs.square().mean(dim=(1, 2, 3), keepdim=True) + TINY**2).sqrt()
+    ours, theirs = ours / rms, theirs / rms
+    area = weight.sum(dim=(1, 2, 3))  # [B], 0 without a hole
+    apart = (weight * (ours - theirs).abs()).mean(1).sum((1, 2)) / area.clamp_min(TINY)
+    textures = (_gram(ours, weight, area) - _gram(theirs, weight, area)).abs().mean((1, 2))
+    return apart.mean(), textures.mean()
+
+
+def _gram(features: Tensor, weight: Tensor, area: Tensor) -> Tensor:
+    """[B, C, C] how channels go together, averaged over cells by weight."""
+    together = (features * weight).flatten(2) @ features.flatten(2).mT
+    return together / area.clamp_min(TINY)[:, None, None]

@@ -1,0 +1,106 @@
+"""What one training step looks at: a view with holes, its truth, and crops of it small enough for a step."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.render.protocol import TILE
+from spackle.rendering import Rendering
+from spackle.residual.cues import CELL, Cues, hole_mask
+from spackle.residual.rim import Rim
+from spackle.residual.seeds import Seeds, make_seeds
+
+REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """A view of frozen Gaussians with holes in it, and what it ought to look like. Nothing here wants gradients."""
+
+    camera: Camera
+    base: Gaussians  # those that touch the tiles around the holes
+    rendering: Rendering  # of the whole base
+    seeds: Seeds  # a grid, one for each 2×2 pixels
+    cues: Cues  # likewise
+    rim: Rim  # likewise
+    target: Tensor  # [H, W, 3] sRGB
+    valid: Tensor  # [H, W] bool: where the target is known
+
+    @staticmethod
+    def of(
+        base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, target: Tensor, valid: Tensor
+    ) -> Sample:
+        """A whole view.
+
+        Args:
+            base: frozen Gaussians.
+            rendering: of them from `camera`.
+            camera: the view.
+            photo_camera: the camera of the photo that the base comes from.
+            target: [H, W, 3] sRGB, the truth.
+            valid: [H, W] bool, where it is known.
+        """
+        rendering, cues = rendering.detach(), Cues.of(rendering)
+        seeds = make_seeds(cues, camera, photo_camera)
+        rim = Rim.of(cues, seeds, camera, photo_camera)
+        return Sample(camera, base.detach(), rendering, seeds, cues, rim, target, valid)
+
+    @property
+    def hole(self) -> Tensor:
+        """[H, W] bool, Q of the paper's loss."""
+        return hole_mask(self.rendering.alpha)
+
+    @property
+    def tiles(self) -> Tensor:
+        """[ceil(H/16), ceil(W/16)] bool: the renderer's tiles that aux Gaussians can touch."""
+        near = max_pool2d(self.hole.float()[None, None], 2 * REACH_PX + 1, stride=1, padding=REACH_PX)
+        return max_pool2d(near, TILE, ceil_mode=True)[0, 0] > 0
+
+    def crop(self, row: int, column: int, height: int, width: int) -> Sample:
+        """The part of a view whose upper left cell is (row, column), height × width cells."""
+        top, left = CELL * row, CELL * column
+        pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
+        cells = (slice(row, row + height), slice(column, column + width))
+        K = self.camera.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        view = self.rendering
+        return Sample(
+            camera=dataclasses.replace(self.camera, K=K, width=CELL * width, height=CELL * height),
+            base=self.base,
+            rendering=Rendering(view.rgb[pixels].clone(), view.depth[pixels].clone(), view.alpha[pixels].clone()),
+            seeds=dataclasses.replace(
+                self.seeds,
+                uv=self.seeds.uv[cells] - torch.tensor([left, top]).to(self.seeds.uv),
+                inverse_depth=self.seeds.inverse_depth[cells].clone(),
+                slope=self.seeds.slope[cells].clone(),
+                rgb=self.seeds.rgb[cells].clone(),
+            ),
+            cues=Cues(*(getattr(self.cues, f.name)[cells].clone() for f in dataclasses.fields(Cues))),
+            rim=Rim(*(getattr(self.rim, f.name)[cells].clone() for f in dataclasses.fields(Rim))),
+            target=self.target[pixels].clone(),
+            valid=self.valid[pixels].clone(),
+        )._with_near_base()
+
+    def _with_near_base(self) -> Sample:
+        """Without the base Gaussians that touch no tile of interest."""
+        rows, columns = self.tiles.shape
+        uv, z = self.camera.project(self.base.means)
+        reach = 3.0 * self.base.scales.amax(-1) * max(self.camera.focal) / z.clamp_min(1e-6) + 1.0
+        near = torch.zeros(len(uv), dtype=torch.bool)
+        wide = max_pool2d(self.tiles.float()[None, None], 3, stride=1, padding=1)[0, 0] > 0
+        # Most blobs are smaller than a tile; one whose centre lies in a tile beside a wanted one may touch it.
+        x, y = (uv / TILE).floor().long().unbind(-1)
+        inside = (x >= -1) & (y >= -1) & (x <= columns) & (y <= rows) & (z > 0)
+        small = reach < TILE
+        at = wide[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]
+        near = inside & small & at
+        big = ~small & (z > 0) & (uv[:, 0] > -reach) & (uv[:, 1] > -reach)
+        big &= (uv[:, 0] < self.camera.width + reach) & (uv[:, 1] < self.camera.height + reach)
+        return dataclasses.replace(self, base=self.base.select(near | big))

@@ -1,0 +1,152 @@
+"""Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spackle.bases.depth_maps import DepthMap, load_depth
+from spackle.bases.rgbd import lift
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.image import film_to_pixels, load_photo
+from spackle.render import Renderer
+from spackle.training.composites import composite
+from spackle.training.reverse_view import reverse_view, seen_from, with_backing
+from spackle.training.sample import Sample
+from spackle.trajectory import TRAJECTORIES, DepthRange, trajectory
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
+FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
+FRAMES = 24  # of a path, one of which is the virtual camera
+
+
+class Source(Protocol):
+    """A supply of views."""
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages."""
+        ...
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        """A view, the same for the same state of `rng`.
+
+        Raises:
+            InputError: a file that cannot be used.
+        """
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Composites:
+    """`reverse_view` of photos without depth, cut-outs of some in front of others."""
+
+    photos: Sequence[Path]
+    renderer: Renderer
+    disparity: tuple[float, float]
+    name: str = "composites"
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
+        rgb, inverse_depth = composite(rng, self._photo, height, width)
+        focal = film_to_pixels(float(rng.uniform(*FOCAL_MM)), width, height)
+        depth = _exact(1.0 / inverse_depth)
+        return _reverse(rng, rgb, depth, Camera.from_focal(focal, width, height), self.disparity, self.renderer)
+
+    def _photo(self, rng: np.random.Generator) -> Tensor:
+        return load_photo(self.photos[int(rng.integers(len(self.photos)))]).rgb
+
+
+@dataclasses.dataclass(frozen=True)
+class RgbdFrames:
+    """`reverse_view` of photos that a depth camera took: NAME.color.jpg and NAME.depth.png."""
+
+    frames: Sequence[Path]  # the colour files
+    renderer: Renderer
+    disparity: tuple[float, float]
+    focal_px: float
+    unit_m: float  # of the depth map's numbers; 0 and 65535 are unknown
+    name: str = "rgbd"
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        color = self.frames[int(rng.integers(len(self.frames)))]
+        rgb = load_photo(color).rgb
+        stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
+        depth = dataclasses.replace(stored, depth=stored.depth * (self.unit_m / 0.001))  # it was read as millimetres
+        camera = Camera.from_focal(self.focal_px, rgb.shape[1], rgb.shape[0])
+        return _reverse(rng, rgb, depth, camera, self.disparity, self.renderer)
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoPairs:
+    """The left photo of a pair, and either `reverse_view` of it or the true right one."""
+
+    folders: Sequence[Path]  # each with a scene.json, see `load_depth`
+    renderer: Renderer
+    disparity: tuple[float, float]
+    reverse: bool
+    name: str = "stereo"
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        folder = self.folders[int(rng.integers(len(self.folders)))]
+        left, right, depth, camera, beside = load_pair(folder)
+        if self.reverse:
+            return _reverse(rng, left, depth, camera, self.disparity, self.renderer)
+        base = lift(left, depth, camera).gaussians
+        rendering = self.renderer.render(base, beside)
+        return Sample.of(base, rendering, beside, camera, right, torch.ones_like(rendering.alpha, dtype=torch.bool))
+
+
+def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
+    """A stereo pair: left and right photo [H, W, 3] sRGB, the left one's depth, both cameras.
+
+    Raises:
+        InputError: a file that is missing or broken.
+    """
+    try:
+        facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        names = [folder / facts[key] for key in ("left", "right", "disparity")]
+        focal, cx, cy, doffs, baseline = (float(facts[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder}: no stereo pair: needs a scene.json that names the photos and the lens") from error
+    left, right = (load_photo(name).rgb for name in names[:2])
+    if left.shape != right.shape:
+        raise InputError(f"{folder}: the two photos differ in size")
+    K = torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+    right_K, moved = K.clone(), torch.eye(4)
+    right_K[0, 2] += doffs
+    moved[0, 3] = -baseline
+    height, width = left.shape[:2]
+    cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
+    return left, right, load_depth(names[2]), *cameras
+
+
+def _reverse(
+    rng: np.random.Generator,
+    rgb: Tensor,
+    depth: DepthMap,
+    camera: Camera,
+    disparity: tuple[float, float],
+    renderer: Renderer,
+) -> Sample:
+    """`reverse_view` from a random frame of a random path."""
+    prediction = lift(rgb, depth, camera)
+    kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
+    reach = DepthRange.of(prediction.gaussians)
+    viewer = trajectory(kind, camera, float(rng.uniform(*disparity)), reach, FRAMES)[rng.integers(FRAMES)]
+    seen = seen_from(prediction.gaussians, viewer, renderer)
+    seen = with_backing(seen, prediction.gaussians.means[:, 2], camera.height, camera.width)
+    return reverse_view(prediction, seen, rgb, viewer, renderer)
+
+
+def _exact(depth: Tensor) -> DepthMap:
+    return DepthMap(depth, torch.ones_like(depth, dtype=torch.bool), None, None, "depth", Path("composite"))

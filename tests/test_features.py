@@ -1,0 +1,214 @@
+"""The feature networks: their shapes, their files, and that they stay as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import save_file
+from torch import Tensor
+
+from spackle.errors import InputError
+from spackle.training.features import ResNet50, SqueezeNet, load_features
+
+WITHOUT_HEAD = 25_557_032 - 2048 * 1000 - 1000  # parameters of torchvision's ResNet-50 less its classifier
+
+# Inputs, squeezed and expanded channels, as the paper of SqueezeNet has them in its table 1.
+FIRES = {
+    "fire2": (96, 16, 64),
+    "fire3": (128, 16, 64),
+    "fire4": (128, 32, 128),
+    "fire5": (256, 32, 128),
+    "fire6": (256, 48, 192),
+    "fire7": (384, 48, 192),
+    "fire8": (384, 64, 256),
+    "fire9": (512, 64, 256),
+}
+
+
+@pytest.fixture(scope="module")
+def resnet() -> dict[str, Tensor]:
+    """Random weights, with statistics that are not those of a fresh network, and a classifier."""
+    torch.manual_seed(0)
+    state = dict(ResNet50().state_dict())
+    for name, value in state.items():
+        if name.endswith("running_var"):
+            value.uniform_(0.5, 2)
+    return state | {"fc.weight": torch.randn(1000, 2048), "fc.bias": torch.randn(1000)}
+
+
+@pytest.fixture
+def squeezed() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    shapes = {"conv1": (96, 3, 7, 7), "conv10": (1000, 512, 1, 1)}
+    for fire, (inside, squeeze, expand) in FIRES.items():
+        shapes[f"{fire}/conv1x1_1"] = (squeeze, inside, 1, 1)
+        shapes[f"{fire}/conv1x1_2"] = (expand, squeeze, 1, 1)
+        shapes[f"{fire}/conv3x3_2"] = (expand, squeeze, 3, 3)
+    arrays = {}
+    for name, shape in shapes.items():
+        fan = np.prod(shape[1:])
+        arrays[f"{name}.w"] = (rng.standard_normal(shape) * np.sqrt(2 / fan)).astype(np.float32)
+        arrays[f"{name}.b"] = rng.standard_normal(shape[0]).astype(np.float32)
+    return arrays
+
+
+@pytest.fixture
+def squeezenet(squeezed: dict[str, np.ndarray], tmp_path: Path) -> SqueezeNet:
+    np.savez(tmp_path / "squeeze.npz", **squeezed)
+    network = load_features("squeezenet", tmp_path / "squeeze.npz")
+    assert isinstance(network, SqueezeNet)
+    return network
+
+
+def refusal(name: str, path: Path | None) -> str:
+    """The one line with which a file is refused."""
+    with pytest.raises(InputError) as caught:
+        load_features(name, path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert path is None or str(path) in message
+    return message
+
+
+def test_resnet_has_torchvisions_names_and_shapes() -> None:
+    network = ResNet50()
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
+    assert len(shapes) == 320 - 2  # torchvision's, less its classifier
+    literal = {
+        "conv1.weight": (64, 3, 7, 7),
+        "bn1.running_mean": (64,),
+        "bn1.num_batches_tracked": (),
+        "layer1.0.conv1.weight": (64, 64, 1, 1),
+        "layer1.0.downsample.0.weight": (256, 64, 1, 1),
+        "layer1.0.downsample.1.bias": (256,),
+        "layer2.0.conv2.weight": (128, 128, 3, 3),
+        "layer3.5.bn3.running_var": (1024,),
+        "layer4.0.downsample.0.weight": (2048, 1024, 1, 1),
+        "layer4.2.conv3.weight": (2048, 512, 1, 1),
+    }
+    assert {name: shapes[name] for name in literal} == literal
+    assert "layer1.1.downsample.0.weight" not in shapes
+
+
+@pytest.mark.parametrize("suffix", ["pth", "safetensors"])
+def test_resnet_reads_a_local_file(resnet: dict[str, Tensor], tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"resnet.{suffix}"
+    if suffix == "pth":
+        torch.save(resnet, path)
+    else:  # as older files are: without counters, and here without a classifier
+        save_file({name: v for name, v in resnet.items() if "num_batches" not in name and name[:2] != "fc"}, path)
+    network = load_features("resnet50", path)
+    assert isinstance(network, ResNet50)
+    assert all(torch.equal(value, resnet[name]) for name, value in network.state_dict().items())
+    images = torch.rand(1, 3, 64, 96)
+    maps = network(images)
+    assert [tuple(m.shape) for m in maps] == [(1, 256, 16, 24), (1, 512, 8, 12), (1, 1024, 4, 6), (1, 2048, 2, 3)]
+    assert all(m.min() >= 0 for m in maps)
+
+
+def test_resnet_normalises_as_torchvision_does(resnet: dict[str, Tensor]) -> None:
+    seen: list[Tensor] = []
+    network = ResNet50()
+    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
+    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
+
+
+def test_squeezenet_has_caffes_sizes(squeezenet: SqueezeNet) -> None:
+    shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
+    assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
+    assert [len(m) for m in squeezenet(torch.rand(2, 3, 35, 35))] == [2] * 4
+
+
+def test_squeezenet_convolves_bgr_less_the_mean(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
+    image = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(2))
+    bgr = 255 * image.numpy()[::-1] - np.array([104, 117, 123])[:, None, None]
+    window = bgr[:, 2 * 4 : 2 * 4 + 7, 2 * 9 : 2 * 9 + 7]
+    cell = np.maximum((squeezed["conv1.w"] * window).sum((1, 2, 3)) + squeezed["conv1.b"], 0)
+    np.testing.assert_allclose(squeezenet(image[None])[0][0, :, 4, 9].numpy(), cell, rtol=1e-4, atol=1e-3)
+
+
+def test_squeezenet_is_its_layers_in_order(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
+    tensors = {name: torch.from_numpy(value) for name, value in squeezed.items()}
+
+    def fire(name: str, x: Tensor) -> Tensor:
+        x = F.conv2d(x, tensors[f"{name}/conv1x1_1.w"], tensors[f"{name}/conv1x1_1.b"]).relu()
+        one = F.conv2d(x, tensors[f"{name}/conv1x1_2.w"], tensors[f"{name}/conv1x1_2.b"])
+        three = F.conv2d(x, tensors[f"{name}/conv3x3_2.w"], tensors[f"{name}/conv3x3_2.b"], padding=1)
+        return torch.cat([one, three], 1).relu()
+
+    maps = squeezenet(torch.rand(1, 3, 70, 52, generator=torch.Generator().manual_seed(4)))
+    x = maps[0]
+    stages = (["fire2", "fire3", "fire4"], ["fire5", "fire6", "fire7", "fire8"], ["fire9"])
+    for names, expected in zip(stages, maps[1:], strict=True):
+        x = F.max_pool2d(x, 3, 2, ceil_mode=True)
+        for name in names:
+            x = fire(name, x)
+        torch.testing.assert_close(x, expected)
+
+
+@pytest.mark.parametrize("kind", [ResNet50, SqueezeNet])
+def test_networks_are_frozen_and_pass_gradients_on(kind: type[ResNet50 | SqueezeNet]) -> None:
+    network = kind().train()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    images = torch.rand(2, 3, 48, 48, requires_grad=True)
+    torch.stack([m.mean() for m in network(images)]).sum().backward()
+    assert images.grad is not None
+    assert images.grad.any()
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+    assert not any(module.training for module in network.modules())
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+def test_none_is_no_network() -> None:
+    assert load_features("none", None) is None
+
+
+def test_a_network_wants_its_file(tmp_path: Path) -> None:
+    assert "name their file" in refusal("resnet50", None)
+    assert "no such feature network" in refusal("vgg", None)
+    assert "no such weight file" in refusal("squeezenet", tmp_path / "missing.npz")
+    assert "not a plain file" in refusal("squeezenet", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["resnet50", "squeezenet"])
+@pytest.mark.parametrize("content", [b"", b"no weights", b"PK\x03\x04 cut off", b"\x80\x02cos\nsystem\n."])
+def test_a_broken_file_is_refused(name: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "weights").write_bytes(content)
+    assert "give" in refusal(name, tmp_path / "weights")
+
+
+def test_resnet_refuses_what_is_not_its_weights(resnet: dict[str, Tensor], tmp_path: Path) -> None:
+    path = tmp_path / "other.pth"
+    small = {"conv1.weight": resnet["conv1.weight"]}
+    for content, words in [
+        (small, "'bn1.weight' is missing and"),
+        ({name: value for name, value in resnet.items() if name != "bn1.bias"}, "('bn1.bias' is missing)"),
+        ([1, 2], "more than named tensors"),
+        ({"epoch": 3, "model": small}, "more than named tensors"),
+        ({"conv1.weight": resnet["conv1.weight"].to_sparse()}, "more than named tensors"),
+    ]:
+        torch.save(content, path)
+        assert words in refusal("resnet50", path)
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    refusal("resnet50", tmp_path / "other.npz")
+
+
+def test_squeezenet_refuses_what_is_not_its_weights(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
+    path = tmp_path / "other.npz"
+    first = squeezed["conv1.w"]
+    for change, words in [
+        ({"conv1.w": first[:, :, :3, :3]}, "'conv1.w' is [96, 3, 3, 3] instead of [96, 3, 7, 7]"),
+        ({"conv1.w": np.full_like(first, np.nan)}, "'conv1.w' holds something else than finite numbers"),
+        ({"conv1.w": first.astype(np.int32)}, "'conv1.w' holds something else than finite numbers"),
+        ({"fire10/conv1x1_1.w": first}, "'fire10/conv1x1_1.w' is unknown"),
+        ({"conv10.b": first}, "'conv10.b' is [96, 3, 7, 7] instead of [1000]"),
+        ({"conv1.w": np.array([{}])}, "cannot be read as an .npz file"),  # an object: would have to be unpickled
+    ]:
+        np.savez(path, **(squeezed | change))
+        assert words in refusal("squeezenet", path)

@@ -1,0 +1,295 @@
+"""The four losses and the reported distances, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from spackle.training.distance import hole_distance, hole_psnr
+from spackle.training.losses import (
+    LossWeights,
+    alpha_loss,
+    color_loss,
+    covered,
+    dilate,
+    perceptual_loss,
+    preserve_loss,
+    total_loss,
+)
+
+RGB = torch.tensor([[[[0.1, 0.2, 0.3], [0.5, 0.5, 0.5]]]])  # [1, 1, 2, 3]: one row of two pixels
+TARGET = torch.tensor([[[[0.2, 0.2, 0.0], [1.0, 0.0, 0.9]]]])
+LEFT = torch.tensor([[[True, False]]])
+NO_HOLE = torch.zeros_like(LEFT)
+
+
+class Pixels:
+    """Features that are the image itself, once for each factor."""
+
+    name = "pixels"
+
+    def __init__(self, *factors: float) -> None:
+        self.factors = factors
+
+    def __call__(self, images: Tensor) -> list[Tensor]:
+        return [factor * images for factor in self.factors]
+
+
+class Convolved:
+    """Two smooth layers, the second at half the resolution, in double precision."""
+
+    name = "convolved"
+
+    def __init__(self) -> None:
+        generator = torch.Generator().manual_seed(0)
+        self.fine, self.coarse = (torch.randn(4, c, 3, 3, generator=generator, dtype=torch.double) for c in (3, 4))
+
+    def __call__(self, images: Tensor) -> list[Tensor]:
+        fine = F.conv2d(images, self.fine, padding=1).sigmoid()
+        return [fine, F.conv2d(fine, self.coarse, stride=2, padding=1).sigmoid()]
+
+
+class Never:
+    name = "never"
+
+    def __call__(self, images: Tensor) -> list[Tensor]:
+        raise AssertionError("there is nothing to look at")
+
+
+def pictures(*shape: int, seed: int = 1) -> tuple[Tensor, Tensor]:
+    values = torch.rand(2, *shape, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.double)
+    return values[0].requires_grad_(), values[1]
+
+
+def test_color_is_the_mean_difference_in_the_hole() -> None:
+    assert color_loss(RGB, TARGET, LEFT).item() == pytest.approx((0.1 + 0.0 + 0.3) / 3)
+    assert color_loss(RGB, TARGET, ~NO_HOLE).item() == pytest.approx((0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6)
+
+
+def test_color_counts_the_images_of_a_batch_alike() -> None:
+    hole = torch.tensor([[[True, False]], [[True, True]], [[False, False]]])
+    rgb, target = RGB.expand(3, -1, -1, -1), TARGET.expand(3, -1, -1, -1)
+    assert color_loss(rgb, target, hole).item() == pytest.approx((0.4 / 3 + 1.8 / 6 + 0) / 3)
+
+
+def test_alpha_counts_the_images_of_a_batch_alike() -> None:
+    alpha = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]])
+    hole = torch.tensor([[[True, False]], [[True, True]]])
+    assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
+
+
+def test_alpha_is_cross_entropy_towards_one() -> None:
+    alpha = torch.tensor([[[0.5, 0.25, 0.9]]])
+    hole = torch.tensor([[[True, True, False]]])
+    assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
+
+
+def test_alpha_of_nothing_is_clamped_and_a_faint_splat_still_has_a_gradient() -> None:
+    alpha = torch.tensor([[[0.0, 1 / 255]]], requires_grad=True)
+    loss = alpha_loss(alpha, ~NO_HOLE)
+    loss.backward()
+    assert loss.item() == pytest.approx((6.907755 + 5.541264) / 2)  # -log 0.001 and -log(1/255)
+    assert alpha.grad is not None
+    assert alpha.grad.flatten().tolist() == pytest.approx([0, -255 / 2])
+
+
+def test_preserve_is_the_mean_difference_outside_and_leaves_the_base_alone() -> None:
+    rgb, base = RGB.clone().requires_grad_(), TARGET.clone().requires_grad_()
+    loss = preserve_loss(rgb, base, LEFT)
+    loss.backward()
+    assert loss.item() == pytest.approx((0.5 + 0.5 + 0.4) / 3)
+    assert base.grad is None
+    assert rgb.grad is not None
+    assert rgb.grad.flatten().tolist() == pytest.approx([0, 0, 0, -1 / 3, 1 / 3, -1 / 3])
+
+
+def perceptual_example() -> tuple[Tensor, Tensor]:
+    """Mean square of the target 3/6; left pixels (0, 0.5, 0) and (1, 0, 0)."""
+    target = torch.tensor([[[[1.0, 0, 0], [0, 1, 1]]]])
+    return torch.tensor([[[[0.0, 0.5, 0], [9, 9, 9]]]]), target
+
+
+FEATURE_TERM = (1 + 0.5 + 0) / math.sqrt(0.5) / 3
+GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1) of the prediction, of nine
+
+
+def test_perceptual_is_a_feature_term_and_a_gram_term() -> None:
+    rgb, target = perceptual_example()
+    loss = perceptual_loss(Pixels(1), rgb, target, LEFT, dilation=1, size=None)
+    assert loss.item() == pytest.approx(FEATURE_TERM + GRAM_TERM, rel=1e-5)
+
+
+def test_perceptual_sums_layers_whatever_their_scale() -> None:
+    rgb, target = perceptual_example()
+    loss = perceptual_loss(Pixels(1, 100, 0.01), rgb, target, LEFT, dilation=1, size=None)
+    assert loss.item() == pytest.approx(3 * (FEATURE_TERM + GRAM_TERM), rel=1e-5)
+
+
+def test_perceptual_counts_the_images_of_a_batch_alike() -> None:
+    rgb, target = perceptual_example()
+    hole = torch.cat([LEFT, NO_HOLE])
+    loss = perceptual_loss(Pixels(1), rgb.repeat(2, 1, 1, 1), target.repeat(2, 1, 1, 1), hole, dilation=1, size=None)
+    assert loss.item() == pytest.approx((FEATURE_TERM + GRAM_TERM) / 2, rel=1e-5)
+
+
+def test_the_loss_of_a_batch_is_the_mean_of_its_parts() -> None:
+    rgb, target = pictures(4, 6, 7)
+    shares = torch.tensor([0, 0.1, 0.5, 1])[:, None, None]
+    hole = torch.rand(4, 6, 7, generator=torch.Generator().manual_seed(3)) < shares
+
+    def loss(part: slice) -> Tensor:
+        values = rgb[part], rgb[part, ..., 0], target[part], target[part].flip(1), hole[part]
+        return total_loss(*values, features=Convolved(), dilation=3, size=12)[0]
+
+    halves = (loss(slice(0, 2)) + loss(slice(2, 4))) / 2
+    assert loss(slice(None)).item() == pytest.approx(halves.item(), rel=1e-12)
+
+
+def test_perceptual_looks_only_near_the_hole() -> None:
+    rgb, target = pictures(1, 1, 7)
+    hole = torch.zeros(1, 1, 7, dtype=torch.bool)
+    hole[0, 0, 3] = True
+    perceptual_loss(Pixels(1), rgb, target, hole, dilation=5, size=None).backward()
+    assert rgb.grad is not None
+    assert rgb.grad[0, 0].abs().sum(-1).bool().tolist() == [False, True, True, True, True, True, False]
+
+
+def test_perceptual_of_equal_images_is_nothing() -> None:
+    _, target = pictures(1, 6, 8)
+    assert perceptual_loss(Convolved(), target, target, torch.ones(1, 6, 8, dtype=torch.bool)).item() == 0
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "seen"), [((6, 8), 4, (3, 4)), ((8, 6), 16, (16, 12)), ((6, 8), None, (6, 8))]
+)
+def test_perceptual_resizes_to_the_longer_side(shape: tuple[int, int], size: int | None, seen: tuple[int, int]) -> None:
+    sizes = []
+
+    class Watching(Pixels):
+        def __call__(self, images: Tensor) -> list[Tensor]:
+            sizes.append(tuple(images.shape))
+            return super().__call__(images)
+
+    rgb, target = pictures(1, *shape)
+    perceptual_loss(Watching(1), rgb, target, torch.ones(1, *shape, dtype=torch.bool), size=size)
+    assert sizes == [(1, 3, *seen)] * 2
+
+
+def test_dilation_is_a_square_and_wants_a_centre() -> None:
+    mask = torch.zeros(1, 5, 5, dtype=torch.bool)
+    mask[0, 1, 2] = True
+    assert dilate(mask, 3)[0].int().tolist() == [[0, 1, 1, 1, 0]] * 3 + [[0] * 5] * 2
+    with pytest.raises(ValueError, match="odd"):
+        dilate(mask, 4)
+
+
+def test_a_mask_is_pooled_by_area() -> None:
+    mask = torch.tensor([[[True, True, False, False], [True, False, False, False]]])
+    assert covered(mask, torch.zeros(1, 7, 1, 2)).flatten().tolist() == [0.75, 0]
+
+
+LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "color": color_loss,
+    "alpha": lambda rgb, _, hole: alpha_loss(rgb[..., 0], hole),
+    "preserve": preserve_loss,
+    "perceptual": lambda rgb, target, hole: perceptual_loss(Convolved(), rgb, target, hole, dilation=3, size=12),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_gradients_are_those_of_finite_differences(name: str) -> None:
+    rgb, target = pictures(2, 6, 7)
+    hole = torch.rand(2, 6, 7, generator=torch.Generator().manual_seed(3)) < 0.2
+    assert torch.autograd.gradcheck(lambda rgb: LOSSES[name](rgb, target, hole), (rgb,))
+
+
+def test_without_a_hole_there_is_nothing_to_fill_and_all_to_preserve() -> None:
+    rgb, target = RGB.clone().requires_grad_(), TARGET
+    alpha = torch.tensor([[[0.0, 0.5]]], requires_grad=True)
+    loss, terms = total_loss(rgb, alpha, target, RGB, NO_HOLE, features=Never())
+    loss.backward()
+    assert terms == {"color": 0, "alpha": 0, "preserve": 0, "perceptual": 0}
+    assert rgb.grad is not None
+    assert alpha.grad is not None
+    assert not rgb.grad.any()
+    assert not alpha.grad.any()
+
+
+def test_where_all_is_hole_nothing_is_preserved() -> None:
+    assert preserve_loss(RGB, TARGET, ~NO_HOLE).item() == 0
+
+
+@pytest.mark.parametrize("weights", [LossWeights(), LossWeights(1, 2, 3, 4)])
+def test_the_total_is_the_weighted_sum_of_its_terms(weights: LossWeights) -> None:
+    rgb, target = perceptual_example()
+    alpha, base = torch.tensor([[[0.5, 0.0]]]), torch.full_like(rgb, 8.75)
+    loss, terms = total_loss(rgb, alpha, target, base, LEFT, features=Pixels(1), weights=weights, dilation=1, size=None)
+    values = {"color": 0.5, "alpha": 0.693147, "perceptual": FEATURE_TERM + GRAM_TERM, "preserve": 0.25}
+    assert {name: term.item() for name, term in terms.items()} == pytest.approx(values, rel=1e-5)
+    assert loss.item() == pytest.approx(sum(getattr(weights, name) * value for name, value in values.items()), rel=1e-5)
+
+
+def test_the_weights_are_the_papers() -> None:
+    assert LossWeights() == LossWeights(color=10.0, alpha=0.5, perceptual=1.0, preserve=5.0)
+
+
+def test_without_features_there_is_no_perceptual_term() -> None:
+    _, terms = total_loss(RGB, torch.ones(1, 1, 2), TARGET, RGB, LEFT)
+    assert set(terms) == {"color", "alpha", "preserve"}
+
+
+def test_an_unknown_target_counts_for_opacity_alone() -> None:
+    rgb, target = perceptual_example()
+    rgb = rgb.requires_grad_()
+    target[0, 0, 1] = math.nan
+    alpha = torch.tensor([[[1.0, 0.5]]])
+    loss, terms = total_loss(rgb, alpha, target, RGB, ~NO_HOLE, features=Pixels(1), valid=LEFT, dilation=1, size=None)
+    loss.backward()
+    assert terms["color"].item() == pytest.approx(0.5)
+    assert terms["alpha"].item() == pytest.approx(0.693147 / 2)
+    assert 0 < terms["perceptual"].item() < math.inf
+    assert rgb.grad is not None
+    assert rgb.grad.isfinite().all()
+    assert rgb.grad[0, 0, 0].any()
+    assert not rgb.grad[0, 0, 1].any()
+
+
+def test_distance_is_between_directions_of_feature_vectors() -> None:
+    target = torch.tensor([[[1.0, 0, 0], [0, 0, 1]]])
+
+    def distance(*pixel: float) -> float:
+        return hole_distance(Pixels(1, 5), torch.tensor([[pixel, (9.0, 9, 9)]]), target, LEFT[0])
+
+    assert distance(0, 1, 0) == pytest.approx(2 * 2)  # a right angle in each of the two layers
+    assert distance(1, 1, 0) == pytest.approx(2 * (2 - math.sqrt(2)))
+    assert distance(0.5, 0, 0) == 0  # the same direction
+    assert distance(0, 0, 0) == pytest.approx(2 * 1)  # no direction at all
+
+
+def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
+    target = torch.zeros(2, 4, 3, dtype=torch.double)
+    target[..., 0], rgb = 1, torch.zeros(2, 4, 3, dtype=torch.double)
+    rgb[:, :2, 1], rgb[:, 2:, 0] = 1, 1  # wrong in the left half, right in the right one
+    hole = torch.tensor([[True, True, True, False], [True, False, False, False]])
+
+    class Halved(Pixels):
+        def __call__(self, images: Tensor) -> list[Tensor]:
+            return [F.max_pool2d(images, 2)]
+
+    # The left cell is hole by 3/4 and sees (1, 1, 0), of target and prediction; the right one, by 1/4, is right.
+    assert hole_distance(Halved(), rgb, target, hole) == pytest.approx(0.75 * (2 - math.sqrt(2)))
+
+
+def test_psnr_is_of_the_hole_alone() -> None:
+    assert hole_psnr(RGB[0], TARGET[0], LEFT[0]) == pytest.approx(-10 * math.log10((0.01 + 0.09) / 3))
+    assert hole_psnr(RGB[0], RGB[0], LEFT[0]) == math.inf
+
+
+def test_without_a_hole_there_is_no_distance() -> None:
+    assert math.isnan(hole_distance(Never(), RGB[0], TARGET[0], NO_HOLE[0]))
+    assert math.isnan(hole_psnr(RGB[0], TARGET[0], NO_HOLE[0]))
