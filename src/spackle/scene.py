@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Literal
 
 import torch
 
@@ -18,9 +19,11 @@ from spackle.image import Photo, load_photo
 from spackle.render import Renderer, get_renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet
+from spackle.residual.weights import shipped_network
 from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 PATH_FRAMES = 60
+Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +80,7 @@ def predict(
     base: Base | None = None,
     kind: TrajectoryKind = "rotate_forward",
     disparity: float = 0.3,
-    network: ResidualNet | None = None,
+    network: ResidualNet | Shipped | None = "shipped",
     renderer: Renderer | None = None,
 ) -> Scene:
     """A photo to a scene without holes along a camera path, by its depth or by a base that needs none.
@@ -88,7 +91,7 @@ def predict(
         base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`.
         kind: the path that the scene is completed for.
         disparity: how far the path goes, see `spackle.trajectory.max_offset`.
-        network: residual weights; without any the seeds alone fill the holes.
+        network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         renderer: the CPU's where None.
 
     Raises:
@@ -111,12 +114,13 @@ def complete(
     cameras: Sequence[Camera],
     *,
     exact: bool = False,
-    network: ResidualNet | None = None,
+    network: ResidualNet | Shipped | None = "shipped",
     renderer: Renderer | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
-    """One scene for all views of a path: see `Completer.complete_scene`."""
-    completer = Completer(prediction.gaussians, prediction.camera, renderer or get_renderer(), network)
+    """One scene for all views of a path: see `Completer.complete_scene`, and `predict` for the network."""
+    chosen = shipped_network() if network == "shipped" else network
+    completer = Completer(prediction.gaussians, prediction.camera, renderer or get_renderer(), chosen)
     aux = completer.complete_scene(cameras, exact=exact, progress=progress)
     return Scene(prediction.gaussians, aux, prediction.camera)
 

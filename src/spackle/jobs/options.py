@@ -51,8 +51,14 @@ class PredictOptions:
 
     @property
     def residual_weights(self) -> str:
-        """The weights that --residual means: a file, "seeds" or "none"."""
-        return self.residual or (str(SHIPPED) if SHIPPED.exists() else "seeds")
+        """The weights that --residual means: "shipped", a file, "seeds" or "none"."""
+        return self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
+
+    @property
+    def residual_file(self) -> Path | None:
+        """The file of those weights, where there is one."""
+        named = self.residual_weights
+        return SHIPPED if named == "shipped" else None if named in ("seeds", "none") else Path(named)
 
     @property
     def base_weights(self) -> Path | None:

@@ -23,13 +23,12 @@ def shared_digest(options: PredictOptions) -> str:
     Raises:
         InputError: one of the files is missing.
     """
-    residual = options.residual_weights
     files = {"calibration": options.calib, "camera file": options.cameras, "checkpoint": options.base_weights}
-    files["weights"] = None if residual in ("seeds", "none") else Path(residual)
+    files["weights"] = options.residual_file
     choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
     for name in IRRELEVANT:
         del choices[name]
-    choices |= {"spackle": spackle.__version__, "residual": residual}
+    choices |= {"spackle": spackle.__version__, "residual": options.residual_weights}
     return _digest([choices, *(file and fingerprint(file, kind) for kind, file in files.items())])
 
 

@@ -34,7 +34,7 @@ class Tools:
     renderer: Renderer
     base: Callable[[], Base] | None  # loads one that needs nothing beside the photo, the first time it is asked for
     network: ResidualNet | None
-    residual: str  # for the report: a path, "seeds" or "none"
+    residual: str  # for the report: "shipped", a path, "seeds" or "none"
     views: list[Camera] | None  # of --cameras
     digest: str  # of the options, and of the files that all photos share
 
@@ -46,15 +46,15 @@ def set_up(options: PredictOptions) -> Tools:
         InputError: an option that cannot be used.
     """
     check_options(options)
-    residual = options.residual_weights
-    network = None if residual in ("seeds", "none") else load_residual(residual)
+    file = options.residual_file
+    network = None if file is None else load_residual(file)
     views = load_cameras(options.cameras) if options.cameras else None
     if views and options.render and (problem := video_problem(views)):
         raise InputError(f"{options.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     digest = shared_digest(options)
     # SHARP takes seconds to load: not before a photo is known to need it.
     base = functools.cache(lambda: _load_sharp(options, digest)) if options.base == "sharp" else None
-    return Tools(get_renderer(options.device), base, network, residual, views, digest)
+    return Tools(get_renderer(options.device), base, network, options.residual_weights, views, digest)
 
 
 def _load_sharp(options: PredictOptions, digest: str) -> SharpBase:

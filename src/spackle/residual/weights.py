@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
@@ -13,6 +14,12 @@ from spackle.errors import InputError
 from spackle.residual.network import ResidualNet
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
+
+
+@functools.cache
+def shipped_network() -> ResidualNet | None:
+    """The network with the weights that come with the package; None where a build has none."""
+    return load_residual(SHIPPED) if SHIPPED.is_file() else None
 
 
 def load_residual(path: str | os.PathLike[str]) -> ResidualNet:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
@@ -10,13 +11,14 @@ from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import TILE
+from spackle.render.protocol import ALPHA_MIN, TILE
 from spackle.rendering import Rendering
 from spackle.residual.cues import CELL, Cues, hole_mask
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds, make_seeds
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
+FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which an opaque blob is no longer drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +94,12 @@ class Sample:
         """Without the base Gaussians that touch no tile of interest."""
         rows, columns = self.tiles.shape
         uv, z = self.camera.project(self.base.means)
-        reach = 3.0 * self.base.scales.amax(-1) * max(self.camera.focal) / z.clamp_min(1e-6) + 1.0
+        # No blob is drawn beyond FAINTEST deviations, and none stretched more than at the renderer's steepest ray.
+        middle, focal = self.camera.K[:2, 2], self.camera.K.diagonal()[:2]
+        size = torch.tensor([self.camera.width, self.camera.height]).to(middle)
+        steepest = float(((torch.maximum(middle.abs(), (size - middle).abs()) + 0.15 * size) / focal).max())
+        stretch = max(self.camera.focal) * math.hypot(1.0, steepest)
+        reach = FAINTEST * self.base.scales.amax(-1) * stretch / z.clamp_min(1e-6) + 1.0
         near = torch.zeros(len(uv), dtype=torch.bool)
         wide = max_pool2d(self.tiles.float()[None, None], 3, stride=1, padding=1)[0, 0] > 0
         # Most blobs are smaller than a tile; one whose centre lies in a tile beside a wanted one may touch it.

@@ -81,6 +81,7 @@ class RgbdFrames:
         color = self.frames[int(rng.integers(len(self.frames)))]
         rgb = load_photo(color).rgb
         stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
+        stored.check_shape(rgb.shape[0], rgb.shape[1], color)
         depth = dataclasses.replace(stored, depth=stored.depth * (self.unit_m / 0.001))  # it was read as millimetres
         camera = Camera.from_focal(self.focal_px, rgb.shape[1], rgb.shape[0])
         return _reverse(rng, rgb, depth, camera, self.disparity, self.renderer)
@@ -113,21 +114,24 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
         InputError: a file that is missing or broken.
     """
     try:
-        facts = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        scene = folder / "scene.json"
+        facts = json.loads(scene.read_text(encoding="utf-8"))
         names = [folder / facts[key] for key in ("left", "right", "disparity")]
         focal, cx, cy, doffs, baseline = (float(facts[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{folder}: no stereo pair: needs a scene.json that names the photos and the lens") from error
     left, right = (load_photo(name).rgb for name in names[:2])
     if left.shape != right.shape:
         raise InputError(f"{folder}: the two photos differ in size")
+    depth = load_depth(names[2], calib=scene)
+    depth.check_shape(left.shape[0], left.shape[1], names[0])
     K = torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
     right_K, moved = K.clone(), torch.eye(4)
     right_K[0, 2] += doffs
     moved[0, 3] = -baseline
     height, width = left.shape[:2]
     cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
-    return left, right, load_depth(names[2]), *cameras
+    return left, right, depth, *cameras
 
 
 def _reverse(
