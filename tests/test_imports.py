@@ -16,6 +16,7 @@ SOURCES = Path(spackle.__file__).parent
 FILES = sorted(SOURCES.rglob("*.py"))
 
 OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage", "yaml", "tensorboard")
+OPTIONAL += ("cv2", "fsspec")
 
 # Rooms in the order in which the data flows; each may import itself and what is named here.
 SHELL = {"", "__main__", "cli", "jobs", "scene"}  # thin, on top of everything; "" is the package itself
@@ -26,7 +27,7 @@ ALLOWED = {
     "residual": {"values", "render"},
     "formats": {"values"},
     "downloads": {"values"},
-    "pseudo": {"values", "render", "bases", "residual"},
+    "pseudo": {"values", "render", "bases", "residual", "formats"},
     "training": {"values", "render", "bases", "residual", "formats", "pseudo"},
     "evaluation": {"values", "render", "bases", "residual", "formats", "pseudo", "training"},
     "viewer": {"values", "formats", "residual"},

@@ -11,6 +11,7 @@ from typing import Any
 from spackle.errors import InputError
 from spackle.render import Renderer
 from spackle.training.cache import Cache, digest_of
+from spackle.training.pseudo_source import PseudoViews
 from spackle.training.recipe import DataRecipe, plain
 from spackle.training.sources import PHOTO_SUFFIXES, Composites, RgbdFrames, Source, StereoPairs
 
@@ -65,9 +66,15 @@ class Supply:
             scenes = [file.parent for file in _find(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
             for reverse, share, name in ((True, data.shares.stereo, "stereo"), (False, data.shares.pairs, "pairs")):
                 add(StereoPairs(scenes, renderer, data.disparity, reverse, name), share, data.stereo, scenes)
+        if data.pseudo is not None and data.shares.pseudo > 0:
+            views = PseudoViews(data.pseudo)
+            sources.append(views)
+            shares.append(data.shares.pseudo)
+            names.extend([views.name, views.digest])
         if not sources:
             raise InputError(
-                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a share above 0"
+                "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
+                "and a share above 0"
             )
         return Supply(data, sources, shares, names)
 
@@ -77,6 +84,8 @@ class Supply:
         facts: dict[str, Any] = plain(self.data)
         for name in ("photos", "stereo", "cache", "views", "validation_views"):
             facts.pop(name)
+        if facts.pop("pseudo") is None:  # recipes from before there was one keep their digits
+            facts["shares"].pop("pseudo")
         for camera in facts["rgbd"]:
             camera.pop("folder")
         return digest_of((facts, list(self.shares), list(self.names)))

@@ -30,6 +30,7 @@ class Shares:
     rgbd: float = 0.12
     stereo: float = 0.10  # reverse_view of the left photo
     pairs: float = 0.12  # the true right photo
+    pseudo: float = 1.0  # renderings with completed targets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,7 @@ class DataRecipe:
     photos: Path | None = None  # a folder, with its subfolders
     rgbd: tuple[RgbdFolder, ...] = ()
     stereo: Path | None = None  # a folder of scenes, each with a scene.json
+    pseudo: Path | None = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
     disparity: tuple[float, float] = (0.1, 0.6)  # how far the virtual camera goes
     views: int = 20_000  # the paper's: 1,000 photos, 20 views of each
@@ -119,6 +121,7 @@ FREE: tuple[str, ...] = (
     "run.min_delta",
 )
 FREE += ("run.device", "loss.features_path", "data.cache", "data.photos", "data.stereo", "data.rgbd")
+FREE += ("data.pseudo", "data.shares.pseudo")  # younger than some checkpoints
 
 
 def plain(value: Any) -> Any:

@@ -23,7 +23,7 @@ LEAST_SIDE = 36  # pixels that the feature networks need
 RANGES: dict[str, tuple[float, float]] = {
     "data.rgbd.focal_px": (1, 1e6),
     "data.rgbd.unit_m": (POSITIVE, 1e3),
-    **{f"data.shares.{name}": (0, 1e6) for name in ("composites", "rgbd", "stereo", "pairs")},
+    **{f"data.shares.{name}": (0, 1e6) for name in ("composites", "rgbd", "stereo", "pairs", "pseudo")},
     "data.disparity": (0, MAX_DISPARITY),
     "data.views": (1, 1e6),  # six digits name a sample's file
     "data.crops": (1, 100),

@@ -1,0 +1,132 @@
+"""The choices of `spackle dataset build`, which of them cannot be, and what they are called in the manifest."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import spackle
+from spackle.bases.sharp import Precision
+from spackle.downloads import read_record
+from spackle.errors import InputError
+from spackle.jobs.inputs import find_depth
+from spackle.jobs.options import PredictOptions, check_options
+from spackle.jobs.request import fingerprint
+from spackle.pseudo.build import ViewChoices
+from spackle.pseudo.inpainters import Inpainter
+from spackle.pseudo.photos import PhotoFile
+from spackle.trajectory import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+
+MAX_VIEWS = 100  # two digits name a view
+MAX_PHOTOS = 1_000_000  # six digits name a photo
+MAX_THREADS = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetOptions:
+    """The choices of `spackle dataset build`."""
+
+    base: PredictOptions  # its name and what it needs
+    choices: ViewChoices
+    images: Path | None = None  # where the photos of a COCO JSON lie
+    sample: int | None = None  # so many photos; all where None
+    inpainter: str = "geometry"
+    workers: int = 1  # processes
+    threads: int = 2  # of each
+    shard_size: int = 50  # photos
+
+
+def base_options(
+    base: str, depth: Path | None, checkpoint: Path | None, precision: Precision, device: str
+) -> PredictOptions:
+    """What a prediction takes, without any completion."""
+    return PredictOptions(
+        base=base, depth=depth, checkpoint=checkpoint, precision=precision, device=device, residual="none"
+    )
+
+
+def view_choices(seed: int, views: int, trajectory: str | None, disparity: tuple[float, float]) -> ViewChoices:
+    """Which views; a trajectory by its name in `TRAJECTORIES`."""
+    kinds: dict[str, TrajectoryKind] = {name: name for name in TRAJECTORIES}
+    return ViewChoices(seed, views, None if trajectory is None else kinds[trajectory], disparity)
+
+
+def check_dataset_options(options: DatasetOptions) -> None:
+    """InputError for an option that cannot be used, whatever the photos."""
+    check_options(options.base)
+    choices = options.choices
+    low, high = choices.disparity
+    if not 0 < low <= high <= MAX_DISPARITY:
+        raise InputError(
+            f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
+        )
+    for name, value, least, most in (
+        ("--views", choices.views, 2, MAX_VIEWS),
+        ("--seed", choices.seed, 0, 2**31 - 1),
+        ("--sample", 1 if options.sample is None else options.sample, 1, MAX_PHOTOS),
+        ("--workers", options.workers, 1, MAX_THREADS),
+        ("--threads", options.threads, 1, MAX_THREADS),
+        ("--shard-size", options.shard_size, 1, MAX_PHOTOS),
+    ):
+        if not least <= value <= most:
+            raise InputError(f"{name} must be between {least} and {most}, got {value}")
+
+
+def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter) -> dict[str, Any]:
+    """Everything that decides what the shards hold, ready for JSON; nothing of where files lie.
+
+    Threads are part of it: SHARP's last bits depend on their number. Workers are not.
+    """
+    base = options.base
+    inputs = hashlib.sha256(json.dumps([_inputs(photo, base) for photo in photos]).encode()).hexdigest()
+    choices = dataclasses.asdict(options.choices)
+    return {
+        "spackle": spackle.__version__,
+        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
+        "base": {
+            "name": base.base,
+            "weights": None if base.base_weights is None else weights_digest(base.base_weights),
+            "precision": base.precision,
+            "device": base.device,
+        },
+        "views": choices | {"disparity": list(options.choices.disparity)},
+        "inpainter": {"name": inpainter.name, "version": inpainter.version},
+        "shard_size": options.shard_size,
+        "threads": options.threads,
+    }
+
+
+def depth_of(photo: PhotoFile, depth: Path) -> Path:
+    """The depth map of a photo: in a folder, below the same subfolder as the photo.
+
+    Raises:
+        InputError: there is none.
+    """
+    beside = depth / Path(photo.name).parent
+    return find_depth(beside if depth.is_dir() and beside.is_dir() else depth, photo.path)
+
+
+def weights_digest(path: Path) -> str:
+    """SHA-256 of a checkpoint: the recorded one of a download, else of the file."""
+    record = read_record(path)
+    if record is not None:
+        return record.sha256
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 22):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _inputs(photo: PhotoFile, base: PredictOptions) -> list[str]:
+    """Name and content of a photo and of its depth map."""
+    if base.depth is None:
+        return [photo.name, photo.sha256]
+    try:
+        return [photo.name, photo.sha256, fingerprint(depth_of(photo, base.depth), "depth map")]
+    except InputError:  # its turn will come
+        return [photo.name, photo.sha256, "none"]

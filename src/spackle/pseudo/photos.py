@@ -1,0 +1,177 @@
+"""Which photos a dataset is made of: those of a folder, or those that COCO's annotations name."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from spackle.errors import InputError
+from spackle.image import check_file, load_photo
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff", ".gif", ".bmp")
+MIN_SIDE = 32  # pixels: a smaller picture has no depth that anybody could see
+MAX_JSON_BYTES = 1 << 30
+
+Step = Callable[[int, int], None]  # (done, of how many)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoFile:
+    """A photo, and what tells it from all others."""
+
+    path: Path
+    name: str  # relative to its folder, with slashes
+    sha256: str  # of the file
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """The files that a source names, in the order of their names."""
+
+    root: Path
+    names: Sequence[str]
+    missing: Sequence[str] = ()  # named, but not there
+
+
+def find_photos(source: Path, folder: Path | None = None) -> Found:
+    """The photos below a folder, or those that a COCO annotation file names.
+
+    Args:
+        source: a folder, searched with its subfolders; or a JSON file `{"images": [{"file_name": …}, …]}`.
+        folder: where the files of a JSON lie; beside it where None.
+
+    Raises:
+        InputError: nothing there, no photo, or no such JSON.
+    """
+    if not os.path.isdir(source):
+        return _named_by_coco(source, folder)
+    if folder is not None:
+        raise InputError(f"{folder}: only a COCO JSON needs a folder beside it, and {source} is a folder itself")
+    names = []
+    for place, folders, files in os.walk(source):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for file in files:
+            if file.lower().endswith(SUFFIXES) and not file.startswith("."):
+                names.append((Path(place) / file).relative_to(source).as_posix())
+    if not names:
+        raise InputError(f"{source}: no photos in this folder (looked for {', '.join(SUFFIXES)})")
+    return Found(source, sorted(names))
+
+
+def _named_by_coco(source: Path, folder: Path | None) -> Found:
+    if check_file(source, "folder of photos or COCO JSON") > MAX_JSON_BYTES:
+        raise InputError(f'{source}: too long for COCO annotations (at most 1 GiB): take out what is not "images"')
+    try:
+        content: Any = json.loads(source.read_text(encoding="utf-8"))
+        names = [image["file_name"] for image in content["images"]]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f'{source}: neither a folder nor COCO annotations: needs {{"images": [{{"file_name": …}}, …]}}'
+        ) from error
+    if not names:
+        raise InputError(f"{source}: names no images")
+    root = source.parent if folder is None else folder
+    if not os.path.isdir(root):
+        raise InputError(f"{root}: no such folder, and the photos of {source.name} should be in it")
+    unique = sorted({_inside(name, source) for name in names})
+    there = [name for name in unique if os.path.isfile(root / name)]
+    if not there:
+        raise InputError(f"{source}: none of its {len(unique)} images is in {root}: name their folder")
+    present = set(there)
+    return Found(root, there, [name for name in unique if name not in present])
+
+
+def _inside(name: object, source: Path) -> str:
+    """A file name that stays in its folder."""
+    if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
+        raise InputError(f"{source}: {str(name)[:60]!r} is no file name of an image")
+    return Path(name).as_posix()
+
+
+def choose(found: Found, count: int | None, seed: int, warn: Callable[[str], None], progress: Step) -> list[PhotoFile]:
+    """The photos of a dataset, in the order of their names: all, or a random subset.
+
+    The subset depends on the names, the contents and the seed, not on the order in which a file system lists them.
+    What cannot be read, is too small, or repeats another photo byte for byte is passed over, and in a
+    subset the next one takes its place.
+
+    Args:
+        found: see `find_photos`.
+        count: how many; all where None.
+        seed: of the subset.
+        warn: told of each photo that is passed over, and why.
+        progress: called with (photos chosen, of how many).
+
+    Raises:
+        InputError: fewer good photos than `count`, or none.
+    """
+    repeated = _repeated(found, warn)
+    names: Iterable[str] = (name for name in found.names if name not in repeated)
+    wanted = len(found.names) - len(repeated) if count is None else count
+    if count is not None:
+        names = sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
+    chosen: list[PhotoFile] = []
+    for name in names:
+        if len(chosen) == wanted:
+            break
+        try:
+            chosen.append(_checked(found.root / name, name))
+        except InputError as error:
+            warn(f"passed over: {error}")
+        progress(len(chosen), wanted)
+    if not chosen:
+        raise InputError(f"{found.root}: none of {len(found.names)} photos can be used (the lines above say why)")
+    if count is not None and len(chosen) < count:
+        raise InputError(f"{found.root}: {len(chosen)} photos can be used, and --sample asks for {count}")
+    return sorted(chosen, key=lambda photo: photo.name)
+
+
+def _checked(path: Path, name: str) -> PhotoFile:
+    """A photo that can be read from its first to its last pixel."""
+    photo = load_photo(path)
+    if min(photo.width, photo.height) < MIN_SIDE:
+        raise InputError(f"{path}: {photo.width}×{photo.height} pixels are too few (at least {MIN_SIDE} each way)")
+    return PhotoFile(path, name, _sha256(path))
+
+
+def _repeated(found: Found, warn: Callable[[str], None]) -> set[str]:
+    """Names whose file holds the same bytes as one of an earlier name. Only files of one size are read."""
+    by_size: dict[int, list[str]] = defaultdict(list)
+    for name in found.names:
+        by_size[_size(found.root / name)].append(name)
+    repeated: set[str] = set()
+    for size, names in by_size.items():
+        if len(names) == 1 or size <= 0:  # empty ones are told as such
+            continue
+        first: dict[str, str] = {}
+        for name in names:
+            digest = _sha256(found.root / name)
+            if digest and first.setdefault(digest, name) != name:
+                warn(f"passed over: {found.root / name}: the same photo as {first[digest]}")
+                repeated.add(name)
+    return repeated
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
+
+
+def _sha256(path: Path) -> str:
+    """Hexadecimal digest of a file; "" of one that cannot be read, which is found out later."""
+    try:
+        with open(path, "rb") as file:
+            digest = hashlib.sha256()
+            while block := file.read(1 << 20):
+                digest.update(block)
+            return digest.hexdigest()
+    except OSError:
+        return ""

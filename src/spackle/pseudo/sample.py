@@ -1,0 +1,183 @@
+"""A photo with its views as the files of a shard, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats.cameras import checked_camera
+from spackle.gaussians import Gaussians
+from spackle.pseudo.archive import unpack
+from spackle.pseudo.encode import (
+    decode_alpha,
+    decode_depth,
+    decode_gaussians,
+    decode_mask,
+    decode_rgb,
+    encode_alpha,
+    encode_depth,
+    encode_gaussians,
+    encode_mask,
+    encode_rgb,
+)  # fmt: skip
+from spackle.pseudo.views import PathChoice, ViewStack
+from spackle.rendering import Rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class PseudoSample:
+    """One view of a photo: what the paper's training sample holds (appendix, "Dataset")."""
+
+    key: str  # of the photo in its dataset
+    index: int  # of the view; 0 is the photo's own
+    kind: str  # of the camera path
+    photo: Tensor  # [h, w, 3] sRGB at its working size
+    photo_camera: Camera
+    camera: Camera  # the view's
+    rendering: Rendering  # of the base: rgb [H, W, 3], depth [H, W], alpha [H, W]
+    mask: Tensor  # [H, W] bool: uncovered
+    target: Tensor  # [H, W, 3] sRGB, completed
+    base: Gaussians | None  # where the reader was asked for it
+
+
+def to_members(
+    key: str,
+    photo: Tensor,
+    stack: ViewStack,
+    targets: Tensor,
+    threshold: float,
+    path: PathChoice,
+    facts: dict[str, Any],
+) -> list[tuple[str, bytes]]:
+    """The files of a photo in their order: KEY.json, KEY.photo.png, KEY.base.safetensors, then five a view.
+
+    Args:
+        key: their common beginning, without a dot.
+        photo: [h, w, 3] sRGB at its working size.
+        stack: V views of it.
+        targets: [V, H, W, 3] sRGB.
+        threshold: of the mask.
+        path: where the camera goes.
+        facts: more for the JSON.
+    """
+    files: list[tuple[str, bytes]] = []
+    views: list[dict[str, Any]] = []
+    for index, camera in enumerate(stack.cameras):
+        rgb, depth, alpha, mask = (field[index] for field in (stack.rgb, stack.depth, stack.alpha, stack.mask))
+        depth_png, depth_range = encode_depth(depth, alpha)
+        kinds = {
+            "rgb": encode_rgb(rgb),
+            "target": encode_rgb(targets[index]),
+            "mask": encode_mask(mask),
+            "alpha": encode_alpha(alpha, mask, threshold),
+            "depth": depth_png,
+        }
+        files += [(view_file(key, index, kind), data) for kind, data in kinds.items()]
+        views.append(_camera_facts(camera) | {"depth_range": list(depth_range), "hole": float(mask.double().mean())})
+    common = {
+        "key": key,
+        "trajectory": {"kind": path.kind, "disparity": path.disparity},
+        "threshold": threshold,
+        "photo_camera": _camera_facts(stack.photo_camera),
+        "views": views,
+    }
+    text = json.dumps(facts | common, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    first = (f"{key}.json", text.encode()), (f"{key}.photo.png", encode_rgb(photo))
+    return [*first, (f"{key}.base.safetensors", encode_gaussians(stack.base)), *files]
+
+
+def view_file(key: str, index: int, kind: str) -> str:
+    """What a picture of a view is called."""
+    return f"{key}.{index:02d}.{kind}.png"
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoGroup:
+    """The files of a photo, not decoded yet."""
+
+    key: str
+    files: Mapping[str, bytes]
+    facts: Mapping[str, Any]  # KEY.json
+    where: str  # for messages
+
+    @staticmethod
+    def of(key: str, data: bytes, where: str) -> PhotoGroup:
+        """Take apart the stretch of a shard that belongs to a photo; InputError where that cannot be."""
+        try:
+            files = unpack(data)
+            facts = json.loads(files[f"{key}.json"])
+            if not isinstance(facts["views"], list):
+                raise TypeError("its views are no list")
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{where}: not a photo of a dataset, or damaged: {error}") from error
+        return PhotoGroup(key, files, facts, where)
+
+    @property
+    def views(self) -> int:
+        """How many there are."""
+        return len(self.facts["views"])
+
+    def view(self, index: int, *, with_base: bool = False) -> PseudoSample:
+        """Decode one view.
+
+        Raises:
+            InputError: a file that is missing or damaged.
+        """
+        try:
+            facts = self.facts["views"][index]
+            rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
+            depth = decode_depth(self._file(index, "depth"), *facts["depth_range"])
+            rendering = Rendering(rgb, depth, decode_alpha(self._file(index, "alpha")))
+            return PseudoSample(
+                key=self.key,
+                index=index,
+                kind=self.facts["trajectory"]["kind"],
+                photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
+                photo_camera=_camera(self.facts["photo_camera"], self.where),
+                camera=_camera(facts, self.where),
+                rendering=rendering,
+                mask=decode_mask(self._file(index, "mask")),
+                target=target,
+                base=self.base() if with_base else None,
+            )
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise InputError(f"{self.where}: view {index} cannot be read: {error}") from error
+
+    def only(self, index: int, *, with_base: bool = False) -> PhotoGroup:
+        """No more than one view needs: so the others' bytes are free again."""
+        kept = (f"{self.key}.{index:02d}.", f"{self.key}.photo.", *([f"{self.key}.base."] if with_base else []))
+        return dataclasses.replace(self, files={n: data for n, data in self.files.items() if n.startswith(kept)})
+
+    def base(self) -> Gaussians:
+        """The photo's Gaussians; ValueError or KeyError where they cannot be read."""
+        return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
+
+    def _file(self, index: int, kind: str) -> bytes:
+        return self.files[view_file(self.key, index, kind)]
+
+
+def _camera_facts(camera: Camera) -> dict[str, Any]:
+    return {
+        "K": camera.K.tolist(),
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "position": camera.position.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _camera(facts: Mapping[str, Any], where: str) -> Camera:
+    K, matrix = (torch.tensor(facts[name], dtype=torch.float64) for name in ("K", "world_to_camera"))
+    return checked_camera(K, matrix, facts["width"], facts["height"], where)
+
+
+def holes_of(facts: Mapping[str, Any]) -> Sequence[float]:
+    """HAR of each view, as the JSON has it."""
+    return [float(view["hole"]) for view in facts["views"]]

@@ -1,0 +1,121 @@
+"""The views that a dataset has of a photo: a controlled camera path, drawn with the base (paper, "Dataset")."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer
+from spackle.residual import hole_mask
+from spackle.residual.cues import MASK_THRESHOLD
+from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+
+VIEWS = 20  # the paper's, the photo's own view among them
+DISPARITY = (0.1, 0.6)  # from a small move to the widest in the paper's figures
+APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
+SPARE = 6  # frames of a path that may coincide with others
+
+
+@dataclasses.dataclass(frozen=True)
+class PathChoice:
+    """Where the camera goes."""
+
+    kind: TrajectoryKind
+    disparity: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewStack:
+    """A photo's Gaussians and what V cameras see of them; the first camera is the photo's."""
+
+    base: Gaussians
+    photo_camera: Camera
+    cameras: Sequence[Camera]
+    rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
+    depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
+    alpha: Tensor  # [V, H, W] opacity
+    mask: Tensor  # [V, H, W] bool: uncovered
+
+    @property
+    def holes(self) -> list[float]:
+        """HAR of each view (paper, section 4.2)."""
+        return [float(mask.double().mean()) for mask in self.mask]
+
+
+def draw_path(
+    seed: int, photo_sha256: str, kind: TrajectoryKind | None = None, disparity: tuple[float, float] = DISPARITY
+) -> PathChoice:
+    """The path of a photo: the same for the same seed and photo, whatever else the dataset holds.
+
+    Args:
+        seed: the dataset's.
+        photo_sha256: of the photo's file.
+        kind: this one; drawn where None.
+        disparity: between these two, see `spackle.trajectory.max_offset`.
+    """
+    digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
+    rng = np.random.default_rng(list(digest))
+    drawn = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
+    return PathChoice(kind or drawn, float(rng.uniform(*disparity)))
+
+
+def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int = VIEWS) -> list[Camera]:
+    """The photo's own view, and then the others along the path, no two alike.
+
+    Paths pass through the photo's eye, and closed ones end where they begin; such frames are left out, and
+    the path is drawn a little finer instead.
+
+    Args:
+        path: its kind and width.
+        camera: the photo's, of the views' size.
+        depth_range: of the base.
+        views: how many in all.
+
+    Raises:
+        ValueError: a path that cannot be, or one on which the camera does not move.
+    """
+    cameras: list[Camera] = []
+    least = APART * max_offset(camera, path.disparity, depth_range)
+    for frames in range(views - 1, views + SPARE):
+        found = trajectory(path.kind, camera, path.disparity, depth_range, frames)
+        cameras = _apart([camera, *found], least) if least > 0 else []
+        if len(cameras) >= views:
+            break
+    if len(cameras) < views:
+        raise ValueError(f"{path.kind} at a disparity of {path.disparity:g} has no {views} different views")
+    while len(cameras) > views:  # the least interesting one
+        reach = [float((view.position.double() - camera.position.double()).norm()) for view in cameras[1:]]
+        del cameras[1 + int(np.argmin(reach))]
+    return cameras
+
+
+def _apart(cameras: Sequence[Camera], least: float) -> list[Camera]:
+    """Those whose eye is farther than `least` from all before them."""
+    eyes = torch.stack([view.position.double() for view in cameras])
+    kept: list[int] = []
+    for index, eye in enumerate(eyes):
+        if all(float((eye - eyes[other]).norm()) > least for other in kept):
+            kept.append(index)
+    return [cameras[index] for index in kept]
+
+
+@torch.no_grad()
+def render_views(
+    base: Gaussians,
+    photo_camera: Camera,
+    cameras: Sequence[Camera],
+    renderer: Renderer,
+    threshold: float = MASK_THRESHOLD,
+) -> ViewStack:
+    """Draw the base from each camera; a pixel with less opacity than `threshold` is uncovered (eq. 3)."""
+    drawn = [renderer.render(base, camera) for camera in cameras]
+    alpha = torch.stack([view.alpha for view in drawn])
+    rgb, depth = torch.stack([view.rgb for view in drawn]), torch.stack([view.depth for view in drawn])
+    return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha, threshold))
