@@ -1,4 +1,4 @@
-"""Complete the right view of stereo pairs and hold it against the true right photo, as a Markdown table.
+"""Complete the right view of stereo pairs by the seeds alone, and compare with the true right photo: a Markdown table.
 
     python benchmarks/stereo_pairs.py FOLDER
 
@@ -56,11 +56,11 @@ def measure(folder: Path) -> list[float]:
     left, right = (load_photo(folder / facts[side]).rgb for side in ("left", "right"))
     camera, beside = cameras(facts, left.shape[1], left.shape[0])
     prediction, renderer = lift(left, load_depth(folder / facts["disparity"]), camera), get_renderer()
-    scene = complete(prediction, [beside], exact=True)
+    scene = complete(prediction, [beside], exact=True, network=None)
     before, after = renderer.render(scene.base, beside), scene.render(beside)
     hole, photo = hole_mask(before.alpha), renderer.render(scene.base, camera).rgb
     path = scene_path(scene.base, camera, "swipe", DISPARITY)
-    swipe = complete(prediction, path)
+    swipe = complete(prediction, path, network=None)
     ends = [(renderer.render(scene.base, end).alpha, swipe.render(end).alpha) for end in (path[0], path[-1])]
     har = hole_area_ratio(before.alpha)
     return [

@@ -94,8 +94,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert report["aux"]["gaussians"] == merged - base > 0
     assert report["aux"]["share"] == pytest.approx((merged - base) / base)
     assert report["merged"] == merged
-    assert report["residual"]["weights"] == "seeds"
-    assert "no trained weights" in report["residual"]["note"]
+    assert report["residual"] == {"weights": "shipped"}
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.3)
     assert report["views"] == "rotate_forward"
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
@@ -268,7 +267,21 @@ def test_residual_none_is_the_base_alone(tmp_path: Path) -> None:
 
 def test_an_empty_residual_is_none_given(tmp_path: Path) -> None:
     predict(*write_pair(tmp_path), tmp_path, "--residual", "")
-    assert report_of(tmp_path / "photo")["residual"]["weights"] == "seeds"
+    assert report_of(tmp_path / "photo")["residual"]["weights"] == "shipped"
+
+
+def test_the_seeds_alone_can_be_had_and_fill_the_holes_where_no_weights_came_with_the_package(
+    tmp_path: Path, plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict(*write_pair(tmp_path), tmp_path / "asked", "--residual", "seeds")
+    report = report_of(tmp_path / "asked" / "photo")
+    assert report["residual"]["weights"] == "seeds"
+    assert "no trained weights" in report["residual"]["note"]
+    monkeypatch.setattr("spackle.jobs.options.SHIPPED", tmp_path / "none.safetensors")
+    predict(*write_pair(tmp_path), tmp_path / "without")
+    seeds, without = (tmp_path / name / "photo" / "scene.ply" for name in ("asked", "without"))
+    assert seeds.read_bytes() == without.read_bytes()
+    assert seeds.read_bytes() != (plain[0] / "scene.ply").read_bytes()
 
 
 def test_residual_weights_are_loaded_and_named(tmp_path: Path, plain: tuple[Path, Run]) -> None:

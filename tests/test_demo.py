@@ -17,11 +17,10 @@ from PIL import Image
 
 from spackle import cli
 from spackle.image import read_image
-from spackle.residual.weights import SHIPPED
 
 SIZE = (741, 500)  # of the photo
 INPAINTING = "2D inpainting (biharmonic)"
-SPACKLE = "Spackle (seeds)"
+SPACKLE, TRAINED = "Spackle (seeds)", "Spackle (trained)"
 
 
 def run(folder: Path) -> tuple[int, str]:
@@ -81,6 +80,13 @@ def test_it_fills_the_hole_better_than_2d_inpainting(report: dict[str, Any]) -> 
     assert hole["base"] < hole[SPACKLE]
 
 
+def test_the_trained_weights_are_better_than_the_seeds(report: dict[str, Any]) -> None:
+    scores = report["right_camera"]
+    assert scores["psnr"][TRAINED]["in_hole"] > scores["psnr"][SPACKLE]["in_hole"]
+    assert scores["ssim"][TRAINED] > scores["ssim"][SPACKLE] + 0.01
+    assert scores["psnr"]["base"]["outside"] - scores["psnr"][TRAINED]["outside"] <= 0.05
+
+
 def test_it_does_not_harm_what_was_seen(report: dict[str, Any]) -> None:
     outside = {name: score["outside"] for name, score in report["right_camera"]["psnr"].items()}
     assert outside["base"] - outside[SPACKLE] <= 0.1
@@ -103,7 +109,7 @@ def test_it_prints_the_numbers_of_its_report(demo: tuple[Path, str], report: dic
         assert f"{report['right_camera']['ssim'][name]:.3f}" in row
     assert f"{report['aux_gaussians']:,} aux Gaussians" in said
     assert str(demo[0] / "comparison.png") in said.replace("\n", "")
-    assert report["residual"]["weights"] == ("shipped" if SHIPPED.is_file() else "seeds")
+    assert report["residual"]["weights"] == "shipped"
 
 
 @pytest.mark.parametrize("kind", ["file", "file/deep", "folder"])

@@ -107,8 +107,9 @@ class Completer:
     ) -> tuple[Gaussians, Rendering]:
         """New aux Gaussians for a view, and the view with them."""
         added = [Gaussians.empty()]
-        for _ in range(PASSES):
-            new = self._propose(rendering, camera)
+        for turn in range(PASSES):
+            # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
+            new = self._propose(rendering, camera, self.network if turn == 0 else None)
             if not len(new):
                 break
             added.append(push_behind(new, camera.position, shields))
@@ -117,20 +118,19 @@ class Completer:
                 break
         return Gaussians.cat(added), rendering
 
-    def _propose(self, rendering: Rendering, camera: Camera) -> Gaussians:
+    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None) -> Gaussians:
         """One Gaussian for each masked cell of a rendering."""
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return Gaussians.empty()
         seeds = make_seeds(cues, camera, self.photo_camera)
-        return compose(seeds.select(cues.mask), self._deltas(cues, seeds, camera), camera)
+        deltas = None if network is None else self._deltas(network, cues, seeds, camera)
+        return compose(seeds.select(cues.mask), deltas, camera)
 
-    def _deltas(self, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor | None:
-        """[n, 14] for the masked cells, or None without a network."""
-        if self.network is None:
-            return None
+    def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
+        """[n, 14] for the masked cells."""
         rim = Rim.of(cues, seeds, camera, self.photo_camera)
-        field: Tensor = self.network(network_input(cues, seeds, rim))
+        field: Tensor = network(network_input(cues, seeds, rim))
         return field[0].permute(1, 2, 0)[cues.mask]
 
 
