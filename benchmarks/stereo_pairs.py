@@ -9,7 +9,6 @@ for the 2D inpainting beside it: pip install opencv-python-headless.
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -18,29 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle import Camera, complete, get_renderer, hole_area_ratio, hole_mask, load_depth, load_photo
+from spackle import complete, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.rgbd import lift
 from spackle.scene import scene_path
+from spackle.training.distance import hole_psnr
+from spackle.training.sources import load_pair
 
 DISPARITY = 0.3
 TELEA_RADIUS = 3
 COLUMNS = ["scene", "HAR before", "after / before", "hole: Telea", "hole: Spackle"]
 COLUMNS += ["outside: before", "outside: after", "photo", f"photo, scene ±{DISPARITY:g}", "worst end, scene"]
-
-
-def psnr(image: Tensor, truth: Tensor, where: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of sRGB images [H, W, 3], over a mask [H, W] where given."""
-    error = (image - truth) ** 2
-    return float(-10 * torch.log10(error.mean() if where is None else error[where].mean()))
-
-
-def cameras(facts: dict[str, float], width: int, height: int) -> tuple[Camera, Camera]:
-    """The left camera, which is the world's, and the right one beside it."""
-    K = torch.tensor([[facts["focal_px"], 0, facts["cx"]], [0, facts["focal_px"], facts["cy"]], [0, 0, 1]])
-    right_K, beside = K.clone(), torch.eye(4)
-    right_K[0, 2] += facts["doffs_px"]
-    beside[0, 3] = -facts["baseline_m"]
-    return Camera(K, torch.eye(4), width, height), Camera(right_K, beside, width, height)
 
 
 def telea(image: Tensor, hole: Tensor) -> Tensor:
@@ -52,26 +38,24 @@ def telea(image: Tensor, hole: Tensor) -> Tensor:
 @torch.no_grad()
 def measure(folder: Path) -> list[float]:
     """One row of the table, without the name."""
-    facts = json.loads((folder / "scene.json").read_text())
-    left, right = (load_photo(folder / facts[side]).rgb for side in ("left", "right"))
-    camera, beside = cameras(facts, left.shape[1], left.shape[0])
-    prediction, renderer = lift(left, load_depth(folder / facts["disparity"]), camera), get_renderer()
+    left, right, depth, camera, beside = load_pair(folder)
+    prediction, renderer = lift(left, depth, camera), get_renderer()
     scene = complete(prediction, [beside], exact=True, network=None)
     before, after = renderer.render(scene.base, beside), scene.render(beside)
     hole, photo = hole_mask(before.alpha), renderer.render(scene.base, camera).rgb
     path = scene_path(scene.base, camera, "swipe", DISPARITY)
     swipe = complete(prediction, path, network=None)
     ends = [(renderer.render(scene.base, end).alpha, swipe.render(end).alpha) for end in (path[0], path[-1])]
-    har = hole_area_ratio(before.alpha)
+    har, everywhere = hole_area_ratio(before.alpha), torch.ones_like(hole)
     return [
         har,
         hole_area_ratio(after.alpha) / har,
-        psnr(telea(before.rgb, hole), right, hole),
-        psnr(after.rgb, right, hole),
-        psnr(before.rgb, right, ~hole),
-        psnr(after.rgb, right, ~hole),
-        psnr(scene.render(camera).rgb, photo),
-        psnr(swipe.render(camera).rgb, photo),
+        hole_psnr(telea(before.rgb, hole), right, hole),
+        hole_psnr(after.rgb, right, hole),
+        hole_psnr(before.rgb, right, ~hole),
+        hole_psnr(after.rgb, right, ~hole),
+        hole_psnr(scene.render(camera).rgb, photo, everywhere),
+        hole_psnr(swipe.render(camera).rgb, photo, everywhere),
         max(hole_area_ratio(closed) / hole_area_ratio(open_) for open_, closed in ends),
     ]
 

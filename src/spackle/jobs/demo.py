@@ -26,6 +26,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.residual.weights import shipped_network
 from spackle.scene import Scene, complete, even_camera, scene_path
+from spackle.training.distance import hole_psnr
 from spackle.trajectory import DepthRange, extremes
 
 FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
@@ -189,7 +190,7 @@ def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Rende
         "har_before": hole_area_ratio(before.alpha),
         "har_after": hole_area_ratio(after.alpha),
         "psnr": {
-            name: {"in_hole": _psnr(image, pair.right, hole), "outside": _psnr(image, pair.right, ~hole)}
+            name: {"in_hole": hole_psnr(image, pair.right, hole), "outside": hole_psnr(image, pair.right, ~hole)}
             for name, image in methods.items()
         },
         "ssim": {name: _ssim(image, pair.right, hole) for name, image in methods.items()},
@@ -203,11 +204,6 @@ def _ssim(image: Tensor, truth: Tensor, where: Tensor) -> float:
     pictures = image.numpy(), truth.numpy()
     _, similarity = structural_similarity(*pictures, channel_axis=-1, data_range=1, full=True)  # type: ignore[no-untyped-call]
     return float(similarity[where.numpy()].mean())
-
-
-def _psnr(image: Tensor, truth: Tensor, where: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of sRGB images [H, W, 3] over a mask [H, W]."""
-    return float(-10 * torch.log10(((image - truth)[where] ** 2).mean()))
 
 
 def _table(scores: dict[str, Any]) -> Table:
