@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,15 @@ def shifted(camera: Camera, right: float, focus: float = 4.0) -> Camera:
 def away(camera: Camera) -> Camera:
     """The photo's camera turned round: it sees nothing of the photo's scene."""
     return camera.looking(torch.zeros(3), torch.tensor([0.0, 0.0, -1.0]))
+
+
+def tensors_of(value: object) -> Iterator[Tensor]:
+    """Every tensor in a value and in the values in it."""
+    if isinstance(value, Tensor):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from tensors_of(getattr(value, field.name))
 
 
 def psnr(a: Tensor, b: Tensor) -> float:

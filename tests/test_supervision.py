@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from photos import metres, picture, write_depth, write_photo
 from PIL import Image
-from scenes import Scene, away, box_before_wall, psnr, shifted, slanted_plane, texture, wall
+from scenes import Scene, away, box_before_wall, psnr, shifted, slanted_plane, tensors_of, texture, wall
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -188,14 +188,6 @@ def test_the_truth_is_the_photo_and_nothing_wants_gradients() -> None:
     found = list(tensors_of(sample)) + list(tensors_of(sample.crop(0, 0, 16, 16)))
     assert len(found) > 40
     assert not any(tensor.requires_grad for tensor in found)
-
-
-def tensors_of(value: object) -> Iterator[Tensor]:
-    if isinstance(value, Tensor):
-        yield value
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield from tensors_of(getattr(value, field.name))
 
 
 def named_tensors(value: object, prefix: str = "") -> dict[str, Tensor]:

@@ -20,8 +20,7 @@ import torch
 from command import Run, names_in, run
 from photos import picture
 from PIL import Image
-from scenes import box_before_wall, shifted
-from torch import Tensor
+from scenes import box_before_wall, shifted, tensors_of
 
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
@@ -350,14 +349,6 @@ def sample_of(base: Gaussians) -> Sample:
     rendering = get_renderer().render(base, view)
     truth = torch.full_like(rendering.rgb, 0.5).detach()
     return Sample.of(base, rendering, view, scene.camera, truth, torch.ones(view.height, view.width, dtype=torch.bool))
-
-
-def tensors_of(value: object) -> Iterator[Tensor]:
-    if isinstance(value, Tensor):
-        yield value
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield from tensors_of(getattr(value, field.name))
 
 
 def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import spackle
 from spackle.bases.sharp import Precision
 from spackle.downloads import read_record
+from spackle.downloads.partial import digest
 from spackle.errors import InputError
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options
@@ -115,11 +116,8 @@ def weights_digest(path: Path) -> str:
     record = read_record(path)
     if record is not None:
         return record.sha256
-    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        while block := file.read(1 << 22):
-            digest.update(block)
-    return digest.hexdigest()
+        return digest(file).hexdigest()
 
 
 def _inputs(photo: PhotoFile, base: PredictOptions) -> list[str]:
