@@ -1,6 +1,6 @@
 """Trained residual weights beside the seeds alone, on stereo pairs whose right photo is the truth, as Markdown tables.
 
-    python benchmarks/residual.py FOLDER --features squeezenet_v1.0.npz [--residual FILE] [--pictures OUT]
+    python benchmarks/residual.py FOLDER --features squeezenet_v1.0.npz [--residual FILE] [--pictures OUT] [--no-swipes]
 
 FOLDER holds one folder a scene, as for `benchmarks/stereo_pairs.py`. The first table completes the right camera's view:
 the perceptual distance in the hole (see `spackle.training.distance.hole_distance`: SqueezeNet's conv1, fire4, fire8 and
@@ -11,6 +11,7 @@ share of holes before and after. --pictures draws base, seeds, trained and truth
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -70,12 +71,21 @@ class Scene:
         return share([self.base]), share([self.base, aux])
 
 
-def print_table(columns: list[str], rows: dict[str, list[float]]) -> None:
-    """Markdown, with the mean of each column below."""
-    print(f"\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
-    mean = torch.tensor(list(rows.values()), dtype=torch.float64).mean(0).tolist()
-    for name, row in {**rows, "mean": mean}.items():
-        print(f"| {name} | {' | '.join(f'{value:.4f}' if value < 1 else f'{value:.2f}' for value in row)} |")
+def row_of(name: str, values: Sequence[float]) -> str:
+    """A Markdown row."""
+    return f"| {name} | {' | '.join(f'{value:.4f}' if value < 1 else f'{value:.2f}' for value in values)} |"
+
+
+def print_table(columns: Sequence[str], rows: Iterable[tuple[str, list[float]]]) -> list[float]:
+    """Markdown, each row as soon as it is there; prints and returns the mean of each column."""
+    print(f"\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
+    values = []
+    for name, row in rows:
+        values.append(row)
+        print(row_of(name, row), flush=True)
+    mean: list[float] = torch.tensor(values, dtype=torch.float64).mean(0).tolist()
+    print(row_of("mean", mean), flush=True)
+    return mean
 
 
 @torch.no_grad()
@@ -86,23 +96,29 @@ def main() -> None:
     parser.add_argument("--features", type=Path, required=True, help="SqueezeNet 1.0's weights")
     parser.add_argument("--residual", type=Path, default=SHIPPED)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--no-swipes", action="store_true", help="the first table alone, in a minute or two")
     arguments = parser.parse_args()
     features = load_features("squeezenet", arguments.features)
     network = load_residual(arguments.residual)
     assert features is not None
-    pairs: dict[str, list[float]] = {}
-    swipes: dict[str, list[float]] = {}
-    for folder in sorted(path.parent for path in arguments.folder.glob("*/scene.json")):
-        scene = Scene(folder, network)
-        pairs[scene.name], pictures = scene.pair(features)
-        swipes[scene.name] = [value for disparity in DISPARITIES for value in scene.swipe(disparity)]
-        if arguments.pictures:
-            arguments.pictures.mkdir(parents=True, exist_ok=True)
-            save_png(torch.cat(pictures, dim=1), arguments.pictures / f"{scene.name}.png")
-    print_table(PAIR_COLUMNS, pairs)
-    print_table(["scene", *(f"{d:g} {when}" for d in DISPARITIES for when in ("before", "after"))], swipes)
-    seeds, trained = (torch.tensor([row[k] for row in pairs.values()]).mean() for k in (1, 2))
-    print(f"\nPerceptual distance in the hole: {trained / seeds - 1:+.1%} against the seeds.")
+    scenes = [Scene(path.parent, network) for path in sorted(arguments.folder.glob("*/scene.json"))]
+
+    def pairs() -> Iterator[tuple[str, list[float]]]:
+        for scene in scenes:
+            numbers, pictures = scene.pair(features)
+            if arguments.pictures:
+                arguments.pictures.mkdir(parents=True, exist_ok=True)
+                save_png(torch.cat(pictures, dim=1), arguments.pictures / f"{scene.name}.png")
+            yield scene.name, numbers
+
+    def swipes() -> Iterator[tuple[str, list[float]]]:
+        for scene in scenes:
+            yield scene.name, [value for disparity in DISPARITIES for value in scene.swipe(disparity)]
+
+    mean = print_table(PAIR_COLUMNS, pairs())
+    print(f"\nPerceptual distance in the hole: {mean[2] / mean[1] - 1:+.1%} against the seeds.", flush=True)
+    if not arguments.no_swipes:
+        print_table(["scene", *(f"{d:g} {when}" for d in DISPARITIES for when in ("before", "after"))], swipes())
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from spackle.training.step import MIN_AUX, training_cells
 CPU = CpuRenderer()
 PROPERTY = settings(deadline=None, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)
-RIM_PX = 3  # blobs are wider than pixels: what stands in front hides so much more than a line says, but not less
+RIM_PX = 2  # blobs are wider than pixels: what stands in front hides so much more than a line says, but not less
 
 
 # Geometry, once more ------------------------------------------------------------------------------

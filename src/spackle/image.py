@@ -21,6 +21,7 @@ from spackle.errors import InputError, reason_in_a_line
 
 T = TypeVar("T")
 
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # looked for in folders
 MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as float32
 MAX_SIDE = 1536  # long side of the working size
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice

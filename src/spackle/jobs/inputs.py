@@ -11,8 +11,8 @@ from pathlib import Path
 
 from spackle.errors import InputError
 from spackle.formats import check_writable
+from spackle.image import PHOTO_SUFFIXES
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError
-from spackle.image import check_file, load_photo
+from spackle.image import PHOTO_SUFFIXES, check_file, load_photo
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff", ".gif", ".bmp")
+SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE = 32  # pixels: a smaller picture has no depth that anybody could see
 MAX_JSON_BYTES = 1 << 30
 

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError
+from spackle.image import PHOTO_SUFFIXES
 from spackle.render import Renderer
 from spackle.training.cache import Cache, digest_of
 from spackle.training.pseudo_source import PseudoViews
 from spackle.training.recipe import DataRecipe, plain
-from spackle.training.sources import PHOTO_SUFFIXES, Composites, RgbdFrames, Source, StereoPairs
+from spackle.training.sources import Composites, RgbdFrames, Source, StereoPairs
 
 TRAIN, VALIDATION = "train", "validation"
+SAMPLES_VERSION = 2  # goes up whenever the same recipe would make other samples
 Step = Callable[[int, int], None]  # (done, of how many)
 
 
@@ -82,13 +84,11 @@ class Supply:
     def digest(self) -> str:
         """Twelve digits: the same samples have the same ones, wherever the files lie and however many are made."""
         facts: dict[str, Any] = plain(self.data)
-        for name in ("photos", "stereo", "cache", "views", "validation_views"):
+        for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
             facts.pop(name)
-        if facts.pop("pseudo") is None:  # recipes from before there was one keep their digits
-            facts["shares"].pop("pseudo")
         for camera in facts["rgbd"]:
             camera.pop("folder")
-        return digest_of((facts, list(self.shares), list(self.names)))
+        return digest_of((SAMPLES_VERSION, facts, list(self.shares), list(self.names)))
 
     def samples(self, folder: Path, train: Step, validation: Step, warn: Callable[[str], None]) -> SampleFiles:
         """The samples in a folder, which many recipes may share; what is missing is made.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
@@ -34,13 +35,18 @@ def reverse_view(prediction: BasePrediction, seen: Tensor, photo: Tensor, viewer
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, renderer: Renderer) -> Tensor:
-    """[N] bool: which Gaussians a camera sees, by the depth that it renders at their centres."""
+    """[N] bool: which Gaussians a camera sees, by the depth that it renders around their centres.
+
+    Around, because a blob is wider than a pixel: at an outline the nearer surface's depth bleeds over
+    the farther one, and on steep ground a pixel's depth is behind half of what lies in it.
+    """
     depth = renderer.render(gaussians, viewer).depth
+    around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
     column, row = uv.floor().long().unbind(-1)
     inside = (column >= 0) & (column < viewer.width) & (row >= 0) & (row < viewer.height) & (z > 0)
-    front = depth[row.clamp(0, viewer.height - 1), column.clamp(0, viewer.width - 1)]
-    return inside & ((front == 0) | (z <= front * (1 + TOLERANCE)))
+    at = row.clamp(0, viewer.height - 1), column.clamp(0, viewer.width - 1)
+    return inside & ((depth[at] == 0) | (z <= around[at] * (1 + TOLERANCE)))
 
 
 def with_backing(seen: Tensor, z: Tensor, height: int, width: int) -> Tensor:

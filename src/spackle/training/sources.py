@@ -23,7 +23,6 @@ from spackle.training.reverse_view import reverse_view, seen_from, with_backing
 from spackle.training.sample import Sample
 from spackle.trajectory import TRAJECTORIES, DepthRange, trajectory
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
 FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
 FRAMES = 24  # of a path, one of which is the virtual camera
