@@ -30,12 +30,14 @@ from spackle.training.cache import load_sample, save_sample
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
 from spackle.training.data import SampleFiles
 from spackle.training.logs import NoLogs
-from spackle.training.loop import Trainer, Watch
+from spackle.training.loop import Trainer
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
+from spackle.training.residual_method import ResidualMethod
 from spackle.training.sample import Sample
 from spackle.training.step import MIN_AUX, aux_of, complete_samples, training_cells
 from spackle.training.validation import Judge
+from spackle.training.watch import Watch
 
 pytest.importorskip("yaml")
 
@@ -397,7 +399,8 @@ def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path)
 
     torch.manual_seed(0)
     watch = Watch(note, nothing, nothing, lambda: False)
-    trainer = Trainer(recipe, files, ResidualNet(), judge, tmp_path, NoLogs(), watch, Ranks())
+    method = ResidualMethod(files, judge, recipe.optim.batch)
+    trainer = Trainer(recipe, method, ResidualNet(), judge, tmp_path, NoLogs(), watch, Ranks())
     assert trainer.run() == "steps"
     assert len(found) == 12
     assert found[-1] < 0.5 * found[0]

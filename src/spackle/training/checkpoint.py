@@ -53,6 +53,7 @@ class Checkpoint:
     optimizer: dict[str, Any]
     recipe: dict[str, Any]
     digest: str  # of the samples
+    method: str = "residual"  # checkpoints from before there was another do not say
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
@@ -98,8 +99,13 @@ def _read(path: Path) -> Checkpoint:
     return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)})
 
 
-def check_same_run(checkpoint: Checkpoint, recipe: dict[str, Any], digest: str, folder: Path) -> None:
-    """InputError where a checkpoint is of another recipe, or of other samples."""
+def check_same_run(checkpoint: Checkpoint, method: str, recipe: dict[str, Any], digest: str, folder: Path) -> None:
+    """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
+    if checkpoint.method != method:
+        raise InputError(
+            f"{folder}: holds a run of --method {checkpoint.method}, not of {method}: choose another with -o, "
+            "or --overwrite to start anew"
+        )
     other = differences(checkpoint.recipe, recipe)
     if not other and checkpoint.digest != digest:
         other = ["the files that data names"]

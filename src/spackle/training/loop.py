@@ -1,49 +1,26 @@
-"""The training loop: samples in, weights out; whatever stops it, it goes on from its last checkpoint."""
+"""The training loop: items in, weights out; whatever stops it, it goes on from its last checkpoint."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import nn
-from torch.nn.parallel import DistributedDataParallel
-from torch.nn.utils import clip_grad_norm_
 
 from spackle.errors import InputError
 from spackle.formats import save_png
-from spackle.residual.network import ResidualNet
-from spackle.training.cache import load_sample
-from spackle.training.checkpoint import (
-    BAD,
-    BEST,
-    LAST,
-    PICTURES,
-    Checkpoint,
-    Progress,
-    export_weights,
-    save_checkpoint,
-)  # fmt: skip
-from spackle.training.data import SampleFiles
+from spackle.training.checkpoint import BAD, BEST, LAST, PICTURES, Checkpoint, Progress, save_checkpoint
+from spackle.training.learner import Learner
 from spackle.training.logs import Logs
+from spackle.training.method import Method, chunks
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import Recipe, plain
-from spackle.training.schedule import ema_decay, learning_rate, samples_of_step
-from spackle.training.validation import PICTURED, Judge, picture, validate
-
-
-@dataclasses.dataclass(frozen=True)
-class Watch:
-    """How a run talks to whoever started it."""
-
-    step: Callable[[int, dict[str, float]], None]  # steps done, and their mean numbers since it was last called
-    validated: Callable[[Progress], None]
-    saved: Callable[[Progress], None]  # a checkpoint is on the disk
-    stop: Callable[[], bool]  # whether somebody wants it to end after this step
+from spackle.training.schedule import samples_of_step
+from spackle.training.validation import Judge, validate
+from spackle.training.watch import Means, Watch
 
 
 class Trainer:
@@ -52,8 +29,8 @@ class Trainer:
     def __init__(
         self,
         recipe: Recipe,
-        samples: SampleFiles,
-        network: ResidualNet,
+        method: Method,
+        network: nn.Module,
         judge: Judge,
         folder: Path,
         logs: Logs,
@@ -64,7 +41,7 @@ class Trainer:
 
         Args:
             recipe: optim and run count here.
-            samples: what to learn from.
+            method: what to learn, and from what.
             network: the first weights; trained in place.
             judge: the loss.
             folder: for results; exists.
@@ -72,31 +49,21 @@ class Trainer:
             watch: told what goes on.
             ranks: this process; the first one writes.
         """
-        self.recipe, self.samples, self.judge, self.folder = recipe, samples, judge, folder
+        self.recipe, self.method, self.judge, self.folder = recipe, method, judge, folder
         self.logs, self.watch, self.ranks = logs, watch, ranks
-        self.network = network.to(judge.device, memory_format=torch.channels_last).requires_grad_()  # type: ignore[call-overload]
-        self.average = ResidualNet().to(judge.device, memory_format=torch.channels_last).requires_grad_(False)  # type: ignore[call-overload]
-        self.average.load_state_dict(network.state_dict())
-        optim = recipe.optim
-        self.optimizer = torch.optim.AdamW(
-            network.parameters(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay
-        )
+        self.learner = Learner(network, recipe.optim, judge.device, ranks)
         self.progress, self.on_disk = Progress(), -1  # the step of the newest checkpoint
-        # Gradients are averaged over the processes while they are computed.
-        self.wrapped: nn.Module = DistributedDataParallel(network) if ranks.count > 1 else network
 
     def resume(self, checkpoint: Checkpoint) -> None:
-        """Go on where a checkpoint was written."""
-        self.network.load_state_dict(checkpoint.network)
-        self.average.load_state_dict(checkpoint.average)
-        self.optimizer.load_state_dict(checkpoint.optimizer)
+        """Go on where a checkpoint was written; InputError where it is of another network."""
+        self.learner.resume(checkpoint, self.folder)
         self.progress, self.on_disk = checkpoint.progress, checkpoint.progress.step
 
     def run(self) -> str:
         """Train until the steps are done ("steps"), nothing improves ("patience") or `watch.stop` ("stopped").
 
         Raises:
-            InputError: a sample that cannot be read, a loss that is no number, a file that cannot be written.
+            InputError: an item that cannot be read, a loss that is no number, a file that cannot be written.
         """
         run, since, numbers = self.recipe.run, time.perf_counter(), Means()
         start = self.progress.seconds
@@ -115,47 +82,45 @@ class Trainer:
 
     def step(self, step: int) -> dict[str, float]:
         """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0."""
-        optim = self.recipe.optim
-        picks = samples_of_step(
-            step, len(self.samples.train), optim.batch, self.recipe.run.seed, self.ranks.rank, self.ranks.count
-        )
-        files = [self.samples.train[pick] for pick in picks]
-        batch = self.judge.complete(self.wrapped, [load_sample(file) for file in files])
-        loss, terms = self.judge.total(batch)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        gradient = clip_grad_norm_(self.network.parameters(), optim.clip)
-        mine = {name: float(value) for name, value in {"loss": loss.detach(), **terms, "gradient": gradient}.items()}
+        method, ranks = self.method, self.ranks
+        items = samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
+        mine = self._find_gradients(step, items)
         mine["stop"] = float(self.watch.stop())
-        means = self.ranks.mean(list(mine.values()), self.judge.device)
+        means = ranks.mean(list(mine.values()), self.judge.device)
         numbers = dict(zip(mine, means, strict=True))
         if not (math.isfinite(numbers["loss"]) and math.isfinite(numbers["gradient"])):
-            self._reject(step, files, mine["loss"], numbers)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(step, optim)
-        self.optimizer.step()
-        decay = ema_decay(step, optim.ema)
-        with torch.no_grad():
-            for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(weight, 1 - decay)
-        return {**numbers, "lr": self.optimizer.param_groups[0]["lr"]}
+            self._reject(step, items, mine["loss"], numbers)
+        return {**numbers, "lr": self.learner.update(step)}
+
+    def _find_gradients(self, step: int, items: Sequence[int]) -> dict[str, float]:
+        """Leave a step's gradients in the network; returns its loss and terms, and the length of the gradient."""
+        numbers: dict[str, float] = {}
+        parts = list(chunks(items, self.method.at_once))
+        self.learner.forget_gradients()
+        for part in parts:
+            share = len(part) / len(items)
+            with self.learner.adding_up(last=part is parts[-1]):
+                loss, terms = self.judge.total(self.method.complete(self.learner.wrapped, step, part))
+                (share * loss).backward()  # type: ignore[no-untyped-call]
+            for name, value in {"loss": loss.detach(), **terms}.items():
+                numbers[name] = numbers.get(name, 0.0) + share * float(value)
+        return {**numbers, "gradient": float(self.learner.clip())}
 
     def judge_average(self) -> None:
         """Validate the averaged weights, keep them where they are the best so far, and draw what they do."""
-        share = self.recipe.optim.batch // self.ranks.count
-        found = validate(self.average, self.samples.validation, self.judge, share, self.ranks)
+        average = self.learner.average
+        found = validate(average, self.method, self.judge, self.ranks)
         step = self.progress.step
         self.progress = self.progress.judged({"step": step, **found}, self.recipe.run.min_delta)
         if not self.ranks.first:
             return
         self.logs.numbers("validation", found, step)
-        some = self.samples.validation[:: max(1, len(self.samples.validation) // PICTURED)][:PICTURED]
-        sheet = picture(self.average, [load_sample(file) for file in some], self.judge)
-        self.logs.picture("base, seeds, completed, truth", sheet, step)
+        sheet = self.method.picture(average)
+        self.logs.picture(self.method.columns, sheet, step)
         (self.folder / PICTURES).mkdir(exist_ok=True)
         save_png(sheet, self.folder / PICTURES / f"{step:07d}.png")
         if self.progress.stale == 0:
-            export_weights(self.average, self.folder / BEST)
+            self.method.export(average, self.folder / BEST)
         self.watch.validated(self.progress)
 
     def save(self) -> None:
@@ -163,7 +128,7 @@ class Trainer:
         if not self.ranks.first or self.on_disk == self.progress.step:
             return
         save_checkpoint(self.checkpoint(), self.folder)
-        export_weights(self.average, self.folder / LAST)
+        self.method.export(self.learner.average, self.folder / LAST)
         self.on_disk = self.progress.step
         self.watch.saved(self.progress)
 
@@ -171,11 +136,10 @@ class Trainer:
         """All of the run's state."""
         return Checkpoint(
             progress=self.progress,
-            network=self.network.state_dict(),
-            average=self.average.state_dict(),
-            optimizer=self.optimizer.state_dict(),
             recipe=plain(self.recipe),
-            digest=self.samples.digest,
+            digest=self.method.digest,
+            method=self.method.name,
+            **self.learner.state(),
         )
 
     def _ended(self, stopped: bool) -> str | None:
@@ -190,13 +154,12 @@ class Trainer:
             self.logs.numbers("train", numbers, self.progress.step)
             self.watch.step(self.progress.step, numbers)
 
-    def _reject(self, step: int, files: list[Path], loss: float, numbers: dict[str, float]) -> None:
+    def _reject(self, step: int, items: Sequence[int], loss: float, numbers: dict[str, float]) -> None:
         """Keep what made a loss that is no number, and end the run; nothing has learned from it."""
         place = self.folder / BAD
         place.mkdir(exist_ok=True)
         if not math.isfinite(loss) or math.isfinite(numbers["loss"]):  # else it is another process that has them
-            for file in files:
-                shutil.copy(file, place / file.name)
+            self.method.keep(step, items, place)
         self.ranks.wait()
         if not self.ranks.first:
             raise InputError("")  # one process speaks for all
@@ -204,27 +167,5 @@ class Trainer:
         bad = ", ".join(name for name, value in numbers.items() if not math.isfinite(value))
         raise InputError(
             f"{place}: step {step} gave numbers that are not finite ({bad}): its samples and the weights before it "
-            "are there; lower optim.lr, or delete the samples in the cache and run again"
+            f"are there; lower optim.lr, or {self.method.remedy}"
         )
-
-
-class Means:
-    """Numbers of several steps, on their way to a line."""
-
-    def __init__(self) -> None:
-        self.sums: dict[str, float] = {}
-        self.count = 0
-        self.stopped = False
-
-    def add(self, numbers: dict[str, float]) -> None:
-        """One more step."""
-        self.stopped = numbers.pop("stop") > 0
-        self.count += 1
-        for name, value in numbers.items():
-            self.sums[name] = self.sums.get(name, 0.0) + value
-
-    def take(self) -> dict[str, float]:
-        """The means, and an end to them."""
-        means = {name: total / self.count for name, total in self.sums.items()}
-        self.sums, self.count = {}, 0
-        return means

@@ -1,29 +1,28 @@
-"""How good a network is on samples that it has not seen, in numbers and in pictures."""
+"""The loss, and how good a network is on views that it has not learned from."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from spackle.render import Renderer
-from spackle.residual.compose import compose
 from spackle.residual.cues import hole_area_ratio
-from spackle.training.cache import load_sample
 from spackle.training.distance import hole_psnr
 from spackle.training.features import FeatureNet
 from spackle.training.losses import total_loss
+from spackle.training.method import Method, chunks
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import LossRecipe
 from spackle.training.sample import Sample
 from spackle.training.step import Batch, complete_samples
 
-PICTURED = 6  # samples in the picture
-NUMBERS = ("loss", "color", "alpha", "preserve", "perceptual", "hole_psnr", "har_before", "har_after")
+PICTURED = 6  # views in the picture
+DECIBELS = ("hole_psnr", "seen_psnr")
+NUMBERS = ("loss", "color", "alpha", "preserve", "perceptual", *DECIBELS, "har_before", "har_after")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,32 +52,32 @@ class Judge:
 
 
 @torch.no_grad()
-def validate(network: nn.Module, files: Sequence[Path], judge: Judge, batch: int, ranks: Ranks) -> dict[str, float]:
-    """Means over the samples, each in its own right; the same in all processes.
+def validate(network: nn.Module, method: Method, judge: Judge, ranks: Ranks) -> dict[str, float]:
+    """Means over the judged views, each in its own right; the same in all processes.
 
     Args:
         network: the averaged one.
-        files: the validation samples, of one size.
+        method: whose views count.
         judge: the loss.
-        batch: samples at a time.
         ranks: the processes that share the work.
 
     Returns:
-        loss and its terms; hole_psnr in dB, of the samples whose holes are not met exactly; har_before and har_after,
-        the share of hole pixels.
+        loss and its terms; hole_psnr and seen_psnr in dB, inside of the holes against the target and outside of them
+        against the base, of the views in which they are not infinite; har_before and har_after, the share of hole
+        pixels.
 
     Raises:
-        InputError: a sample that cannot be read.
+        InputError: an item that cannot be read.
     """
     totals, counts = dict.fromkeys(NUMBERS, 0.0), dict.fromkeys(NUMBERS, 0)
-    for part in _batches(files[ranks.rank :: ranks.count], batch):
-        samples = [load_sample(file) for file in part]
-        done = judge.complete(network, samples)
+    mine = range(ranks.rank, method.judged_items, ranks.count)
+    for part in chunks(mine, method.at_once):
+        done = method.complete_judged(network, part)
         loss, terms = judge.total(done)
         means = {name: float(value) for name, value in {"loss": loss, **terms}.items()}
-        found = {name: [value] * len(samples) for name, value in means.items()}
+        found = {name: [value] * len(done.rgb) for name, value in means.items()}
         for name, values in {**found, **_of_images(done)}.items():
-            finite = [value for value in values if math.isfinite(value)] if name == "hole_psnr" else values
+            finite = [value for value in values if math.isfinite(value)] if name in DECIBELS else values
             totals[name] += sum(finite)
             counts[name] += len(finite)
     sums = ranks.sum([*totals.values(), *counts.values()], judge.device)
@@ -89,25 +88,10 @@ def validate(network: nn.Module, files: Sequence[Path], judge: Judge, batch: int
 def _of_images(batch: Batch) -> dict[str, list[float]]:
     """What is measured of each completed view."""
     views = list(zip(batch.rgb, batch.target, batch.hole & batch.valid, strict=True))
+    seen = zip(batch.rgb, batch.base_rgb, ~batch.hole, strict=True)
     return {
         "hole_psnr": [hole_psnr(rgb, target, hole) for rgb, target, hole in views],
+        "seen_psnr": [hole_psnr(rgb, base, rest) for rgb, base, rest in seen],
         "har_before": [float(hole.double().mean()) for hole in batch.hole],
         "har_after": [hole_area_ratio(alpha) for alpha in batch.alpha],
     }
-
-
-@torch.no_grad()
-def picture(network: nn.Module, samples: Sequence[Sample], judge: Judge) -> Tensor:
-    """[n·H, 4·W, 3] sRGB: a row for each sample, with the base, the seeds alone, the completed view and the truth."""
-    rows = []
-    completed = judge.complete(network, samples)
-    for sample, rgb in zip(samples, completed.rgb, strict=True):
-        seeds = compose(sample.seeds.select(sample.cues.mask), None, sample.camera)
-        alone = judge.renderer.render([sample.base, seeds], sample.camera, tiles=sample.tiles, onto=sample.rendering)
-        rows.append(torch.cat([sample.rendering.rgb, alone.rgb, rgb.cpu(), sample.target], dim=1))
-    return torch.cat(rows)
-
-
-def _batches(files: Sequence[Path], size: int) -> Iterator[Sequence[Path]]:
-    for start in range(0, len(files), size):
-        yield files[start : start + size]

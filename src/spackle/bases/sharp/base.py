@@ -46,7 +46,8 @@ class SharpBase:
         """Read a checkpoint.
 
         Args:
-            path: Apple's .pt file, or a safetensors file with the same names.
+            path: Apple's .pt file, a safetensors file with the same names, or the decoder that
+                `spackle train --method direct-ft` wrote, which names the checkpoint for the rest.
             precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively. In either,
                 the last bits of the Gaussians depend on the number of threads, because sums run in another order;
                 bf16's last bits are coarser.

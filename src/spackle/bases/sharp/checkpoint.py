@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from spackle.bases.sharp.config import CONFIGS, SharpConfig
+from spackle.bases.sharp.decoder_file import owner_of, with_owner
 from spackle.bases.sharp.device import enough_memory
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import set_precision
@@ -22,10 +23,11 @@ NAMED = 3  # how many of the names that differ are spelled out
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu") -> SharpNetwork:
     """A frozen network from Apple's .pt file, or from a safetensors file with the same names.
 
-    The size, published or tiny, is told from the shapes.
+    The size, published or tiny, is told from the shapes. A file with a trained Gaussian decoder alone stands
+    for the checkpoint that it names, with that decoder in it.
 
     Args:
-        path: the checkpoint.
+        path: the checkpoint, or the decoder.
         dtype: of the heavy arithmetic, float32 or bfloat16.
         device: where the network is to run.
 
@@ -33,6 +35,8 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
         InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
     tensors = read_tensors(path)
+    if (owner := owner_of(path)) is not None:
+        tensors = with_owner(tensors, path, owner)
     network = _empty_network(_config_of(tensors))
     check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, _shapes_of(network), path)
     advice = ["try --precision bf16"] if dtype == torch.float32 else []  # it takes half as much

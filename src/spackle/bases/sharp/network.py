@@ -8,15 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from spackle.bases.protocol import Progress
-from spackle.bases.sharp.config import LAYERS, STRIDE, SharpConfig
-from spackle.bases.sharp.decoder import Decoder, Fusion, normed_residual
+from spackle.bases.sharp.config import LAYERS, SharpConfig
+from spackle.bases.sharp.decoder import Decoder
+from spackle.bases.sharp.heads import FeatureNetwork, GaussianDecoder, PredictionHead
 from spackle.bases.sharp.precision import ExactConv
 from spackle.bases.sharp.pyramid import SlidingPyramid
 from spackle.bases.sharp.start import Start, make_start
 
 DISPARITY_RANGE = (1e-4, 1e4)  # what the depth head says is clamped to it
 HIDDEN = 32  # channels before the last layer of the depth head
-GEOMETRY, TEXTURE = 3, 11  # delta channels: offset; scale 3, quaternion 4, colour 3, opacity 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +25,15 @@ class SharpOutput:
 
     start: Start  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32, to be applied to them
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What encoder and depth network make of one picture: all that the Gaussian decoder goes by."""
+
+    start: Start
+    picture: Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
+    maps: list[Tensor]  # the encoder's, fine to coarse: [1, C, side/2, side/2] to [1, C, side/32, side/32]
 
 
 class SharpNetwork(nn.Module):
@@ -49,13 +58,21 @@ class SharpNetwork(nn.Module):
             batch: windows that go through the transformer at once; more are no faster on a processor.
             progress: called as the transformer advances, with windows done and all of them.
         """
+        seen = self.see(image, disparity_factor, batch, progress)
+        deltas: Tensor = self.gaussian_decoder()(seen.picture, seen.maps)
+        return SharpOutput(seen.start, deltas)
+
+    def see(self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None) -> Seen:
+        """Everything before the Gaussian decoder; the arguments are `forward`'s."""
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
-        depth = disparity_factor / disparity.clamp(*DISPARITY_RANGE)
-        start = make_start(image, depth)
-        texture, geometry = self.feature_model(torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
-        return SharpOutput(start, self.prediction_head(texture, geometry))
+        start = make_start(image, disparity_factor / disparity.clamp(*DISPARITY_RANGE))
+        return Seen(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
+
+    def gaussian_decoder(self) -> GaussianDecoder:
+        """The rest, by itself: the same modules under the same names."""
+        return GaussianDecoder(self.feature_model, self.prediction_head)
 
 
 class DepthNetwork(nn.Module):
@@ -79,45 +96,3 @@ class DepthNetwork(nn.Module):
         """[1, 2, side, side] ≥ 0, float32."""
         out: Tensor = self.head(self.decoder(maps))
         return out
-
-
-class FeatureNetwork(nn.Module):
-    """Features for the deltas from the pyramid, the picture and its disparity."""
-
-    def __init__(self, config: SharpConfig) -> None:
-        super().__init__()
-        width = config.gaussian_width
-        self.decoder = Decoder((config.depth_width, *config.pyramid), width)
-        self.image_encoder = nn.Module()
-        self.image_encoder.conv = ExactConv(3 + LAYERS, width, STRIDE, stride=STRIDE)
-        self.fusion = Fusion(width, doubles=False)
-        self.texture_head = _head(width, config.feature_width)
-        self.geometry_head = _head(width, config.feature_width)
-
-    def forward(self, picture: Tensor, maps: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Texture and geometry features [1, F, side/2, side/2] of [1, 5, side, side] in -1..1."""
-        features = self.decoder(maps)
-        features = self.fusion(features, self.image_encoder.conv(picture).to(features))  # type: ignore[operator]
-        return self.texture_head(features), self.geometry_head(features)
-
-
-class PredictionHead(nn.Module):
-    """Features to deltas."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.geometry_prediction_head = ExactConv(width, GEOMETRY * LAYERS, 1)
-        self.texture_prediction_head = ExactConv(width, TEXTURE * LAYERS, 1)
-
-    def forward(self, texture: Tensor, geometry: Tensor) -> Tensor:
-        """[14, 2, H, W] float32."""
-        geometry = self.geometry_prediction_head(geometry)[0].unflatten(0, (GEOMETRY, LAYERS))
-        texture = self.texture_prediction_head(texture)[0].unflatten(0, (TEXTURE, LAYERS))
-        return torch.cat([geometry, texture])
-
-
-def _head(width: int, out: int) -> nn.Sequential:
-    last = nn.Conv2d(width, out, 1)
-    return nn.Sequential(
-        normed_residual(width), normed_residual(width), nn.ReLU(inplace=True), last, nn.ReLU(inplace=True)
-    )

@@ -21,7 +21,8 @@ class ExactConv(nn.Conv2d):
     """A convolution that stays in float32: cheap, and next to the pixels that come in or the Gaussians that go out."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x.float())
+        with torch.autocast(x.device.type, enabled=False):  # the decoder learns under it
+            return super().forward(x.float())
 
 
 def lower(x: Tensor, module: nn.Linear | nn.Conv2d | nn.ConvTranspose2d) -> Tensor:

@@ -53,6 +53,20 @@ def read_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     return dict(loaded)
 
 
+def read_notes(path: str | os.PathLike[str]) -> dict[str, str]:
+    """What a safetensors file says about itself; nothing where it says nothing, or is another kind of file.
+
+    Args:
+        path: a file that `read_tensors` has read.
+    """
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if not _is_safetensors(head):
+        return {}
+    with safe_open(path, framework="pt") as opened:
+        return dict(opened.metadata() or {})
+
+
 def plain_text(text: str, longest: int = 120) -> str:
     """A stranger's text for a message: as it is where it is plain, else quoted and escaped."""
     text = text[:longest]
@@ -68,7 +82,7 @@ def _read(path: str | os.PathLike[str]) -> object:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about kinds of tensors that are refused
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    if head[8:] == b"{" and int.from_bytes(head[:8], "little") <= MAX_HEADER:
+    if _is_safetensors(head):
         with safe_open(path, framework="pt") as opened:
             return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
     if head.startswith(b"\x80"):
@@ -77,6 +91,11 @@ def _read(path: str | os.PathLike[str]) -> object:
             "save it again with a current torch.save, or give Apple's checkpoint as it was downloaded"
         )
     raise InputError(f"{path}: neither a PyTorch checkpoint nor a safetensors file: give SHARP's checkpoint")
+
+
+def _is_safetensors(head: bytes) -> bool:
+    """By the first nine bytes of a file."""
+    return head[8:] == b"{" and int.from_bytes(head[:8], "little") <= MAX_HEADER
 
 
 def _check_archive(path: str | os.PathLike[str]) -> None:
