@@ -10,6 +10,8 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[demo,dev]'
+	# It asks for torchvision, of which a test needs one layer and brings its own.
+	$(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt --no-deps pytorchcv
 	touch $@
 
 demo: $(VENV)/.installed

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tarfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -134,6 +135,17 @@ def test_a_shard_is_a_plain_tar_in_the_order_of_webdataset(whole: tuple[Path, Ru
         f"{i:02d}.{kind}.png" for i in range(VIEWS) for kind in ("rgb", "target", "mask", "alpha", "depth")
     }
     assert {(m.mtime, m.uid, m.gid, m.uname, m.mode) for m in members} == {(0, 0, 0, "", 0o644)}
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # its own
+def test_webdataset_reads_the_shards(whole: tuple[Path, Run]) -> None:
+    webdataset = pytest.importorskip("webdataset")
+    shards = [str(path) for path in sorted(whole[0].glob("*.tar"))]
+    groups = list(webdataset.WebDataset(shards, shardshuffle=False))
+    assert [group["__key__"] for group in groups] == [f"{number:06d}" for number in range(5)]
+    for group, own in zip(groups, (PseudoFiles(whole[0]).group(number) for number in range(5)), strict=True):
+        files = {f"{own.key}.{name}": data for name, data in group.items() if not name.startswith("__")}
+        assert files == dict(own.files)
 
 
 def test_the_files_say_what_the_paper_asks_for(whole: tuple[Path, Run]) -> None:
@@ -264,6 +276,21 @@ def test_a_worker_that_dies_is_a_line() -> None:
     future.set_exception(BrokenProcessPool("gone"))
     with pytest.raises(InputError, match="a worker process died"):
         list(_results([future]))
+
+
+def test_few_photos_wait_for_a_worker_at_a_time() -> None:
+    asked: list[int] = []
+
+    def futures() -> Iterator[Future[Made]]:
+        for number in range(20):
+            asked.append(number)
+            future: Future[Made] = Future()
+            future.set_result(Made(number, {}, None))
+            yield future
+
+    for given, _ in enumerate(_results(futures(), 4)):
+        assert len(asked) <= given + 4
+    assert asked == list(range(20))
 
 
 def test_ctrl_c_ends_after_the_photo_at_work(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from rich.filesize import decimal
 from spackle.downloads.locks import hold
 from spackle.errors import InputError
 from spackle.jobs.dataset_options import DatasetOptions, check_dataset_options, configuration
+from spackle.jobs.dataset_ray import at_work_on_ray, cluster
 from spackle.jobs.dataset_worker import PARTS, Job, Made, Maker, at_work, part_file
 from spackle.jobs.inputs import LEFTOVER, make_folder, results_folder
 from spackle.jobs.progress import Reporter
@@ -20,6 +22,7 @@ from spackle.jobs.stopping import asked_to_stop
 from spackle.pseudo.build import Seconds, key_of, timed
 from spackle.pseudo.manifest import NAME, Manifest, ShardEntry, differences, load_manifest
 from spackle.pseudo.photos import PhotoFile, choose, find_photos
+from spackle.pseudo.propainter import NOTICE
 from spackle.pseudo.shards import shard_name, write_shard
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
@@ -44,11 +47,14 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     """
     check_dataset_options(options)
     maker = Maker.of(options, output)  # what cannot be is refused before long work
-    photos = _photos(source, options, reporter)
-    config = configuration(options, photos, maker.inpainter)
-    with results_folder(output, (NAME,)), _alone(output):
-        manifest = _begin(output, config)
-        return _Build(photos, output, options, reporter, config).run(manifest.shards)
+    if options.inpainter == "propainter":
+        reporter.say(NOTICE)
+    with cluster(options):
+        photos = _photos(source, options, reporter)
+        config = configuration(options, photos, maker.inpainter)
+        with results_folder(output, (NAME,)), _alone(output):
+            manifest = _begin(output, config)
+            return _Build(photos, output, options, reporter, config).run(manifest.shards)
 
 
 def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[PhotoFile]:
@@ -120,7 +126,9 @@ class _Build:
             if not jobs:
                 return self._finish(shards, seconds, 0, 0.0)
             total: Seconds = {}
-            with timed("wall", total), at_work(self.options, self.output, jobs) as results:
+            on_ray = functools.partial(at_work_on_ray, say=self.reporter.say)
+            workers = at_work if self.options.ray is None else on_ray
+            with timed("wall", total), workers(self.options, self.output, jobs) as results:
                 for result in results:
                     made += self._note(result, problems, seconds)
                     waiting[result.index // self.options.shard_size].discard(result.index)

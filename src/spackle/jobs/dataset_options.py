@@ -14,12 +14,15 @@ from spackle.bases.sharp import Precision
 from spackle.downloads import read_record
 from spackle.downloads.partial import digest
 from spackle.errors import InputError
+from spackle.image import MAX_SIDE
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.request import fingerprint
 from spackle.pseudo.build import ViewChoices
-from spackle.pseudo.inpainters import Inpainter
+from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile
+from spackle.pseudo.propainter import MIN_SIDE, SIDE
+from spackle.pseudo.propainter_weights import weight_files
 from spackle.trajectory import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
 
 MAX_VIEWS = 100  # two digits name a view
@@ -36,9 +39,18 @@ class DatasetOptions:
     images: Path | None = None  # where the photos of a COCO JSON lie
     sample: int | None = None  # so many photos; all where None
     inpainter: str = "geometry"
+    inpainter_weights: Path | None = None  # a folder, for propainter
+    inpainter_side: int | None = None  # pixels of the long side at which propainter works
     workers: int = 1  # processes
+    ray: str | None = None  # the cluster where they are; this machine where None
     threads: int = 2  # of each
     shard_size: int = 50  # photos
+
+    @property
+    def for_inpainter(self) -> InpainterOptions:
+        """What an inpainter with a network takes."""
+        device = None if self.base.device == "auto" else self.base.device
+        return InpainterOptions(self.inpainter_weights, self.inpainter_side or SIDE, device)
 
 
 def base_options(
@@ -72,9 +84,15 @@ def check_dataset_options(options: DatasetOptions) -> None:
         ("--workers", options.workers, 1, MAX_THREADS),
         ("--threads", options.threads, 1, MAX_THREADS),
         ("--shard-size", options.shard_size, 1, MAX_PHOTOS),
+        ("--inpainter-side", SIDE if options.inpainter_side is None else options.inpainter_side, MIN_SIDE, MAX_SIDE),
     ):
         if not least <= value <= most:
             raise InputError(f"{name} must be between {least} and {most}, got {value}")
+    for name, given in (("weights", options.inpainter_weights), ("side", options.inpainter_side)):
+        if given is not None and options.inpainter != "propainter":
+            raise InputError(
+                f"--inpainter-{name} {given}: the {options.inpainter} inpainter has no network: leave the option out"
+            )
 
 
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter) -> dict[str, Any]:
@@ -83,7 +101,7 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
     Threads are part of it: SHARP's last bits depend on their number. Workers are not.
     """
     base = options.base
-    inputs = hashlib.sha256(json.dumps([_inputs(photo, base) for photo in photos]).encode()).hexdigest()
+    inputs = hashlib.sha256(json.dumps([inputs_of(photo, base) for photo in photos]).encode()).hexdigest()
     choices = dataclasses.asdict(options.choices)
     return {
         "spackle": spackle.__version__,
@@ -95,10 +113,17 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
             "device": base.device,
         },
         "views": choices | {"disparity": list(options.choices.disparity)},
-        "inpainter": {"name": inpainter.name, "version": inpainter.version},
+        "inpainter": {"name": inpainter.name, "version": inpainter.version} | _inpainter_weights(options),
         "shard_size": options.shard_size,
         "threads": options.threads,
     }
+
+
+def _inpainter_weights(options: DatasetOptions) -> dict[str, dict[str, str]]:
+    """SHA-256 of each file of an inpainter that has any."""
+    if options.inpainter_weights is None:
+        return {}
+    return {"weights": {name: weights_digest(file) for name, file in weight_files(options.inpainter_weights).items()}}
 
 
 def depth_of(photo: PhotoFile, depth: Path) -> Path:
@@ -120,7 +145,7 @@ def weights_digest(path: Path) -> str:
         return digest(file).hexdigest()
 
 
-def _inputs(photo: PhotoFile, base: PredictOptions) -> list[str]:
+def inputs_of(photo: PhotoFile, base: PredictOptions) -> list[str]:
     """Name and content of a photo and of its depth map."""
     if base.depth is None:
         return [photo.name, photo.sha256]

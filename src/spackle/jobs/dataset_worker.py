@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from pathlib import Path
@@ -28,6 +29,7 @@ from spackle.pseudo.inpainters import Inpainter, get_inpainter
 from spackle.pseudo.photos import PhotoFile
 
 PARTS = "parts"  # in the output: samples that are in no shard yet
+IN_HAND = 2  # photos of a worker: the one it works on, and the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,13 +62,21 @@ class Maker:
     def of(options: DatasetOptions, output: Path) -> Maker:
         """Set up; a network is loaded with the first photo. InputError where that cannot be."""
         tools = set_up(options.base)
-        return Maker(options, output, tools, get_inpainter(options.inpainter, tools.renderer))
+        return Maker(options, output, tools, get_inpainter(options.inpainter, tools.renderer, options.for_inpainter))
 
     def make(self, job: Job) -> Made:
         """Write a photo's sample, whole or not at all.
 
         Raises:
             InputError: no photo can be worked on, or nothing can be written.
+        """
+        return keep(self.output, *self.sample(job))
+
+    def sample(self, job: Job) -> tuple[Made, bytes | None]:
+        """A photo's sample, or None where it gives none.
+
+        Raises:
+            InputError: no photo can be worked on.
         """
         index, photo = job
         seconds: Seconds = {}
@@ -77,10 +87,8 @@ class Maker:
         except BaseError:
             raise
         except InputError as error:
-            return Made(index, seconds, str(error))
-        with timed("write", seconds), atomic_path(part_file(self.output, index)) as temporary:
-            temporary.write_bytes(data)
-        return Made(index, seconds, None)
+            return Made(index, seconds, str(error)), None
+        return Made(index, seconds, None), data
 
     def _predict(self, file: PhotoFile, photo: Photo) -> BasePrediction:
         options = self.options.base
@@ -91,6 +99,14 @@ class Maker:
                 raise BaseError(str(error)) from error
         depth = depth_of(file, options.depth)
         return make_base(photo, dataclasses.replace(options, depth=depth), self.tools).predict(photo)
+
+
+def keep(output: Path, made: Made, data: bytes | None) -> Made:
+    """Write a sample, if there is one, where it waits for its shard; InputError where that cannot be."""
+    if data is not None:
+        with timed("write", made.seconds), atomic_path(part_file(output, made.index)) as temporary:
+            temporary.write_bytes(data)
+    return made
 
 
 @contextlib.contextmanager
@@ -113,16 +129,19 @@ def at_work(options: DatasetOptions, output: Path, jobs: Sequence[Job]) -> Itera
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(options, output))
     try:
-        futures = [pool.submit(_make, job) for job in jobs]
-        yield _results(futures)
+        yield _results((pool.submit(_make, job) for job in jobs), IN_HAND * count)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _results(futures: Sequence[Future[Made]]) -> Iterator[Made]:
+def _results(futures: Iterable[Future[Made]], most: int = 1) -> Iterator[Made]:
+    """Results as they come; the next future is taken when fewer than `most` are open."""
+    left, open_ones = iter(futures), set[Future[Made]]()
     try:
-        for future in as_completed(futures):
-            yield future.result()
+        while open_ones := open_ones | set(itertools.islice(left, most - len(open_ones))):
+            done, open_ones = wait(open_ones, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
     except BrokenProcessPool as error:
         raise InputError(
             "a worker process died, most likely for want of memory: take fewer --workers; the same command goes on"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Protocol
 
 import torch
@@ -11,10 +13,20 @@ from torch import Tensor
 from spackle.errors import InputError
 from spackle.fill import far_fill
 from spackle.pseudo.opencv import OpencvInpainter
+from spackle.pseudo.propainter import SIDE, PropainterInpainter
 from spackle.pseudo.views import ViewStack
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, hole_mask
+
+
+@dataclasses.dataclass(frozen=True)
+class InpainterOptions:
+    """What only an inpainter with a network takes."""
+
+    weights: Path | None = None  # a folder
+    side: int = SIDE  # pixels of the long side at which it works
+    device: str | None = None  # "cpu" or "cuda"; where None, CUDA if there is any
 
 
 class Inpainter(Protocol):
@@ -78,23 +90,23 @@ def closed(drawn: Rendering) -> Tensor:
     return far_fill(inverse_depth, drawn.rgb.permute(2, 0, 1), known)[1].permute(1, 2, 0)
 
 
-# The paper's ProPainter would be one more: a class of its own file, which imports the package inside it.
-INPAINTERS: dict[str, Callable[[Renderer], Inpainter]] = {
-    "geometry": GeometryInpainter,
-    "opencv": lambda renderer: OpencvInpainter(),
-    "none": lambda renderer: NoInpainter(),
+INPAINTERS: dict[str, Callable[[Renderer, InpainterOptions], Inpainter]] = {
+    "geometry": lambda renderer, options: GeometryInpainter(renderer),
+    "opencv": lambda renderer, options: OpencvInpainter(),
+    "propainter": lambda renderer, options: PropainterInpainter(options.weights, options.side, options.device),
+    "none": lambda renderer, options: NoInpainter(),
 }
 
 
-def get_inpainter(name: str, renderer: Renderer) -> Inpainter:
+def get_inpainter(name: str, renderer: Renderer, options: InpainterOptions | None = None) -> Inpainter:
     """An inpainter by its name.
 
     Raises:
-        InputError: an unknown one, or one whose package is not installed.
+        InputError: an unknown one, or one whose package or weights are not there.
     """
     if name not in INPAINTERS:
         raise InputError(f"--inpainter {name}: unknown; there are {', '.join(inpainter_names())}")
-    return INPAINTERS[name](renderer)
+    return INPAINTERS[name](renderer, options or InpainterOptions())
 
 
 def inpainter_names() -> Sequence[str]:

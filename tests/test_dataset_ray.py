@@ -1,0 +1,268 @@
+"""A dataset built by workers on a Ray cluster: the same bytes, whoever dies, and a line where that cannot be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from command import Run, names_in
+from test_dataset import SHORT, build, content, is_alive, write_inputs
+
+from spackle.jobs import dataset_crew, dataset_ray
+from spackle.jobs.dataset_options import DatasetOptions, base_options, view_choices
+from spackle.jobs.dataset_remote import RemoteMaker
+from spackle.jobs.dataset_worker import IN_HAND, Job, Made
+from spackle.pseudo.photos import PhotoFile
+
+os.environ.setdefault("RAY_AUTH_MODE", "token")  # before it is loaded: a cluster of newer versions wants one
+ray = pytest.importorskip("ray")
+
+CLUSTER = """
+import ray, sys
+context = ray.init("local", num_cpus=2, num_gpus=0, include_dashboard=False, log_to_driver=False, logging_level="error")
+print(context.address_info["address"], flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photos, their depth, and the dataset that one process makes of them."""
+    place = write_inputs(tmp_path_factory.mktemp("ray"), 6)
+    assert build(place, place / "whole").code == 0
+    return place
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """Of a cluster with room for two workers; it ends with the process that holds it."""
+    with subprocess.Popen([sys.executable, "-c", CLUSTER], stdin=-1, stdout=-1, stderr=-3, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.communicate()
+
+
+def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteMaker]:
+    """Workers of which the first few are killed when they have made this photo, or as they begin."""
+
+    def turn() -> None:
+        turns = len(list(notes.iterdir()))
+        if turns < times:
+            (notes / str(turns)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    class Dying(RemoteMaker):
+        def begin(self, expected: Any) -> None:
+            if where == "begin":
+                turn()
+            super().begin(expected)
+
+        def make(self, job: Job, seen: Sequence[str]) -> tuple[Made, bytes | None]:
+            answer = super().make(job, seen)
+            if where == "make" and job[0] == at:
+                turn()
+            return answer
+
+    notes.mkdir()
+    return Dying
+
+
+def on(address: str, place: Path, output: Path, *more: object) -> Run:
+    return build(place, output, "--ray", address, "--workers", 2, *more)
+
+
+# The same bytes -----------------------------------------------------------------------------------
+
+
+def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    done = on("local", place, tmp_path / "out")
+    assert done.code == 0, done.err
+    assert done.out == ""
+    assert len(done.lines) == 2, done.err  # nothing of Ray's own
+    assert content(tmp_path / "out") == content(place / "whole")
+    assert not ray.is_initialized()
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_photos_of_a_killed_worker_are_made_again_by_another(
+    place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_crew, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
+    done = on(address, place, tmp_path / "out")
+    assert (done.code, done.out) == (0, ""), done.err
+    assert len(done.lines) == 3
+    assert f"{place}/photos/3.png: at this photo a worker died, and another takes its place" in done.lines[0]
+    assert names_in(tmp_path / "notes") == {"0"}  # one was killed
+    assert content(tmp_path / "out") == content(place / "whole")
+
+
+@pytest.mark.slow
+def test_a_photo_that_kills_every_worker_ends_the_build_which_goes_on_later(
+    place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset_crew, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
+        done = on(address, place, tmp_path / "out")
+    assert (done.code, done.out, len(done.lines)) == (2, "", 4)
+    assert f"{place}/photos/3.png: at this photo a worker died for the 4th time" in done.lines[-1]
+    assert names_in(tmp_path / "notes") == {"0", "1", "2", "3"}
+    assert build(place, tmp_path / "out").code == 0
+    assert content(tmp_path / "out") == content(place / "whole")
+
+
+@pytest.mark.slow
+def test_workers_and_their_cluster_end_with_a_killed_build(place: Path, tmp_path: Path) -> None:
+    note = tmp_path / "processes"
+    words = ["spackle", "dataset", "build", "--photos", place / "photos", "--depth", place / "depth", *SHORT]
+    words += ["-o", tmp_path / "out", "--ray", "local", "--workers", 2]
+    code = f"""
+import os, subprocess, sys
+sys.argv = {[str(word) for word in words]!r}
+import spackle.jobs.dataset_build as build
+def dying(*arguments):
+    with open({str(note)!r}, "w") as file:
+        subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
+    os.kill(os.getpid(), 9)
+build._Build._note = dying
+from spackle.cli import main
+main()
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    assert process.wait() == -signal.SIGKILL
+    # Ray's own agents take a minute.
+    pids = [pid for pid, args in below(process.pid, note.read_text()) if "agent" not in args.lower()]
+    assert len(pids) >= 4  # two workers, and at least two that Ray consists of
+    deadline = time.monotonic() + 30
+    while any(is_alive(pid) for pid in pids):
+        assert time.monotonic() < deadline, "a process of the cluster goes on"
+        time.sleep(0.1)
+    assert build(place, tmp_path / "out").code == 0
+    assert content(tmp_path / "out") == content(place / "whole")
+
+
+def below(top: int, listing: str) -> list[tuple[int, str]]:
+    """Number and command of every process that a process has started, or one of those, by what ps says."""
+    rows = [line.split(None, 2) for line in listing.splitlines()]
+    own = [(int(pid), args) for pid, parent, args in rows if int(parent) == top and not args.startswith("ps ")]
+    return own + [row for pid, _ in own for row in below(pid, listing)]
+
+
+# What cannot be -----------------------------------------------------------------------------------
+
+
+def test_without_ray_there_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    done = on("local", place, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "--ray local: needs a package: pip install 'spackle-nvs[ray]'" in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_address_where_nobody_answers_is_a_line(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_ray, "ANSWER_S", 1.0)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with socket.socket() as nobody:  # takes the port, and no calls
+        nobody.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{nobody.getsockname()[1]}"
+        done = on(address, place, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert f"--ray {address}: no cluster: no answer within 1 seconds: is one running there" in done.err
+    monkeypatch.setattr(dataset_ray, "ANSWER_S", 60.0)
+    done = on("nowhere", place, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "--ray nowhere: no cluster: ValueError: " in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_without_room_is_a_line(place: Path, address: str, tmp_path: Path) -> None:
+    done = on(address, place, tmp_path / "out", "--workers", 3)
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert f"--ray {address}: room for 2 of 3 workers, which take 1 CPUs each, on 1 nodes" in done.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "instead", "line"),
+    [
+        ("what_is_seen", ["another", "photo"], "0.png: node {node} does not find this photo or its depth map"),
+        ("setting", {"spackle": "0.0"}, 'would make another dataset (base: null -> {{"name'),
+        ("RemoteMaker", "begin", "as it started a worker died for the 4th time"),
+    ],
+)
+def test_a_node_that_is_not_like_the_others_is_a_line(
+    place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, instead: Any, line: str
+) -> None:
+    if name == "RemoteMaker":
+        monkeypatch.setattr(dataset_crew, name, dying(0, 99, tmp_path / "notes", instead))
+    else:
+        monkeypatch.setattr(dataset_crew, name, lambda *arguments: instead)
+    done = on(address, place, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1 if name != "RemoteMaker" else 4)
+    assert line.format(node=socket.gethostname()) in done.lines[-1]
+    assert names_in(tmp_path / "out" / "parts") == set()
+
+
+def test_a_worker_takes_a_gpu_only_where_a_network_uses_one(tmp_path: Path) -> None:
+    def options(base: str, device: str = "auto", inpainter: str = "geometry") -> DatasetOptions:
+        one = base_options(base, None, None, "auto", device)
+        return DatasetOptions(one, view_choices(0, 2, None, (0.1, 0.2)), inpainter=inpainter)
+
+    with_one = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": True, "Resources": {"CPU": 4.0, "GPU": 1.0}}]
+    assert dataset_ray.gpus_of(options("sharp"), with_one) == 1
+    assert dataset_ray.gpus_of(options("rgbd", inpainter="propainter"), with_one) == 1
+    assert dataset_ray.gpus_of(options("rgbd"), with_one) == 0
+    assert dataset_ray.gpus_of(options("sharp", "cpu"), with_one) == 0
+    assert dataset_ray.gpus_of(options("sharp"), with_one[:1]) == 0
+    assert dataset_ray.gpus_of(options("sharp"), [with_one[0], {**with_one[1], "Alive": False}]) == 0
+
+
+# Back-pressure ------------------------------------------------------------------------------------
+
+
+def noting(counts: list[int]) -> SimpleNamespace:
+    """Stands in for the package: answers the oldest call first, and counts at each call how many are open."""
+    calls: list[Callable[[], object]] = []
+
+    def ask(answer: object) -> Callable[[], object]:
+        calls.append(lambda: answer)
+        counts.append(len(calls))
+        return calls[-1]
+
+    def get(call: Callable[[], object]) -> object:
+        calls.remove(call)
+        return call()
+
+    actor = SimpleNamespace(
+        begin=SimpleNamespace(remote=lambda expected: ask(None)),
+        make=SimpleNamespace(remote=lambda job, seen: ask((Made(job[0], {}, "none"), None))),
+    )
+    return SimpleNamespace(
+        remote=lambda **resources: lambda kind: SimpleNamespace(remote=lambda *arguments: actor),
+        wait=lambda calls, timeout: (calls[:1], calls[1:]),
+        get=get,
+        kill=lambda actor: None,
+        exceptions=ray.exceptions,
+    )
+
+
+def test_workers_have_few_photos_in_hand(tmp_path: Path) -> None:
+    base = base_options("rgbd", tmp_path, None, "auto", "auto")
+    options = DatasetOptions(base, view_choices(0, 2, None, (0.1, 0.2)), workers=3, ray="local")
+    jobs = [(number, PhotoFile(tmp_path / f"{number}.png", f"{number}.png", "")) for number in range(50)]
+    counts: list[int] = []
+    crew = dataset_crew.Crew(noting(counts), options, tmp_path, jobs, 0, print)
+    assert sorted(made.index for made in crew.results()) == list(range(50))
+    assert max(counts) == 3 * IN_HAND

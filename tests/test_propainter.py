@@ -1,0 +1,493 @@
+"""ProPainter with random weights, from their files to a whole dataset, over a stand-in for torchvision.
+
+The networks are the published ones in full size, on the smallest pictures that they take.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from command import Run, run
+from deform_conv import DeformConv2d
+from photos import metres, picture, write_depth
+from PIL import Image
+from safetensors.torch import save_file
+from scenes import Scene, box_before_wall, shifted
+from torch import Tensor, nn
+
+from spackle.errors import InputError
+from spackle.pseudo.inpainters import InpainterOptions, get_inpainter
+from spackle.pseudo.manifest import load_manifest
+from spackle.pseudo.propainter import DILATION, PropainterInpainter, dilated, padded, path_order
+from spackle.pseudo.propainter_weights import NETWORKS, give_weights, weight_files
+from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views
+from spackle.render import get_renderer
+from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind
+
+OURS = ("torchvision", "pytorchcv.models.propainter")  # modules that hold the convolution
+SHORT = ["--base", "rgbd", "--views", 3, "--threads", 1, "--trajectory", "swipe", "--disparity", 0.3, 0.4]
+
+
+# The convolution ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("groups", "offset_groups", "stride", "padding", "dilation", "bias"),
+    [(1, 1, 1, 1, 1, True), (2, 4, 2, 1, 2, True), (1, 2, (2, 1), (0, 2), (1, 3), False), (4, 1, 1, 0, 1, False)],
+)
+def test_the_convolution_is_that_of_its_definition(
+    groups: int, offset_groups: int, stride: Any, padding: Any, dilation: Any, bias: bool
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    conv = DeformConv2d(8, 4, (3, 2), stride, padding, dilation, groups, bias).double()
+    for parameter in conv.parameters():
+        parameter.data.normal_(generator=generator)
+    image = torch.randn(2, 8, 6, 7, generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        plain = F.conv2d(image, conv.weight, conv.bias, stride, padding, dilation, groups)
+        still = torch.zeros(2, 2 * offset_groups * 6, *plain.shape[-2:], dtype=torch.float64)
+        torch.testing.assert_close(conv(image, still), plain)
+        torch.testing.assert_close(conv(image, still, torch.ones_like(still[:, ::2])), plain)
+        offset = 3 * torch.randn(still.shape, generator=generator, dtype=torch.float64)
+        mask = torch.rand(still[:, ::2].shape, generator=generator, dtype=torch.float64)
+        torch.testing.assert_close(conv(image, offset, mask), slow(conv, image, offset, mask))
+
+
+def slow(conv: nn.Conv2d, image: Tensor, offset: Tensor, mask: Tensor) -> Tensor:
+    """The same, number by number."""
+    batch, channels, height, width = image.shape
+    rows, columns = conv.kernel_size
+    taps = rows * columns
+    per_offset = channels * 2 * taps // offset.shape[1]  # input channels that share their offsets
+    per_group, out_per_group = channels // conv.groups, conv.out_channels // conv.groups
+    out = torch.zeros(batch, conv.out_channels, *offset.shape[-2:], dtype=image.dtype)
+    padding, stride, dilation = (tuple(map(int, pair)) for pair in (conv.padding, conv.stride, conv.dilation))
+
+    def at(b: int, c: int, y: float, x: float) -> float:
+        total = 0.0
+        for v in (int(np.floor(y)), int(np.floor(y)) + 1):
+            for u in (int(np.floor(x)), int(np.floor(x)) + 1):
+                if 0 <= v < height and 0 <= u < width:
+                    total += (1 - abs(y - v)) * (1 - abs(x - u)) * float(image[b, c, v, u])
+        return total
+
+    for b, o, i, j in np.ndindex(*out.shape):
+        total = 0.0 if conv.bias is None else float(conv.bias[o])
+        for c, tap in np.ndindex(per_group, taps):
+            channel, n = o // out_per_group * per_group + c, tap
+            n += (o // out_per_group * per_group + c) // per_offset * taps
+            y = i * stride[0] - padding[0] + tap // columns * dilation[0] + float(offset[b, 2 * n, i, j])
+            x = j * stride[1] - padding[1] + tap % columns * dilation[1] + float(offset[b, 2 * n + 1, i, j])
+            weight = float(conv.weight[o, c, tap // columns, tap % columns])
+            total += weight * float(mask[b, n, i, j]) * at(b, channel, y, x)
+        out[b, o, i, j] = total
+    return out
+
+
+def test_the_convolution_is_torchvisions_where_that_can_be_imported() -> None:
+    try:
+        from torchvision.ops import deform_conv2d
+    except Exception as error:  # beside a torch without CUDA it is a RuntimeError
+        pytest.skip(f"torchvision: {error}")
+    conv = DeformConv2d(8, 12, 3, 1, 1, groups=2)
+    image, offset = torch.randn(2, 8, 9, 10), torch.randn(2, 4 * 2 * 9, 9, 10)
+    mask = torch.rand(2, 4 * 9, 9, 10)
+    theirs = deform_conv2d(image, offset, conv.weight, conv.bias, padding=1, mask=mask)
+    torch.testing.assert_close(conv(image, offset, mask), theirs)
+
+
+# Parts that need no package -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_the_photo_stands_where_the_path_passes_it(kind: TrajectoryKind) -> None:
+    camera = box_before_wall().camera
+    cameras = path_cameras(PathChoice(kind, 0.3), camera, DepthRange(2.0, 3.0), 20)
+    order = path_order(cameras)
+    assert sorted(order) == list(range(20))
+    assert [index for index in order if index] == list(range(1, 20))
+    eyes = torch.stack([cameras[index].position for index in order])
+    steps = eyes.diff(dim=0).norm(dim=-1)
+    in_front = torch.stack([view.position for view in cameras]).diff(dim=0).norm(dim=-1)
+    assert float(steps.sum()) <= float(in_front.sum())
+    assert path_order(cameras[:1]) == [0]
+
+
+def test_holes_grow_by_steps_and_sides_to_what_the_networks_take() -> None:
+    hole = torch.zeros(1, 1, 20, 20)
+    hole[0, 0, 10, 8] = 1
+    y, x = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
+    assert torch.equal(dilated(hole)[0, 0] > 0, (y - 10).abs() + (x - 8).abs() <= DILATION)
+    assert [padded(side) for side in (1, 127, 128, 129, 136, 640)] == [128, 128, 128, 136, 136, 640]
+
+
+# With the package ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """pytorchcv beside a torchvision that has nothing but the convolution, in this process and in those it starts."""
+    pytest.importorskip("pytorchcv")
+    place = tmp_path_factory.mktemp("stand_in")
+    (place / "torchvision").mkdir()
+    (place / "torchvision" / "__init__.py").write_text("")
+    (place / "torchvision" / "ops.py").write_text("from deform_conv import DeformConv2d\n")
+    with pytest.MonkeyPatch.context() as patch:
+        forget_package()
+        patch.setattr(sys, "path", [str(place), *sys.path])
+        yield
+    forget_package()
+
+
+def forget_package() -> None:
+    for name in [name for name in sys.modules if name.startswith(OURS)]:
+        del sys.modules[name]
+
+
+def random_networks() -> dict[str, nn.Module]:
+    """The architectures with numbers that anyone can draw, the same each time."""
+    from pytorchcv.models.propainter import propainter
+    from pytorchcv.models.propainter_rfc import propainter_rfc
+    from pytorchcv.models.raft import raft_things
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return {"raft_things": raft_things(), "propainter_rfc": propainter_rfc(), "propainter": propainter()}
+
+
+@pytest.fixture(scope="module")
+def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files as they are published, two by torch.save and one as safetensors, in half precision to save room."""
+    folder = tmp_path_factory.mktemp("weights")
+    for name, network in random_networks().items():
+        tensors = {
+            key: value.half() if value.is_floating_point() else value for key, value in network.state_dict().items()
+        }
+        if name == "raft_things":
+            save_file(tensors, folder / f"{name}.safetensors")
+        else:
+            torch.save(tensors | {"of_somebody_else": torch.zeros(1)}, folder / f"{name}-0000-random.pth")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inpainter(weights: Path) -> PropainterInpainter:
+    """With random weights."""
+    return PropainterInpainter(weights, device="cpu")
+
+
+def stack_of(scene: Scene, rights: list[float]) -> ViewStack:
+    """What cameras beside the photo's see."""
+    cameras = [scene.camera, *(shifted(scene.camera, right) for right in rights)]
+    return render_views(scene.base(), scene.camera, cameras, get_renderer())
+
+
+@pytest.fixture(scope="module")
+def seen() -> ViewStack:
+    """Three views whose sides are no multiples of anything, one of them without a hole."""
+    stack = stack_of(box_before_wall(width=75, height=54), [-0.3, 0.4])
+    mask = stack.mask.clone()
+    mask[0] = False
+    return dataclasses.replace(stack, mask=mask)
+
+
+@pytest.fixture(scope="module")
+def targets(inpainter: PropainterInpainter, seen: ViewStack) -> Tensor:
+    return inpainter.complete(seen)
+
+
+def test_holes_get_colours_and_all_else_stays(targets: Tensor, seen: ViewStack) -> None:
+    assert targets.shape == seen.rgb.shape
+    assert targets.dtype == torch.float32
+    assert torch.equal(targets[~seen.mask], seen.rgb[~seen.mask])
+    assert torch.equal(targets[0], seen.rgb[0])
+    inside = targets[seen.mask]
+    assert bool(((inside >= 0) & (inside <= 1)).all())
+    assert float((inside - seen.rgb[seen.mask]).abs().mean()) > 0.05
+
+
+def test_the_same_views_give_the_same_bits(weights: Path, targets: Tensor, seen: ViewStack) -> None:
+    again = get_inpainter("propainter", get_renderer(), InpainterOptions(weights, device="cpu"))
+    assert torch.equal(again.complete(seen), targets)
+    assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", again.version)
+
+
+def test_one_view_and_views_without_a_hole(inpainter: PropainterInpainter, seen: ViewStack) -> None:
+    parts = {name: getattr(seen, name)[1:2] for name in ("cameras", "rgb", "depth", "alpha", "mask")}
+    alone = inpainter.complete(dataclasses.replace(seen, **parts))
+    assert torch.equal(alone[~seen.mask[1:2]], seen.rgb[1:2][~seen.mask[1:2]])
+    assert float((alone - seen.rgb[1:2]).abs().max()) > 0.05
+    whole = dataclasses.replace(seen, mask=torch.zeros_like(seen.mask))
+    assert torch.equal(inpainter.complete(whole), seen.rgb)
+
+
+class Video:
+    """In place of the networks: says what they were given, and paints the holes grey."""
+
+    given: list[tuple[Tensor, Tensor]]
+
+    def __init__(self, frames: Any, masks: Any, *networks: nn.Module, use_cuda: bool, step: int) -> None:
+        self.frames, self.masks = frames[0:step], masks[0:step]
+        Video.given.append((self.frames, self.masks))
+
+    def __iter__(self) -> Iterator[Tensor]:
+        yield self.frames * (1 - self.masks) + 0.5 * self.masks
+
+
+@pytest.fixture
+def video(package: None, monkeypatch: pytest.MonkeyPatch) -> type[Video]:
+    Video.given = []
+    monkeypatch.setattr("pytorchcv.models.propainter_stream.ProPainterIterator", Video)
+    return Video
+
+
+def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterInpainter) -> None:
+    stack = stack_of(box_before_wall(width=150, height=113), [0.3, -0.3, -0.4])
+    targets = inpainter.complete(stack)
+    frames, masks = video.given[0]
+    assert frames.shape == (4, 3, 128, 152)
+    assert masks.shape == (4, 1, 128, 152)
+    order = [1, 0, 2, 3]
+    torch.testing.assert_close(frames[:, :, :113, :150], 2 * stack.rgb[order].permute(0, 3, 1, 2) - 1)
+    assert torch.equal(masks[:, :, :113, :150], dilated(stack.mask[order, None].float()))
+    assert torch.equal(frames[:, :, 112:113].expand(-1, -1, 16, -1), frames[:, :, 112:])
+    torch.testing.assert_close(targets[stack.mask], torch.full((int(stack.mask.sum()), 3), 0.75))
+
+
+def test_large_views_are_worked_on_in_small_and_no_hole_is_lost(video: type[Video], weights: Path) -> None:
+    stack = stack_of(box_before_wall(width=300, height=200), [0.2])
+    mask = torch.zeros_like(stack.mask)
+    mask[1, 50, :] = True  # one pixel high
+    stack = dataclasses.replace(stack, mask=mask)
+    small = PropainterInpainter(weights, side=150, device="cpu")
+    targets = small.complete(stack)
+    frames, _ = video.given[0]
+    assert frames.shape == (2, 3, 128, 152)
+    assert torch.equal(targets[~mask], stack.rgb[~mask])
+    torch.testing.assert_close(targets[mask], torch.full((300, 3), 0.75))
+    assert "long side 150" in small.version
+
+
+def test_colours_that_are_none_are_refused(
+    video: type[Video], inpainter: PropainterInpainter, seen: ViewStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Video, "__iter__", lambda self: iter([self.frames * torch.nan]))
+    with pytest.raises(InputError, match="not finite"):
+        inpainter.complete(seen)
+
+    def short(self: Video) -> Iterator[Tensor]:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(Video, "__iter__", short)
+    with pytest.raises(InputError, match="lower --inpainter-side"):
+        inpainter.complete(seen)
+
+
+# Weights ------------------------------------------------------------------------------------------
+
+
+def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"give --inpainter-weights FOLDER with raft_things, .* unpacked from https"):
+        weight_files(None)
+    with pytest.raises(InputError, match="no folder that can be read"):
+        weight_files(tmp_path / "missing")
+    with pytest.raises(InputError, match="holds no raft_things"):
+        weight_files(tmp_path)
+    for name in ("raft_things-0000-d74fed4b.pth", "propainter_rfc-0000-a865ddc0.pth", "propainter-0000-5f3cc1e7.pth"):
+        (tmp_path / name).write_bytes(b"")
+    assert [file.name.split("-")[0] for file in weight_files(tmp_path).values()] == list(NETWORKS)
+    with pytest.raises(InputError, match="no folder"):
+        weight_files(tmp_path / "propainter-0000-5f3cc1e7.pth")
+    (tmp_path / "propainter.safetensors").write_bytes(b"")
+    with pytest.raises(InputError, match=r"holds propainter-0000-5f3cc1e7.pth and propainter.safetensors"):
+        weight_files(tmp_path)
+
+
+class Small(nn.Module):
+    """A network with a constant of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(3, 2)
+        self.register_buffer("where", torch.arange(4))
+
+
+def test_weights_are_widened_and_constants_stay(tmp_path: Path) -> None:
+    network = Small()
+    values = {"linear.weight": torch.ones(2, 3).half(), "linear.bias": torch.zeros(2), "where": torch.tensor([9] * 4)}
+    torch.save(values | {"more": [1]}, tmp_path / "a.pth")
+    give_weights(network, "small", tmp_path / "a.pth")
+    assert network.linear.weight.tolist() == [[1.0] * 3] * 2
+    assert network.linear.weight.dtype == torch.float32
+    assert network.get_buffer("where").tolist() == [0, 1, 2, 3]
+    assert not network.linear.weight.requires_grad
+
+
+def broken_files() -> dict[str, tuple[Callable[[Path], object], str]]:
+    """Names, how to write them, and what is said of them."""
+    good = {"linear.weight": torch.ones(2, 3), "linear.bias": torch.zeros(2)}
+
+    def cut(path: Path) -> None:
+        torch.save(good, path)
+        path.write_bytes(path.read_bytes()[:-200])
+
+    return {
+        "missing.pth": (lambda path: None, "no such weight file"),
+        "folder.pth": (Path.mkdir, "not a plain file"),
+        "empty.pth": (Path.touch, "the file is empty"),
+        "garbled.pth": (lambda path: path.write_bytes(b"\x80\x02no" * 50), "cannot be read as weights"),
+        "text.pth": (lambda path: path.write_text("<html>" * 9), "cannot be read as weights"),
+        "cut.pth": (cut, "cannot be read as weights"),
+        "cut.safetensors": (
+            lambda path: path.write_bytes(b"\x40\0\0\0\0\0\0\0{" + b" " * 9),
+            "cannot be read as weights",
+        ),
+        "code.pth": (lambda path: torch.save({"linear.weight": print}, path), "cannot be read as weights"),
+        "alone.pth": (lambda path: torch.save(torch.ones(3), path), "cannot be read as weights"),
+        "others.pth": (lambda path: torch.save({"a": torch.ones(3)}, path), "2 of 2 tensors are missing"),
+        "shape.pth": (lambda path: torch.save(good | {"linear.bias": torch.ones(3)}, path), "such as linear.bias"),
+        "whole.pth": (lambda path: torch.save(good | {"linear.bias": torch.ones(2).int()}, path), "1 of 2 tensors"),
+        "nan.pth": (lambda path: torch.save(good | {"linear.bias": torch.tensor([0, torch.nan])}, path), "not finite"),
+        "sparse.pth": (
+            lambda path: torch.save(good | {"linear.weight": good["linear.weight"].to_sparse()}, path),
+            "1 of",
+        ),
+        "small-0000-0badf00d.pth": (lambda path: torch.save(good, path), "SHA-1 is not the one in its name"),
+    }
+
+
+@pytest.mark.parametrize("name", broken_files())
+def test_broken_weights_are_a_line(tmp_path: Path, name: str) -> None:
+    write, said = broken_files()[name]
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=said) as caught:
+        give_weights(Small(), "small", tmp_path / name)
+    assert str(caught.value).startswith(f"{tmp_path / name}: ")
+    assert "\n" not in str(caught.value)
+
+
+# The command --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two photos, one as small as a photo may be, and their depth."""
+    folder = tmp_path_factory.mktemp("inputs")
+    (folder / "photos").mkdir()
+    for name, width, height in (("a", 72, 54), ("b", 33, 32)):
+        Image.fromarray(picture(width, height)).save(folder / "photos" / f"{name}.png")
+        write_depth(folder / "depth" / f"{name}.npy", metres(width, height))
+    return folder
+
+
+def build(place: Path, output: Path, *more: object) -> Run:
+    return run(
+        "dataset", "build", "--photos", place / "photos", "--depth", place / "depth", "-o", output, *SHORT, *more
+    )
+
+
+@pytest.fixture(scope="module")
+def built(place: Path, weights: Path) -> tuple[Path, Run]:
+    output = place / "built"
+    return output, build(place, output, "--inpainter", "propainter", "--inpainter-weights", weights)
+
+
+def test_a_dataset_is_built_and_says_by_what(built: tuple[Path, Run]) -> None:
+    output, done = built
+    assert done.code == 0, done.err
+    assert [line for line in done.lines if "S-Lab" in line and "non-commercial" in line] == [done.lines[0]]
+    assert run("dataset", "verify", output).code == 0
+    manifest = load_manifest(output)
+    assert [entry.photo for _, entry in manifest.samples] == ["a.png", "b.png"]
+    used = manifest.config["inpainter"]
+    assert used["name"] == "propainter"
+    assert used["version"].endswith("long side 640")
+    assert used["weights"].keys() == set(NETWORKS)
+    assert all(re.fullmatch("[0-9a-f]{64}", sha256) for sha256 in used["weights"].values())
+    json.dumps(dict(manifest.config))
+
+
+def test_two_workers_make_the_same_bytes(built: tuple[Path, Run], place: Path, weights: Path, tmp_path: Path) -> None:
+    options = ["--inpainter", "propainter", "--inpainter-weights", weights, "--workers", 2]
+    done = build(place, tmp_path / "out", *options)
+    assert done.code == 0, done.err
+    assert {file.name: file.read_bytes() for file in built[0].iterdir()} == {
+        file.name: file.read_bytes() for file in (tmp_path / "out").iterdir()
+    }
+
+
+def test_other_weights_are_another_dataset(built: tuple[Path, Run], place: Path, weights: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(weights, tmp_path / "other")
+    save_file(
+        {k: v + 1 for k, v in random_networks()["raft_things"].state_dict().items()}, other / "raft_things.safetensors"
+    )
+    done = build(place, built[0], "--inpainter", "propainter", "--inpainter-weights", other, "--inpainter-side", 320)
+    assert done.code == 2
+    assert "inpainter.weights.raft_things: " in done.lines[-1]
+    assert "inpainter.weights.propainter: " not in done.lines[-1]
+    assert "long side 640" in done.lines[-1]
+    assert "long side 320" in done.lines[-1]
+
+
+def test_options_that_cannot_be_are_a_line_and_leave_nothing(place: Path, tmp_path: Path) -> None:
+    for options, said in (
+        (["--inpainter", "geometry", "--inpainter-weights", tmp_path], "the geometry inpainter has no network"),
+        (["--inpainter", "opencv", "--inpainter-side", 320], "the opencv inpainter has no network"),
+        (
+            ["--inpainter", "propainter", "--inpainter-side", 64],
+            "--inpainter-side must be between 128 and 1536, got 64",
+        ),
+    ):
+        done = build(place, tmp_path / "out", *options)
+        assert (done.code, len(done.lines)) == (2, 1)
+        assert said in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_that_cannot_be_are_a_line_and_leave_nothing(package: None, place: Path, tmp_path: Path) -> None:
+    done = build(place, tmp_path / "out", "--inpainter", "propainter")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "give --inpainter-weights FOLDER" in done.err
+    (tmp_path / "weights").mkdir()
+    for name in NETWORKS:
+        (tmp_path / "weights" / f"{name}.pth").write_bytes(b"PK\x03\x04 cut off")
+    done = build(place, tmp_path / "out", "--inpainter", "propainter", "--inpainter-weights", tmp_path / "weights")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "raft_things.pth: cannot be read as weights" in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_its_packages_propainter_is_a_line(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith(OURS)]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pytorchcv", None)
+    done = build(place, tmp_path / "out", "--inpainter", "propainter")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "pip install 'spackle-nvs[propainter]'" in done.err
+
+
+def test_a_torchvision_of_another_torch_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pytorchcv")
+    for name in [name for name in sys.modules if name.startswith(OURS)]:
+        monkeypatch.delitem(sys.modules, name)
+    (tmp_path / "torchvision").mkdir()
+    problem = "operator torchvision::nms does not exist"  # what torchvision says
+    (tmp_path / "torchvision" / "__init__.py").write_text(f"raise RuntimeError({problem!r})\n")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    done = build(place, tmp_path / "out", "--inpainter", "propainter")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert f"torchvision cannot be imported ({problem})" in done.err
+    assert torch.__version__ in done.err
