@@ -16,10 +16,10 @@ SOURCES = Path(spackle.__file__).parent
 FILES = sorted(SOURCES.rglob("*.py"))
 
 OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage", "yaml", "tensorboard")
-OPTIONAL += ("cv2", "fsspec")
+OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # Rooms in the order in which the data flows; each may import itself and what is named here.
-SHELL = {"", "__main__", "cli", "jobs", "scene"}  # thin, on top of everything; "" is the package itself
+SHELL = {"", "__main__", "cli", "cli_evaluate", "jobs", "scene"}  # thin, on top of everything; "" is the package itself
 ALLOWED = {
     "values": set(),
     "render": {"values"},

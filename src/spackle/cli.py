@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 from typer.exceptions import TyperException
 
+from spackle.cli_evaluate import register
 from spackle.errors import InputError
 
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
@@ -42,7 +43,15 @@ class InpainterChoice(str, Enum):
 
     geometry = "geometry"
     opencv = "opencv"
+    propainter = "propainter"
     none = "none"
+
+
+class MethodChoice(str, Enum):
+    """What learns."""
+
+    residual = "residual"
+    direct_ft = "direct-ft"
 
 
 class ModeChoice(str, Enum):
@@ -207,15 +216,28 @@ def train(
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
     ] = None,
+    method: Annotated[
+        MethodChoice, typer.Option(help="What learns: the residual; direct-ft: SHARP's own decoder, for comparison.")
+    ] = MethodChoice.residual,
+    checkpoint: Annotated[
+        Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where OUT holds a run.")] = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Train the residual: best.safetensors, last.safetensors, run.json, pictures and logs."""
+    """Train the residual, or SHARP itself: best.safetensors, last.safetensors, run.json, pictures and logs."""
     from spackle.jobs.progress import Reporter
     from spackle.jobs.train import train_recipe
 
-    if train_recipe(recipe, overrides or [], output, Reporter(verbose), overwrite=overwrite) == "stopped":
+    speaker, choices = Reporter(verbose), overrides or []
+    ended = train_recipe(
+        recipe, choices, output, speaker, method=method.value, checkpoint=checkpoint, overwrite=overwrite
+    )
+    if ended == "stopped":
         raise typer.Exit(INTERRUPTED)
+
+
+register(app)  # evaluate, tables
 
 
 @dataset.command("build")
@@ -243,7 +265,17 @@ def dataset_build(
     inpainter: Annotated[
         InpainterChoice, typer.Option(help="What completes the views; none leaves the holes.")
     ] = InpainterChoice.geometry,
+    inpainter_weights: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Weights of propainter: three .pth files.")
+    ] = None,
+    inpainter_side: Annotated[
+        int | None, typer.Option(help="Long side in pixels at which propainter works; default: 640.")
+    ] = None,
     workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
+    ] = None,
     threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
     shard_size: Annotated[int, typer.Option(help="Photos of a tar file.")] = 50,
     device: DeviceOption = Device.auto,
@@ -260,7 +292,10 @@ def dataset_build(
         images=images,
         sample=sample,
         inpainter=inpainter.value,
+        inpainter_weights=inpainter_weights,
+        inpainter_side=inpainter_side,
         workers=workers,
+        ray=ray,
         threads=threads,
         shard_size=shard_size,
     )

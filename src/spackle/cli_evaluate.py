@@ -1,0 +1,173 @@
+"""`spackle evaluate`, `spackle tables` and `spackle bench`, as the command line has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+STOPPED = 130  # what shells report of a command that Ctrl-C ended
+
+
+def evaluate(
+    dataset: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
+        ),
+    ],
+    root: Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")],
+    protocol: Annotated[
+        str, typer.Option(help="large-view: holes at wide moves; near-view: against true second photos.")
+    ] = "large-view",
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,…", help="Of base, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft; with commas."
+        ),
+    ] = "base,spackle",
+    disparity: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Of the large views; the paper's S1, S2, S3.")
+    ] = "0.3,0.4,0.5",
+    metrics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,…",
+            help="Of clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips, or none; default: the protocol's.",
+        ),
+    ] = None,
+    base: Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")] = "sharp",
+    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    precision: Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")] = "auto",
+    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")] = False,
+    residual: Annotated[
+        str | None,
+        typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
+    ] = None,
+    direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
+    features: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet 1.0, for the metric distance.")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")] = None,
+    download_metrics: Annotated[
+        bool, typer.Option("--download-metrics", help="Let pyiqa fetch weights (some are not for commercial use).")
+    ] = False,
+    device: Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")] = "auto",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: evaluation-NAME-PROTOCOL."
+        ),
+    ] = None,
+    html: Annotated[bool, typer.Option("--html", help="Write OUT/report.html too: one page with all of it.")] = False,
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image takes.")] = False,
+) -> None:
+    """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
+    from spackle.jobs.evaluate import evaluate as run
+    from spackle.jobs.evaluate_options import EvaluateOptions, parse_disparities, split_words
+    from spackle.jobs.options import PredictOptions
+    from spackle.jobs.progress import Reporter
+
+    options = EvaluateOptions(
+        dataset=dataset,
+        root=root,
+        protocol=protocol,
+        methods=split_words(methods),
+        disparities=parse_disparities(disparity),
+        metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
+        base=PredictOptions(
+            base=base,
+            checkpoint=checkpoint,
+            precision=precision,  # type: ignore[arg-type]  # checked with the other options
+            low_memory=low_memory,
+            residual=residual,
+            device=device,
+            render=False,
+        ),
+        direct_ft=direct_ft,
+        features=features,
+        limit=limit,
+        download=download_metrics,
+    )
+    folder = output or Path(f"evaluation-{dataset}-{protocol}")
+    if run(options, folder, Reporter(verbose), html) == "stopped":
+        raise typer.Exit(STOPPED)
+
+
+def tables(
+    results: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate` wrote.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="T", help="A folder for the files.")],
+    html: Annotated[bool, typer.Option("--html", help="Write T/report.html too: one page with all of it.")] = False,
+) -> None:
+    """Put several evaluations into the same tables: tables.md and tables.tex."""
+    from spackle.jobs.evaluate_tables import merge_tables
+    from spackle.jobs.progress import Reporter
+
+    merge_tables(results, output, Reporter(), html)
+
+
+def bench(
+    dataset: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
+        ),
+    ],
+    root: Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")],
+    disparity: Annotated[
+        str, typer.Option(metavar="A,B,…", help="Of the timed views; the paper's S1, S2, S3.")
+    ] = "0.3,0.4,0.5",
+    base: Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")] = "sharp",
+    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    precision: Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")] = "auto",
+    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")] = False,
+    residual: Annotated[
+        str | None,
+        typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")] = None,
+    runs: Annotated[int, typer.Option(help="How often everything behind the base is timed.")] = 5,
+    base_runs: Annotated[
+        int | None, typer.Option(help="How often the base is timed. [default: 1 for sharp, else as --runs]")
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")] = "auto",
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: bench-NAME-BASE."),
+    ] = None,
+    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say what each view takes.")] = False,
+) -> None:
+    """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex."""
+    from spackle.jobs.bench import bench as run
+    from spackle.jobs.bench_options import BenchOptions
+    from spackle.jobs.evaluate_options import parse_disparities
+    from spackle.jobs.options import PredictOptions
+    from spackle.jobs.progress import Reporter
+
+    options = BenchOptions(
+        dataset=dataset,
+        root=root,
+        disparities=parse_disparities(disparity),
+        base=PredictOptions(
+            base=base,
+            checkpoint=checkpoint,
+            precision=precision,  # type: ignore[arg-type]  # checked with the other options
+            low_memory=low_memory,
+            residual=residual,
+            device=device,
+            render=False,
+        ),
+        limit=limit,
+        runs=runs,
+        base_runs=base_runs,
+    )
+    if run(options, output or Path(f"bench-{dataset}-{base}"), Reporter(verbose)) == "stopped":
+        raise typer.Exit(STOPPED)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(evaluate)
+    app.command()(tables)
+    app.command()(bench)

@@ -1,0 +1,141 @@
+"""The scale between a base's depth and a dataset's lengths, and cameras brought from one to the other."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.evaluation.case import Case
+
+MIN_PIXELS = 8  # fewer give no scale
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+BOUNDS_QUANTILES = (0.001, 0.999)  # what LLFF's near and far are, of the points in a view
+
+
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """How long the base's unit is."""
+
+    scale: float  # the dataset's lengths in one unit of the base: z_dataset = scale · z_base
+    pixels: int  # with known depth, which it rests on; 0 where it comes from bounds, or nothing had to be measured
+    spread: float  # of single pixels around the scale, relative: a robust standard deviation
+    source: Literal["depth", "points", "bounds", "same"]
+
+
+SAME = Alignment(1.0, 0, 0.0, "same")
+
+
+def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = False) -> Alignment:
+    """The median of z_dataset / z_base over the pixels where both are known.
+
+    The dataset's depth map is asked first, then its points, then its bounds. A metric base and a metric dataset are
+    aligned too: what a network calls a metre rarely is one. Only a base that was made from the dataset's own depth
+    needs no scale.
+
+    Args:
+        case: whose lengths are wanted.
+        z_base: [H, W] the base's depth at the input camera, any size of the photo's shape.
+        seen: [H, W] bool, where that depth means something.
+        base_is_truth: the base lifted the dataset's own depth map.
+
+    Raises:
+        InputError: nothing is known about the case's depth, or too little of it where the base sees something.
+    """
+    if base_is_truth:
+        return SAME
+    seen = seen & torch.isfinite(z_base) & (z_base > 0)
+    if case.depth is not None and (found := _from_depth(case, z_base, seen)):
+        return found
+    if case.points is not None and (found := _from_points(case, z_base, seen)):
+        return found
+    if case.bounds is not None and seen.any():
+        return _from_bounds(case.bounds, z_base[seen])
+    sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
+    has = ", ".join(name for name, value in sources.items() if value is not None)
+    reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "no depth of it is known"
+    raise InputError(f"{case.name}: {reason}: the base's scale cannot be found, leave its second views out")
+
+
+def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
+    """A second view's camera, as the base's world has it.
+
+    A base that takes the photo's principal point to be in its middle, or has another focal length, puts what it sees
+    beside where the dataset has it, by a shear: the same pixel at the same depth is another point. The camera that
+    comes back sees the base's points where `view` sees the dataset's. Where the two look the same way, as in rectified
+    pairs, that is exact; else a skew of the pixel grid is left out, which is nothing where the two lenses agree.
+
+    Args:
+        view: in the input photo's frame and the dataset's lengths.
+        photo: the dataset's camera of the input photo.
+        base: the base's camera of the input photo (`BasePrediction.camera`), on any grid of the photo's shape.
+        scale: see `Alignment`.
+
+    Returns:
+        The camera on the grid of `view`, in the base's frame and units.
+    """
+    K, pose = view.K.double(), view.world_to_camera.double()
+    # The base's point of a pixel, times this and the scale, is the dataset's.
+    shear = torch.linalg.solve(photo.K.double(), base.resized(photo.width, photo.height).K.double())
+    lens, rotation = _upper_times_rotation(K @ pose[:3, :3] @ shear)
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = torch.linalg.solve(lens, K @ pose[:3, 3]) / scale
+    lens = lens / lens[2, 2]
+    lens[0, 1] = 0.0  # the skew: a Camera has none
+    return Camera(lens.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
+
+
+def _from_depth(case: Case, z_base: Tensor, seen: Tensor) -> Alignment | None:
+    """The map's nearest pixel to each of the base's."""
+    assert case.depth is not None
+    known = case.depth()
+    (height, width), (rows, columns) = z_base.shape, known.depth.shape
+    y = ((torch.arange(height) + 0.5) * rows / height).long()
+    x = ((torch.arange(width) + 0.5) * columns / width).long()
+    z, valid = known.depth[y][:, x], known.valid[y][:, x] & seen
+    return _from_ratios(z[valid] / z_base[valid], "depth")
+
+
+def _from_points(case: Case, z_base: Tensor, seen: Tensor) -> Alignment | None:
+    """The base's pixel that each point falls into."""
+    assert case.points is not None
+    if case.camera is None:
+        raise ValueError(f"{case.name} has points but no camera whose pixels they are in")
+    points, (height, width) = case.points(), z_base.shape
+    cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
+    inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)
+    x, y = cells[inside].unbind(1)
+    known = seen[y, x]
+    return _from_ratios(points.z[inside][known] / z_base[y, x][known], "points")
+
+
+def _from_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
+    """None where there are too few."""
+    ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
+    if len(ratios) < MIN_PIXELS:
+        return None
+    scale = ratios.median()
+    spread = MAD_TO_SIGMA * float((ratios / scale - 1).abs().median())
+    return Alignment(float(scale), len(ratios), spread, source)
+
+
+def _from_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
+    """Rough: between what makes the nearest depths the same, and what makes the farthest the same."""
+    near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
+    low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
+    return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
+
+
+def _upper_times_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """A 3×3 matrix with a positive determinant as an upper triangle with a positive diagonal times a rotation."""
+    flip = torch.eye(3, dtype=matrix.dtype).flip(0)
+    rotation, upper = torch.linalg.qr((flip @ matrix).T)
+    upper, rotation = flip @ upper.T @ flip, flip @ rotation.T
+    signs = torch.diag(upper.diagonal().sign())
+    return upper @ signs, signs @ rotation

@@ -1,0 +1,129 @@
+"""COLMAP models, text and binary: cameras, the points that each photo sees, and where they are."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spackle.camera import Camera
+from spackle.errors import InputError, reason_in_a_line
+from spackle.evaluation.case import Points
+from spackle.evaluation.datasets import colmap_files as files
+from spackle.gaussians import quat_to_matrix
+from spackle.image import check_file
+
+Array = NDArray[Any]
+T = TypeVar("T")
+
+# A lens that bends the corner by more than this part of the long side is refused. What is less is left alone: photos
+# that stand close to each other are bent alike, so a 1 % bend moves a pixel against its twin by a few percent of the
+# shift between the two.
+MAX_BEND = 0.02
+MAX_ERROR_PX = 2.0  # of a point's reprojection, on average over its photos
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A photo of a model."""
+
+    name: str  # with its folder, as the model has it
+    camera: Camera  # world of the model; float64; COLMAP's pixels have their centres at half-integers, as ours
+    uv: Array  # [n, 2] where points were found
+    ids: Array  # [n] which points
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A sparse reconstruction."""
+
+    views: tuple[View, ...]  # by name
+    ids: Array  # [m] of the reliable points, ascending
+    xyz: Array  # [m, 3] world
+
+    def points(self, view: View) -> Points:
+        """The reliable points that a view sees, with their depth in front of it."""
+        place = np.searchsorted(self.ids, view.ids)
+        place = np.minimum(place, max(0, len(self.ids) - 1))
+        known = self.ids[place] == view.ids if len(self.ids) else np.zeros(len(view.ids), bool)
+        z = view.camera.to_camera(torch.from_numpy(self.xyz[place[known]]))[:, 2]
+        front = z > 0
+        return Points(torch.from_numpy(view.uv[known]).float()[front], z.float()[front])
+
+
+def model_folder(scene: Path) -> Path:
+    """Where a scene's model is: sparse/0, sparse, or the same in dense/, as COLMAP's undistorter leaves it."""
+    places = [scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")]
+    found = next(
+        (place for place in places if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None
+    )
+    if found is None:
+        raise InputError(f"{scene / 'sparse/0'}: no COLMAP model: expected cameras, images, points3D as .bin or .txt")
+    return found
+
+
+def read_model(folder: Path) -> Model:
+    """Read cameras, images and points3D, binary where there is cameras.bin.
+
+    Raises:
+        InputError: a file that is missing or damaged, or a lens that is no pinhole's.
+    """
+    binary = (folder / "cameras.bin").is_file()
+    at = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images", "points3D")]
+    cameras = _whole(at[0], files.cameras_bin if binary else files.cameras_txt)
+    images = _whole(at[1], files.images_bin if binary else files.images_txt)
+    points = _whole(at[2], files.points_bin if binary else files.points_txt)
+    lenses = {camera[0]: _lens(at[0], camera) for camera in cameras}
+    try:
+        views = [_view(lenses[camera], name, pose, observed) for pose, camera, name, observed in images]
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{at[1]}: {reason_in_a_line(error)}: the file is damaged") from error
+    table = np.array([point for point in points if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return Model(tuple(sorted(views, key=lambda view: view.name)), table[:, 0].astype(np.int64), table[:, 1:4])
+
+
+def _whole(path: Path, read: Callable[[Path], Iterable[T]]) -> list[T]:
+    check_file(path, "part of a COLMAP model")
+    try:
+        return list(read(path))
+    except (struct.error, ValueError, IndexError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a COLMAP file ({reason_in_a_line(error)}): it is damaged or cut off") from error
+
+
+def _lens(path: Path, camera: files.CameraRecord) -> Camera:
+    _, model, width, height, parameters = camera
+    known = next((m for key, m in files.MODELS.items() if model in (key, m[0])), None)
+    if known is None or len(parameters) != known[1]:
+        raise InputError(f"{path}: lens model {model} is no pinhole: undistort the photos with COLMAP first")
+    single = known[0].startswith(("SIMPLE", "RADIAL"))
+    fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
+    if not (min(fx, fy, width, height) > 0 and np.isfinite(parameters).all()):
+        raise InputError(f"{path}: a camera of {width}×{height} with lens {parameters}: the file is damaged")
+    corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
+    square = float(corner @ corner)
+    # k1, k2 bend along the radius; p1, p2 by at most three times as much as they would there.
+    radial = sum(abs(k) * square ** (n + 1) for n, k in enumerate(bend[:2])) * float(np.hypot(*corner))
+    tangential = 3 * sum(map(abs, bend[2:])) * square
+    if (radial + tangential) * max(fx, fy) > MAX_BEND * max(width, height):
+        raise InputError(f"{path}: this lens bends the corners by over {MAX_BEND:.0%}: undistort the photos first")
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, torch.eye(4, dtype=torch.float64), width, height)
+
+
+def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> View:
+    quaternion, shift = torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64)
+    if not (torch.isfinite(quaternion).all() and torch.isfinite(shift).all() and float(quaternion.norm()) > 1e-6):
+        raise ValueError(f"the pose of {name} is no rotation")
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
+    seen = observed[observed["id"] >= 0]
+    _, first = np.unique(seen["id"], return_index=True)  # a point may have been found twice in a photo
+    seen = seen[first]
+    return View(name, dataclasses.replace(lens, world_to_camera=matrix), seen["uv"].copy(), seen["id"].copy())

@@ -1,0 +1,127 @@
+"""Photos of one scene with their poses: which are a photo's second views, and the case that it makes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.evaluation.case import Case, Points, SecondView
+from spackle.evaluation.datasets.colmap import Model
+
+MAX_SECONDS = 3
+BASELINES = (0.05, 0.25)  # of the photo's middle depth; a rectified pair of Middlebury's has 0.05 to 0.2
+MAX_TURN = 30.0  # degrees between the optical axes
+MIN_SHARED = 0.3  # of the points that a photo sees, where points are known
+
+
+@dataclasses.dataclass(frozen=True)
+class Posed:
+    """A photo with its pose."""
+
+    name: str
+    photo: Path
+    camera: Camera  # world of the scene, float64
+    depth: float  # in the middle of what it sees; nan where that is not known
+    ids: NDArray[Any] | None = None  # of the points that it sees
+
+
+def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple[int, ...]]:
+    """For each wanted photo its second views: the nearest cameras that are neither the same nor far off.
+
+    A camera qualifies at a distance of 5 % to 25 % of the photo's middle depth, turned by at most 30°, if it sees
+    at least 30 % of the points that the photo sees; where no points are known, if each camera has the middle of the
+    other's view in its picture. Of those the three nearest are taken, by distance, then name. A photo may have none.
+
+    Returns:
+        Index in `views` to such indices.
+    """
+    eyes = torch.stack([view.camera.position for view in views]).numpy()
+    axes = torch.stack([view.camera.world_to_camera[2, :3] for view in views]).numpy()
+    chosen = {}
+    for index in wanted:
+        view = views[index]
+        apart = np.linalg.norm(eyes - eyes[index], axis=1)
+        fits = (apart >= BASELINES[0] * view.depth) & (apart <= BASELINES[1] * view.depth)
+        fits &= axes @ axes[index] >= math.cos(math.radians(MAX_TURN))
+        order = sorted(np.flatnonzero(fits).tolist(), key=lambda other: (float(apart[other]), views[other].name))
+        sees = (other for other in order if _sees_the_same(view, views[other]))
+        chosen[index] = tuple(itertools.islice(sees, MAX_SECONDS))
+    return chosen
+
+
+def make_case(
+    views: Sequence[Posed],
+    index: int,
+    seconds: Sequence[int],
+    *,
+    model: Model | None = None,
+    bounds: tuple[float, float] | None = None,
+    metric: bool = False,
+) -> Case:
+    """A photo as a case, its second views in its own frame.
+
+    Args:
+        model: where the views' points are; its views are in the order of `views`.
+    """
+    view = views[index]
+    own = view.camera.world_to_camera
+
+    def beside(other: Posed) -> SecondView:
+        relative = other.camera.world_to_camera @ torch.linalg.inv(own)
+        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
+        return SecondView(other.name, other.photo, camera)
+
+    def points() -> Points:
+        assert model is not None
+        return model.points(model.views[index])
+
+    camera = dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32)
+    return Case(
+        view.name,
+        view.photo,
+        camera,
+        points=None if model is None or not len(model.views[index].ids) else points,
+        bounds=bounds,
+        seconds=tuple(beside(views[other]) for other in seconds),
+        metric=metric,
+    )
+
+
+def posed_by(model: Model, names: Sequence[str], photos: Sequence[Path]) -> list[Posed]:
+    """The views of a model with the photo files that they stand for, all in the same order."""
+    posed = []
+    for view, name, photo in zip(model.views, names, photos, strict=True):
+        z = model.points(view).z
+        posed.append(Posed(name, photo, view.camera, float(z.median()) if len(z) else math.nan, view.ids))
+    return posed
+
+
+def check_two(scene: Path, count: int) -> None:
+    """InputError where a scene has no second photo."""
+    if count < 2:
+        raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
+
+
+def _sees_the_same(view: Posed, other: Posed) -> bool:
+    if view.ids is not None and other.ids is not None:
+        return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
+    return _has_middle_of(view, other) and _has_middle_of(other, view)
+
+
+def _has_middle_of(view: Posed, other: Posed) -> bool:
+    """Whether the point at the middle of the other's picture and depth is in this picture."""
+    camera = other.camera
+    middle = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64)
+    uv, z = view.camera.project(camera.unproject(middle, torch.tensor(other.depth, dtype=torch.float64)))
+    size = torch.tensor([view.camera.width, view.camera.height])
+    return bool((z > 0) & (uv >= 0).all() & (uv <= size).all())

@@ -1,0 +1,196 @@
+"""What is compared: ways to a view of a photo from elsewhere, all on top of one base prediction."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.pseudo.opencv import OpencvInpainter
+from spackle.pseudo.views import ViewStack
+from spackle.render import Renderer
+from spackle.rendering import Rendering
+from spackle.residual import Completer, ResidualNet, hole_mask
+from spackle.residual.carve import Shield, push_behind
+from spackle.residual.compose import compose
+from spackle.residual.cues import Cues
+from spackle.residual.network import network_input
+from spackle.residual.rim import Rim
+from spackle.residual.seeds import make_seeds
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """A photo's base, and the views that are wanted of it."""
+
+    prediction: BasePrediction
+    cameras: Sequence[Camera]
+    before: Sequence[Rendering]  # the base from each of them
+    renderer: Renderer
+
+    @property
+    def base(self) -> Gaussians:
+        return self.prediction.gaussians
+
+    @functools.cached_property
+    def shield(self) -> Shield:
+        """What the photo shows, which no completion may cover."""
+        return Completer(self.base, self.prediction.camera, self.renderer).photo_shield()
+
+    def draw(self, aux: Gaussians, index: int) -> View:
+        """A view with aux Gaussians on top of the base."""
+        if not len(aux):
+            return View(self.before[index].rgb, self.before[index].alpha, 0)
+        drawn = self.renderer.render([self.base, aux], self.cameras[index])
+        return View(drawn.rgb, drawn.alpha, len(aux))
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What a method makes of one view."""
+
+    rgb: Tensor  # [H, W, 3] sRGB 0..1
+    alpha: Tensor | None  # [H, W]; None where the hole is not filled by anything in 3D
+    aux: int | None  # Gaussians added for it; None where there are none by nature
+
+
+class Method(Protocol):
+    """A way to fill the holes."""
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        """The views of a shot, in its order, one at a time: there may be many."""
+        ...
+
+
+class BaseAlone:
+    """The base's render as it is."""
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        for index in range(len(shot.cameras)):
+            yield shot.draw(Gaussians.empty(), index)
+
+
+@dataclasses.dataclass(frozen=True)
+class PerView:
+    """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
+
+    network: ResidualNet | None
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network)
+        for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
+            aux = completer.complete_view(camera, [shot.shield], rendering=before)
+            yield shot.draw(aux, index)
+
+
+@dataclasses.dataclass(frozen=True)
+class OneScene:
+    """One set of aux Gaussians for all views of a shot together."""
+
+    network: ResidualNet | None
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network)
+        aux = completer.complete_scene(shot.cameras, exact=True)
+        for index in range(len(shot.cameras)):
+            yield shot.draw(aux, index)
+
+
+@dataclasses.dataclass(frozen=True)
+class Dense:
+    """An aux Gaussian for every cell, hole or not: the other side of the mask-guided ablation (tab:mask_guided_init).
+
+    Exactly one for each 2×2 pixels less the few that find no place behind what the photo shows, and no second pass.
+    """
+
+    network: ResidualNet | None
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
+            aux = push_behind(self._everywhere(before, camera, shot.prediction.camera), camera.position, [shot.shield])
+            yield shot.draw(aux, index)
+
+    @torch.no_grad()
+    def _everywhere(self, before: Rendering, camera: Camera, photo_camera: Camera) -> Gaussians:
+        cues = Cues.of(before)
+        seeds = make_seeds(cues, camera, photo_camera)
+        deltas = None
+        if self.network is not None:
+            field = self.network(network_input(cues, seeds, Rim.of(cues, seeds, camera, photo_camera)))
+            deltas = field[0].permute(1, 2, 0).flatten(0, 1)
+        return compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
+
+
+class Inpaint2d:
+    """The base's render with its hole inpainted as a flat picture, by OpenCV."""
+
+    def __init__(self) -> None:
+        """Find OpenCV; InputError where it is not installed."""
+        self._inpainter = OpencvInpainter()
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        for camera, before in zip(shot.cameras, shot.before, strict=True):
+            flat = [image[None] for image in (before.rgb, before.depth, before.alpha, hole_mask(before.alpha))]
+            stack = ViewStack(shot.base, shot.prediction.camera, [camera], *flat)
+            yield View(self._inpainter.complete(stack)[0], None, None)
+
+
+@dataclasses.dataclass(frozen=True)
+class DirectFt:
+    """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
+
+    prediction: BasePrediction  # of the same photo
+    unit: float = 1.0  # the other base's unit of length in this one's, where both were aligned with a dataset
+
+    def views(self, shot: Shot) -> Iterator[View]:
+        for camera in shot.cameras:
+            pose = camera.world_to_camera.clone()
+            pose[:3, 3] *= self.unit
+            moved = dataclasses.replace(camera, world_to_camera=pose)
+            drawn = shot.renderer.render(self.prediction.gaussians, moved)
+            yield View(drawn.rgb, drawn.alpha, None)
+
+
+@dataclasses.dataclass(frozen=True)
+class About:
+    """A method's names."""
+
+    title: str  # in tables
+    says: str  # in captions
+
+
+METHODS: dict[str, About] = {
+    "base": About("base alone", "the base's render, holes black"),
+    "spackle": About("Spackle", "aux Gaussians for each view by itself, as in the paper"),
+    "spackle-scene": About("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
+    "seeds": About("seeds", "as Spackle, without a network: deltas of zero"),
+    "dense": About("dense grid", "an aux Gaussian for every cell, in one pass"),
+    "inpaint2d": About("2D inpainting", "the base's render, its hole inpainted by OpenCV (Telea, radius 5)"),
+    "direct-ft": About("direct FT", "the base fine-tuned on completed views, no aux Gaussians"),
+}
+
+
+def make_method(
+    name: str, network: ResidualNet | None, direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None
+) -> Method:
+    """A method of `METHODS`; `direct_ft` predicts the photo at hand with the other base, and gives its `unit`."""
+    if name == "direct-ft":
+        if direct_ft is None:
+            raise ValueError("direct-ft needs a base of its own")
+        return DirectFt(*direct_ft())
+    plain: dict[str, Callable[[], Method]] = {
+        "base": BaseAlone,
+        "spackle": lambda: PerView(network),
+        "spackle-scene": lambda: OneScene(network),
+        "seeds": lambda: PerView(None),
+        "dense": lambda: Dense(network),
+        "inpaint2d": Inpaint2d,
+    }
+    return plain[name]()

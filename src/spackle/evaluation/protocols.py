@@ -1,0 +1,144 @@
+"""From which views a photo is looked at, and what is measured there."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.errors import reason_in_a_line
+from spackle.evaluation.figures import METRICS
+from spackle.evaluation.methods import Method, Shot, View
+from spackle.evaluation.metrics import psnr, ssim_average, ssim_map
+from spackle.evaluation.pyiqa_metrics import Metric
+from spackle.evaluation.results import Row
+from spackle.render import Renderer
+from spackle.rendering import Rendering
+from spackle.residual import hole_area_ratio, hole_mask
+from spackle.training.distance import hole_distance
+from spackle.training.features import FeatureNet
+from spackle.trajectory import DepthRange, extremes
+
+NEAR = "near"
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """A view to look at."""
+
+    setting: str
+    name: str
+    camera: Camera
+    truth: Tensor | None = None  # [H, W, 3] sRGB 0..1, of the camera's size
+
+
+@dataclasses.dataclass(frozen=True)
+class Gauges:
+    """What is measured besides holes and counts."""
+
+    metrics: Sequence[str]  # of `METRICS`
+    published: Mapping[str, Metric]  # those of them that pyiqa measures, where it can
+    features: FeatureNet | None  # for "distance"
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A photo's figures, and pictures of the view with the largest hole."""
+
+    rows: list[Row]
+    remarks: list[str]
+    shown: Wanted
+    pictures: dict[str, Tensor]  # method → [H, W, 3]
+
+
+def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> list[Wanted]:
+    """The paper's controlled rendering (section 4.1); it says which disparities, but not which views.
+
+    Here they are the two ends of the `swipe` path at each disparity m: the eye moves sideways by m · ‖(W/f, H/f)‖ ·
+    z_near, once to the left and once to the right, and looks at the focus point. The lens stays the photo's; both sides
+    of the picture are even, as the paper's dense counts have it.
+
+    Raises:
+        ValueError: no Gaussian stands in front of the camera, or a disparity that no path has.
+    """
+    lens = prediction.camera
+    even = lens.resized(lens.width + lens.width % 2, lens.height + lens.height % 2)
+    reach = DepthRange.of(prediction.gaussians)
+    return [
+        Wanted(f"{disparity:g}", name, camera)
+        for disparity in disparities
+        for name, camera in zip(("left", "right"), extremes(even, disparity, reach), strict=True)
+    ]
+
+
+@torch.no_grad()
+def measure(
+    prediction: BasePrediction,
+    wanted: Sequence[Wanted],
+    methods: Mapping[str, Method],
+    gauges: Gauges,
+    renderer: Renderer,
+) -> Measured:
+    """Every method on every view; views of one setting are a method's to see together."""
+    before = [renderer.render(prediction.gaussians, view.camera) for view in wanted]
+    holes = [hole_area_ratio(view.alpha) for view in before]
+    shown = max(range(len(wanted)), key=holes.__getitem__)
+    rows: list[Row] = []
+    remarks: list[str] = []
+    pictures: dict[str, Tensor] = {}
+    for setting in dict.fromkeys(view.setting for view in wanted):
+        own = [index for index, view in enumerate(wanted) if view.setting == setting]
+        shot = Shot(prediction, [wanted[i].camera for i in own], [before[i] for i in own], renderer)
+        for name, method in methods.items():
+            for index, view in zip(own, method.views(shot), strict=True):
+                figures = {"har_before": holes[index], **_counts(view, len(prediction.gaussians))}
+                figures |= _quality(view.rgb, wanted[index].truth, before[index], gauges, remarks)
+                rows.append(Row(setting, wanted[index].name, name, {k: _finite(v) for k, v in figures.items()}))
+                if index == shown:
+                    pictures[name] = view.rgb
+    return Measured(rows, list(dict.fromkeys(remarks)), wanted[shown], pictures)
+
+
+def _counts(view: View, base: int) -> dict[str, float]:
+    """Holes that are left, and Gaussians that were added."""
+    figures: dict[str, float] = {}
+    if view.alpha is not None:
+        figures |= {"har": hole_area_ratio(view.alpha), "coverage": 1 - hole_area_ratio(view.alpha)}
+    if view.aux is not None:
+        figures |= {"aux": view.aux, "aux_share": view.aux / base, "merged": base + view.aux}
+    return figures
+
+
+def _quality(
+    rgb: Tensor, truth: Tensor | None, before: Rendering, gauges: Gauges, remarks: list[str]
+) -> dict[str, float]:
+    """The metrics that were asked for and can be: those with a truth want one."""
+    figures: dict[str, float] = {}
+    hole = hole_mask(before.alpha)
+    names = [name for name in gauges.metrics if truth is not None or not METRICS[name].truth]
+    for name in names:
+        if name in gauges.published:
+            try:
+                figures[name] = gauges.published[name](rgb, truth if METRICS[name].truth else None)
+            except Exception as error:  # a stranger's package on an odd picture: the figure is missing, and it shows
+                figures[name] = math.nan
+                remarks.append(f"{name} failed: {reason_in_a_line(error)}")
+        elif truth is not None and name == "psnr":
+            places = {"psnr": None, "psnr_hole": hole, "psnr_outside": ~hole}
+            figures |= {place: psnr(rgb, truth, mask) for place, mask in places.items()}
+        elif truth is not None and name == "ssim":
+            similarity = ssim_map(rgb, truth)
+            places = {"ssim": None, "ssim_hole": hole, "ssim_outside": ~hole}
+            figures |= {place: ssim_average(similarity, mask) for place, mask in places.items()}
+        elif truth is not None and name == "distance" and gauges.features is not None:
+            figures[name] = hole_distance(gauges.features, rgb, truth, hole)
+    return figures
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

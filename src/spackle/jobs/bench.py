@@ -1,0 +1,184 @@
+"""`spackle bench`: what Spackle costs in Gaussians and in time on a dataset, in the paper's tables of efficiency."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from spackle.bases.protocol import Base
+from spackle.bases.rgbd import RgbdBase
+from spackle.errors import InputError
+from spackle.evaluation.case import Case
+from spackle.evaluation.datasets import get_dataset
+from spackle.evaluation.efficiency import Clock, Parameters, ViewBench, count_parameters, time_base
+from spackle.evaluation.efficiency_cells import SIDE
+from spackle.evaluation.efficiency_results import Bill, ImageCost
+from spackle.evaluation.efficiency_tables import efficiency_tables
+from spackle.evaluation.load import LoadedCase, load_case
+from spackle.evaluation.protocols import large_views
+from spackle.evaluation.table import to_latex, to_markdown
+from spackle.jobs.bench_options import BenchOptions, check_bench_options
+from spackle.jobs.evaluate import inputs_digest, spread
+from spackle.jobs.evaluate_case import Bench
+from spackle.jobs.evaluate_setup import configuration, metrics_device, open_bench
+from spackle.jobs.evaluate_store import IMAGES, alone_in, begin, stem_of, write_json, write_text
+from spackle.jobs.inputs import results_folder
+from spackle.jobs.machine import hardware, versions
+from spackle.jobs.progress import Reporter
+from spackle.jobs.setup import BaseError
+from spackle.jobs.stopping import asked_to_stop
+
+RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
+SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
+
+
+def bench(options: BenchOptions, output: Path, reporter: Reporter) -> str:
+    """Time a dataset, or go on with that.
+
+    Args:
+        options: what, how often.
+        output: a folder; bench.json, bench.md, bench.tex and images/ go there. It belongs to one machine: times of
+            two do not go together.
+        reporter: says what is passed over, and with -v each image's figures.
+
+    Returns:
+        "complete", or "stopped" where Ctrl-C came.
+
+    Raises:
+        InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`.
+    """
+    check_bench_options(options)
+    dataset = get_dataset(options.dataset)
+    cases = spread(dataset.cases(options.root), options.limit)
+    _check_cases(cases, options)
+    tools = open_bench(options.evaluation)
+    whole = configuration(options.evaluation, dataset, cases, tools)
+    config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
+    config |= {"view": SIDE, "runs": options.runs, "base_runs": options.base_times}
+    device = torch.device("cpu" if options.base.base == "rgbd" else metrics_device(options.evaluation))
+    config["base"] |= {"device": device.type}
+    config |= {"hardware": hardware(device), "versions": versions()}
+    with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output):
+        begin(output, config)
+        return _Benchmark(options, cases, output, tools, reporter, config, Clock(device)).run()
+
+
+def _check_cases(cases: Sequence[Case], options: BenchOptions) -> None:
+    """InputError where not one of them has what is needed."""
+    where = f"{options.root}: {options.dataset}"
+    if not cases:
+        raise InputError(f"{where}: no images: check the folder")
+    if options.base.base == "rgbd" and not any(case.depth for case in cases):
+        raise InputError(f"{where}: has no depth maps, which --base rgbd takes: take --base sharp")
+
+
+@dataclasses.dataclass
+class _Benchmark:
+    """The images of a dataset and how far they have come."""
+
+    options: BenchOptions
+    cases: Sequence[Case]
+    output: Path
+    tools: Bench
+    reporter: Reporter
+    config: Mapping[str, Any]
+    clock: Clock
+    warm: bool = False  # something was predicted in this process
+
+    def run(self) -> str:
+        """Do what is missing; "complete" or "stopped"."""
+        images: list[ImageCost] = []
+        with self.reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
+            for index, case in enumerate(self.cases):
+                if stop():
+                    self.reporter.say("stopped; the same command goes on from here")
+                    return "stopped"
+                path = self.output / IMAGES / f"{stem_of(index, case.name)}.json"
+                inputs = inputs_digest(case)
+                images.append(_load(path, inputs) or self._measure(case, inputs, path))
+                step(index + 1, len(self.cases))
+        self._finish(Bill(self.config, tuple(images)), count_parameters())
+        return "complete"
+
+    def _measure(self, case: Case, inputs: str, path: Path) -> ImageCost:
+        """One image; a problem of its own is its record, which the next run tries again."""
+        try:
+            image = self._time(case)
+        except BaseError:
+            raise
+        except InputError as error:
+            problem = " ".join(str(error).replace(f"{self.options.root}/", "").splitlines())
+            self.reporter.say(f"passed over: {problem}")
+            return ImageCost(case.name, problem=problem)
+        write_json({"inputs": inputs, "image": image.plain()}, path)
+        for view in image.views:
+            found = view.figures()
+            times = f"{found['base_ms']:,.0f} ms, with Spackle {found['spackle_ms']:,.0f}"
+            self.reporter.detail(f"  {case.name}, {view.setting}: {times}, {view.added:,} Gaussians added")
+        return image
+
+    def _time(self, case: Case) -> ImageCost:
+        """All settings of an image.
+
+        Raises:
+            InputError: a file that cannot be used, or a depth map that the case lacks.
+            BaseError: no image can be worked on.
+        """
+        load = _load_of_machine()
+        loaded = load_case(dataclasses.replace(case, seconds=()))
+        base = time_base(self._base(loaded), loaded.full, self.options.base_times, self.clock, self.warm)
+        self.warm = True
+        try:
+            views = large_views(base.prediction, self.options.disparities)
+        except ValueError as error:
+            raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
+        bench = ViewBench(base, self.tools.renderer, self.tools.network, self.clock)
+        costs = [bench.time_view(view.setting, view.camera, self.options.runs) for view in views if view.name == SIDE]
+        size = {"width": loaded.photo.width, "height": loaded.photo.height}
+        facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}
+        return ImageCost(case.name, facts, tuple(costs))
+
+    def _base(self, loaded: LoadedCase) -> Base:
+        """The network, or the case's own depth."""
+        if self.tools.base is not None:
+            return self.tools.base()
+        if loaded.case.depth is None:
+            raise InputError(f"{loaded.case.name}: has no depth map, which --base rgbd takes")
+        return RgbdBase(loaded.case.depth())
+
+    def _finish(self, bill: Bill, parameters: Parameters) -> None:
+        """Everything that is made of all images; bench.json comes last and vouches for the rest."""
+        if not bill.measured:
+            raise InputError(
+                f"{self.options.root}: none of {len(bill.images)} images gave figures (the lines above say why)"
+            )
+        tables = efficiency_tables(bill, parameters)
+        write_text(to_markdown(tables), self.output / MARKDOWN)
+        write_text(to_latex(tables), self.output / LATEX)
+        counted = {**dataclasses.asdict(parameters), "share": parameters.share}
+        write_json({"parameters": counted, **bill.plain()}, self.output / RESULTS)
+        title, n = bill.config["title"], len(bill.measured)
+        overheads = ", ".join(
+            f"{setting}: {100 * bill.spread(setting, 'overhead').median:.2f} %" for setting in bill.settings
+        )
+        self.reporter.say(f"{title}: {n} of {len(bill.images)} images, overhead {overheads} -> {self.output}")
+
+
+def _load(path: Path, inputs: str) -> ImageCost | None:
+    """What an earlier run found; None where it is not there, or about other files."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return ImageCost.of(content["image"]) if content["inputs"] == inputs else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _load_of_machine() -> float | None:
+    """How many processes want a core, over the last minute; None where the system does not say."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

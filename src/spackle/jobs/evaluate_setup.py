@@ -1,0 +1,136 @@
+"""What an evaluation works with, set up once for all images, and what that is called in its results."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import spackle
+from spackle.bases.sharp import SharpBase
+from spackle.errors import InputError
+from spackle.evaluation.case import Case, EvalDataset
+from spackle.evaluation.figures import OWN
+from spackle.evaluation.methods import make_method
+from spackle.evaluation.protocols import Gauges
+from spackle.evaluation.pyiqa_metrics import DEFINITIONS, open_metrics
+from spackle.jobs.dataset_options import weights_digest
+from spackle.jobs.evaluate_case import Bench
+from spackle.jobs.evaluate_options import EvaluateOptions
+from spackle.jobs.options import PredictOptions
+from spackle.jobs.setup import BaseError, set_up
+from spackle.render import get_renderer
+from spackle.residual.weights import load_residual
+from spackle.training.features import FeatureNet, load_features
+
+BASES = {
+    "sharp": ("SHARP", "Apple's network, from the photo alone"),
+    "rgbd": ("rgbd", "the dataset's own depth, lifted; not SHARP, so not the paper's base"),
+}
+NO_FEATURES = "not run: weights: give SqueezeNet's with --features FILE"
+
+
+def open_bench(options: EvaluateOptions) -> Bench:
+    """Load what all images share; networks of a base are loaded with the first image.
+
+    Raises:
+        InputError: weights or a package that cannot be used.
+    """
+    base = options.base
+    network = None if base.residual_file is None else load_residual(base.residual_file)
+    direct = None
+    if options.direct_ft is not None:
+        path = _there(options.direct_ft, "--direct-ft")
+        direct = functools.cache(lambda: _load_direct(path, base))
+    features = _features(options)
+    wanted = options.wanted_metrics
+    published = open_metrics(
+        [name for name in wanted if name in DEFINITIONS], metrics_device(options), options.download
+    )
+    states = dict.fromkeys(wanted, OWN)
+    states |= dict.fromkeys(published.metrics, f"pyiqa {published.version}")
+    states |= {name: f"not run: {reason}" for name, reason in published.missing.items()}
+    if "distance" in wanted and features is None:
+        states["distance"] = NO_FEATURES
+    if "inpaint2d" in options.methods:
+        _check_opencv()
+    return Bench(
+        options,
+        get_renderer(base.device),
+        set_up(base).base if base.base == "sharp" else None,
+        network,
+        direct,
+        Gauges(wanted, published.metrics, features),
+        states,
+    )
+
+
+def configuration(
+    options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case], bench: Bench
+) -> dict[str, Any]:
+    """Everything that decides the figures, ready for JSON; nothing of where files lie."""
+    base = options.base
+    title, says = BASES[base.base]
+    names = hashlib.sha256(json.dumps([case.name for case in cases]).encode()).hexdigest()
+    weights = None if base.base_weights is None else weights_digest(base.base_weights)
+    about = {"name": base.base, "title": title, "says": says, "weights": weights, "precision": base.precision}
+    residual = base.residual_file and weights_digest(base.residual_file)
+    return {
+        "spackle": spackle.__version__,
+        "dataset": dataset.name,
+        "title": dataset.title,
+        "terms": dataset.terms,
+        "images": {"count": len(cases), "limit": options.limit, "names": names},
+        "protocol": options.protocol,
+        "disparities": None if options.near else list(options.disparities),
+        "base": about | {"device": metrics_device(options)},
+        "methods": list(options.methods),
+        "residual": {"weights": "given" if base.residual not in (None, "seeds") else base.residual_weights}
+        | {"sha256": residual},
+        "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
+        "features": None if options.features is None else weights_digest(options.features),
+        "metrics": bench.states,
+    }
+
+
+def _features(options: EvaluateOptions) -> FeatureNet | None:
+    """SqueezeNet, where its weights are given and wanted."""
+    if options.features is None or "distance" not in options.wanted_metrics:
+        return None
+    return load_features("squeezenet", _there(options.features, "--features"))
+
+
+def _there(path: Path, option: str) -> Path:
+    if not path.is_file():
+        raise InputError(f"{option} {path}: no such file: check the name")
+    return path
+
+
+def _load_direct(path: Path, base: PredictOptions) -> SharpBase:
+    """The base of the method direct-ft, at the precision of the other one."""
+    device = None if base.device == "auto" else base.device
+    try:
+        return SharpBase.load(path, precision=base.precision, low_memory=base.low_memory, device=device)
+    except InputError as error:
+        raise BaseError(f"--direct-ft {error}") from error
+
+
+def _check_opencv() -> None:
+    """InputError where the method inpaint2d has no OpenCV, before any work."""
+    try:
+        make_method("inpaint2d", None)
+    except InputError as error:
+        raise InputError(
+            "--methods inpaint2d: needs a package: pip install 'spackle-nvs[opencv]', or leave the method out"
+        ) from error
+
+
+def metrics_device(options: EvaluateOptions) -> str:
+    """Where networks run."""
+    named = options.base.device
+    return ("cuda" if torch.cuda.is_available() else "cpu") if named == "auto" else named

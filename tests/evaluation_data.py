@@ -1,0 +1,106 @@
+"""A small dataset in Middlebury's folders, whose right photos are true, and a stand-in for pyiqa."""
+
+from __future__ import annotations
+
+import json
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+WIDTH, HEIGHT, FOCAL = 72, 48, 60.0
+NEAR_PX, FAR_PX = 10, 4  # disparities of a box and of the wall behind it
+BASELINE = 0.2
+
+
+def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
+    """Rows from the bottom up, little-endian."""
+    head = f"Pf\n{values.shape[1]} {values.shape[0]}\n-1.0\n".encode()
+    path.write_bytes(head + values[::-1].astype("<f4").tobytes())
+
+
+def write_scene(
+    folder: Path,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    disparity: NDArray[np.float32],
+    focal: float,
+    cx: float,
+    cy: float,
+    doffs: float,
+) -> None:
+    """A stereo pair with its scene.json; inf in the disparity is unknown."""
+    folder.mkdir(parents=True)
+    Image.fromarray(left).save(folder / "left.png")
+    Image.fromarray(right).save(folder / "right.png")
+    write_pfm(folder / "disp.pfm", disparity)
+    names = {
+        "left": "left.png",
+        "right": "right.png",
+        "disparity": "disp.pfm",
+        "disparity_scale": 1.0,
+        "invalid": "inf",
+    }
+    lens = {"focal_px": focal, "cx": cx, "cy": cy, "doffs_px": doffs, "baseline_m": BASELINE}
+    (folder / "scene.json").write_text(json.dumps(names | lens))
+
+
+def write_boxes(folder: Path, seed: int) -> None:
+    """A box before a wall, seen from both sides."""
+    rng = np.random.default_rng(seed)
+    hue, phase = rng.uniform(0.3, 0.7, 3), rng.uniform(0, 6, 3)
+    left, top = int(rng.integers(20, 30)), int(rng.integers(8, 16))
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    box = (x >= left) & (x < left + 22) & (y >= top) & (y < top + 24)
+
+    def wall(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return hue + 0.15 * np.sin(np.stack([0.3 * x, 0.2 * x + 0.3 * y, 0.4 * y], axis=-1) + phase)
+
+    def front(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 1 - hue + 0.15 * np.cos(np.stack([0.5 * y, 0.3 * x, 0.4 * x], axis=-1))
+
+    beside = (x >= left - NEAR_PX) & (x < left + 22 - NEAR_PX) & (y >= top) & (y < top + 24)
+    photos = [np.where(box[..., None], front(x), wall(x))]
+    photos += [np.where(beside[..., None], front(x + NEAR_PX), wall(x + FAR_PX))]
+    first, second = (np.round(255 * photo.clip(0, 1)).astype(np.uint8) for photo in photos)
+    disparity = np.where(box, NEAR_PX, FAR_PX).astype(np.float32)
+    write_scene(folder, first, second, disparity, FOCAL, WIDTH / 2, HEIGHT / 2, 0.0)
+
+
+def write_motorcycle(folder: Path, shrink: int = 4) -> None:
+    """Middlebury's Motorcycle as scikit-image has it, smaller."""
+    left, right, disparity = pytest.importorskip("skimage.data").stereo_motorcycle()
+    height, width = (size // shrink * shrink for size in disparity.shape)
+
+    def small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.asarray(Image.fromarray(image[:height, :width]).reduce(shrink))
+
+    values = disparity[:height:shrink, :width:shrink] / shrink
+    values = np.where(np.isfinite(values), values, np.inf).astype(np.float32)
+    lens = [value / shrink for value in (994.978, 311.193, 254.877, 31.086)]
+    write_scene(folder, small(left), small(right), values, *lens)
+
+
+def fake_pyiqa(
+    patch: pytest.MonkeyPatch, create: Callable[..., object] | None = None, error: Exception | None = None
+) -> types.ModuleType:
+    """Put a module in pyiqa's place: with `create_metric`, or one that cannot be imported."""
+    module = types.ModuleType("pyiqa")
+    module.__dict__.update(__version__="9.9", create_metric=create)
+    if error is None:
+        patch.setitem(sys.modules, "pyiqa", module)
+        return module
+
+    class Finder:
+        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+            if name == "pyiqa":
+                raise error
+
+    patch.delitem(sys.modules, "pyiqa", raising=False)
+    patch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
+    return module

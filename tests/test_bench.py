@@ -1,0 +1,329 @@
+"""`spackle bench`: counts, parameters, layouts, the paper's numbers; of times only that they are there and add up."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command import Run, names_in, run
+from evaluation_data import write_boxes
+from scenes import box_before_wall
+from sharp_weights import gaussians_of, write_tiny
+
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sharp.config import TINY
+from spackle.evaluation import efficiency, paper
+from spackle.evaluation import paper_efficiency as published
+from spackle.evaluation.cells import EMPTY
+from spackle.evaluation.efficiency import Clock, TimedBase, ViewBench, count_parameters, time_base
+from spackle.evaluation.efficiency_cells import SIDE
+from spackle.evaluation.efficiency_results import BASE_PATH, EXTRA, STAGES, Bill, ImageCost, ViewCost
+from spackle.evaluation.efficiency_tables import efficiency_tables
+from spackle.evaluation.protocols import large_views
+from spackle.image import Photo
+from spackle.render import get_renderer
+from spackle.residual import Completer
+
+CPU = Clock(torch.device("cpu"))
+STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "checks": 2.0, "rerender": 7.0}
+
+
+def cost(setting: str = "0.3", added: int = 20, factor: float = 1.0) -> ViewCost:
+    """A view whose base path takes 1,400 ms and Spackle's part 14."""
+    runs = {name: [factor * ms / 1000 * late for late in (0.5, 1, 30)] for name, ms in STAGE_MS.items()}
+    return ViewCost(setting, 1000, added, runs)
+
+
+def bill(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> Bill:
+    """Three images of Middlebury, the second twice as slow and the third four times, and one that failed."""
+    facts = {"load": 1.5, "warm": True, "notes": {"precision": "bf16"}, **facts}
+    images = [
+        ImageCost(f"image {k}", facts, tuple(cost(f"{d:g}", 10 * k, 2.0**k) for d in disparities)) for k in range(3)
+    ]
+    config = {
+        "title": "Middlebury",
+        "disparities": list(disparities),
+        "base": {"title": "SHARP", "says": "a network", "device": "cpu"},
+        "residual": {"weights": "shipped", "sha256": "0123456789abcdef"},
+        "runs": 3,
+        "base_runs": 1,
+        "hardware": {"cpu": "A Processor", "cores": 2, "threads": 2},
+        "versions": {"spackle": "0", "torch": "2"},
+    }
+    return Bill(config, (*images, ImageCost("broken", problem="no such file")))
+
+
+# --- parameters and the paper's numbers
+
+
+def test_the_networks_have_the_papers_parameters() -> None:
+    found = count_parameters()
+    assert found.base == 702_305_169
+    assert found.residual == 8_021_376
+    assert round(found.base / 1e6, 2) == published.PARAMETERS_M
+    assert round(found.residual / 1e6, 2) == published.ADDED_PARAMETERS_M
+    assert round(100 * found.share, 2) == published.ADDED_PARAMETERS_PERCENT
+    assert (found.base + found.residual) / 1e6 == pytest.approx(published.MERGED_PARAMETERS_M, abs=0.01)
+    assert 0.9 * found.base < found.base_used < found.base
+
+
+def test_the_papers_rows_fit_each_other_but_for_one() -> None:
+    for title, rows in published.TIMES.items():
+        for disparity, row in zip(paper.DISPARITIES, rows, strict=True):
+            fits = row.base_fps == pytest.approx(1000 / row.base_ms, rel=0.01)
+            assert fits == ((title, disparity) != published.ODD)
+            assert row.spackle_fps == pytest.approx(1000 / row.spackle_ms, rel=0.01)
+            assert published.time_at(title, disparity) == row
+    assert published.time_at("Middlebury", 0.6) is None
+    assert published.time_at("Elsewhere", 0.3) is None
+    for index in range(3):
+        rows_at = [rows[index] for rows in published.TIMES.values()]
+        spackle = sorted(row.spackle_ms for row in rows_at)
+        assert published.MEDIAN_SPACKLE_MS[index] == pytest.approx((spackle[2] + spackle[3]) / 2, abs=0.11)
+        added = [numbers[3 * index] for numbers in paper.GAUSSIANS.values()]
+        assert published.AVERAGE_ADDED[index] == pytest.approx(sum(added) / 6, abs=1)
+
+
+# --- figures
+
+
+def test_times_are_medians_of_runs_and_add_up() -> None:
+    found = cost().figures()
+    assert found["base_ms"] == pytest.approx(1400)
+    assert found["extra_ms"] == pytest.approx(14)
+    assert found["spackle_ms"] == pytest.approx(1414)
+    assert found["overhead"] == pytest.approx(0.01)
+    assert found["overhead_of_view"] == pytest.approx(14 / 400)
+    assert found["base_fps"] == pytest.approx(1 / 1.4)
+    assert (found["share"], found["merged"]) == (0.02, 1020)
+    assert set(BASE_PATH + EXTRA) == set(STAGES)
+
+
+def test_medians_and_quartiles_run_over_the_images_that_were_measured() -> None:
+    found = bill().spread("0.4", "base_ms")
+    assert (found.n, found.median) == (3, pytest.approx(2800))
+    assert (found.q1, found.q3, found.mean) == tuple(pytest.approx(ms) for ms in (2100, 4200, 9800 / 3))
+    assert bill().spread("0.4", "added").mean == 10
+
+
+def test_an_image_survives_json() -> None:
+    image = bill().images[1]
+    assert ImageCost.of(json.loads(json.dumps(image.plain()))) == image
+    with pytest.raises(KeyError):
+        ImageCost.of({**image.plain(), "views": [{**dataclasses.asdict(cost()), "seconds": {"base": [1.0]}}]})
+
+
+# --- tables
+
+
+def test_the_layouts_are_the_papers() -> None:
+    overhead, expanded, stages, parameters = efficiency_tables(bill(), count_parameters())
+    assert overhead.label == "tab:efficiency_gaussian_overhead"
+    assert [name for name, _ in overhead.groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
+    rows = {line.cells[:2]: line.cells[2:] for line in overhead.lines}
+    assert rows["Middlebury", "SHARP"] == ("10", "1.00") * 3
+    assert rows["", "SHARP (paper)"][1::2] == (EMPTY,) * 3
+    assert rows["LLFF", "SHARP (paper)"] == ("8,425", "0.71", "15,629", "1.32", "23,397", "1.98")
+    assert rows["Average", "SHARP (paper)"] == ("11,532", "0.98", "19,433", "1.65", "27,967", "2.37")
+    assert rows["Median time with Spackle (ms)", "SHARP"][::2] == ("2,828.0",) * 3
+    assert rows["Median time overhead", "SHARP"][::2] == ("1.00%",) * 3
+    assert expanded.label == "tab:expanded_efficiency_gaussian_overhead"
+    assert len(expanded.lines) == 3 + 18
+    ours, theirs = expanded.lines[0].cells, expanded.lines[1].cells
+    assert ours[:6] == ("Middlebury", "S1", "SHARP", "10", "1.00", "1,010")
+    assert ours[6:] == ("2,800.0", "2,828.0", "1.00%", "0.357", "0.354", "3/23")
+    assert theirs[3:9] == ("3,387", "0.29", "1,183,035", "6,410.3†", "1,449.4", "-3.3%†")
+    assert theirs[9:] == ("0.671†", "0.691", "23")
+    assert sum("†" in "".join(line.cells) for line in expanded.lines) == 1
+    assert any(note.startswith("†") for note in expanded.notes)
+    assert stages.lines[0].cells[1] == "2,000.0 [1,500.0, 3,000.0]"
+    assert [line.cells for line in parameters.lines][:2] == [
+        ("SHARP", "702.31", "702.31"),
+        ("SHARP and Spackle", "710.33", "710.32"),
+    ]
+    for table in (overhead, expanded, stages):
+        assert "A Processor, 2 cores, 2 threads" in table.caption
+        assert "torch 2" in table.caption
+        assert "network in bf16 on cpu" in table.caption
+        assert any("1 of 4 images gave no figures: broken" in note for note in table.notes)
+
+
+def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
+    overhead, expanded, *_ = efficiency_tables(bill((0.6,), warm=False, load=None), count_parameters())
+    assert overhead.groups[1] == ("disparity 0.6", 2)
+    assert {line.cells[2:] for line in overhead.lines if "paper" in line.cells[1]} == {(EMPTY, EMPTY)}
+    assert [line.cells[1] for line in expanded.lines] == ["disparity 0.6"]
+    assert any("it was not warm" in note for note in expanded.notes)
+    assert not any("Load" in note or "†" in note for note in expanded.notes)
+
+
+# --- timing
+
+
+@dataclasses.dataclass
+class CountedBase:
+    """Says how often it was asked."""
+
+    prediction: BasePrediction
+    count: int = 0
+    name = "counted"
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        self.count += 1
+        return self.prediction
+
+
+def test_a_first_prediction_counts_only_where_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = CountedBase(box_before_wall().lift())
+    photo = Photo(torch.zeros(4, 4, 3), 4.0, "", Path("photo.png"))
+    cold = time_base(base, photo, 3, CPU, warm=False)
+    assert (base.count, len(cold.seconds), cold.warm) == (4, 3, True)
+    assert len(time_base(base, photo, 3, CPU, warm=True).seconds) == 3
+    assert base.count == 7
+    monkeypatch.setattr(efficiency, "COLD_S", 0.0)
+    long = time_base(base, photo, 1, CPU, warm=False)
+    assert (base.count, len(long.seconds), long.warm) == (8, 1, False)
+
+
+def test_a_view_costs_what_a_completion_adds() -> None:
+    prediction, renderer = box_before_wall().lift(), get_renderer()
+    views = [view for view in large_views(prediction, (0.3, 0.5)) if view.name == SIDE]
+    bench = ViewBench(TimedBase(prediction, [0.25, 0.5, 4.0], True), renderer, None, CPU)
+    for view in views:
+        found = bench.time_view(view.setting, view.camera, 3)
+        aux = Completer(prediction.gaussians, prediction.camera, renderer).complete_view(view.camera)
+        assert found.added == len(aux) > 0
+        assert found.base_gaussians == len(prediction.gaussians)
+        assert set(found.seconds) == set(STAGES)
+        assert all(len(seconds) == 3 and min(seconds) > 0 for seconds in found.seconds.values())
+        figures = found.figures()
+        assert figures["base_stage_ms"] == 500
+        assert figures["base_ms"] == pytest.approx(sum(figures[f"{name}_stage_ms"] for name in BASE_PATH))
+        assert figures["extra_ms"] == pytest.approx(sum(figures[f"{name}_stage_ms"] for name in EXTRA))
+
+
+def test_a_view_without_holes_needs_no_second_render() -> None:
+    prediction = box_before_wall().lift()
+    opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
+    whole = dataclasses.replace(prediction, gaussians=opaque)
+    bench = ViewBench(TimedBase(whole, [1.0], True), get_renderer(), None, CPU)
+    found = bench.time_view("0", whole.camera, 1)
+    assert found.added == 0
+    assert found.seconds["rerender"] == [0.0]
+    assert found.figures()["merged"] == len(opaque)
+
+
+# --- the command
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two small scenes in Middlebury's folders."""
+    root = tmp_path_factory.mktemp("middlebury")
+    for seed, name in enumerate(("Ball", "Chair")):
+        write_boxes(root / name, seed)
+    return root
+
+
+def bench_of(root: Path, output: Path, *more: object) -> Run:
+    return run("bench", "--dataset", "middlebury", "--root", root, "--base", "rgbd", "-o", output, *more)
+
+
+def read(output: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((output / "bench.json").read_text())
+    return found
+
+
+def test_from_files_to_tables_and_on(scenes: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    done = bench_of(scenes, output, "--runs", 2, "--disparity", "0.3,0.5", "-v")
+    assert done.code == 0, done.err
+    assert names_in(output) == {"bench.json", "bench.md", "bench.tex", "config.json", "images"}
+    found = read(output)
+    assert found["parameters"]["residual"] == 8_021_376
+    assert found["config"]["view"] == SIDE
+    assert {"cpu", "cores", "threads"} <= found["config"]["hardware"].keys()
+    assert "torch" in found["config"]["versions"]
+    for image in found["images"]:
+        assert [view["setting"] for view in image["views"]] == ["0.3", "0.5"]
+        assert image["facts"]["warm"]
+        for view in image["views"]:
+            assert {len(runs) for runs in view["seconds"].values()} == {2}
+            assert view["figures"]["merged"] == view["base_gaussians"] + view["added"]
+            assert view["added"] > 0
+    text, tex = ((output / name).read_text() for name in ("bench.md", "bench.tex"))
+    for label in ("efficiency_gaussian_overhead", "expanded_efficiency_gaussian_overhead", "efficiency_stages"):
+        assert label in text
+        assert label in tex
+    assert "2/23" in text
+    before = {path.name: path.stat().st_mtime_ns for path in (output / "images").iterdir()}
+    (output / "bench.md").unlink()
+    assert bench_of(scenes, output, "--runs", 2, "--disparity", "0.3,0.5").code == 0
+    assert (output / "bench.md").read_text() == text
+    assert before == {path.name: path.stat().st_mtime_ns for path in (output / "images").iterdir()}
+    refused = bench_of(scenes, output, "--runs", 3, "--disparity", "0.3,0.5")
+    assert (refused.code, "runs: 2 -> 3" in refused.err) == (2, True)
+
+
+def test_sharp_is_timed_once_and_says_so(scenes: Path, tmp_path: Path) -> None:
+    weights = write_tiny(tmp_path / "sharp.safetensors")
+    words = ("--base", "sharp", "-c", weights, "--precision", "fp32", "--residual", "seeds")
+    words += ("--limit", "1", "--runs", "1", "--disparity", "0.3")
+    done = run("bench", "--dataset", "middlebury", "--root", scenes, "-o", tmp_path / "out", *words)
+    assert done.code == 0, done.err
+    found = read(tmp_path / "out")
+    (image,) = found["images"]
+    assert image["views"][0]["base_gaussians"] == gaussians_of(TINY)
+    assert len(image["views"][0]["seconds"]["base"]) == 1
+    assert "network in fp32 on" in (tmp_path / "out" / "bench.md").read_text()
+    assert math.isfinite(image["views"][0]["figures"]["overhead"])
+
+
+def test_a_broken_image_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    for seed, name in enumerate(("Ball", "Chair")):
+        write_boxes(tmp_path / "data" / name, seed)
+    _cut_off(tmp_path / "data" / "Chair" / "left.png")
+    done = bench_of(tmp_path / "data", tmp_path / "out", "--runs", 1, "--disparity", "0.3")
+    assert done.code == 0
+    assert sum("passed over:" in line for line in done.lines) == 1
+    found = read(tmp_path / "out")
+    assert list(found["problems"]) == ["Chair"]
+    assert str(tmp_path) not in json.dumps(found)
+    _cut_off(tmp_path / "data" / "Ball" / "left.png")
+    done = bench_of(tmp_path / "data", tmp_path / "none", "--runs", 1)
+    assert (done.code, "none of 2 images gave figures" in done.err) == (2, True)
+
+
+def _cut_off(picture: Path) -> None:
+    """The first half of its bytes."""
+    whole = picture.read_bytes()
+    picture.write_bytes(whole[: len(whole) // 2])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--dataset", "midlebury"), "did you mean middlebury?"),
+        (("--base", "shrap"), "did you mean sharp?"),
+        (("--disparity", "0.3,x"), "not numbers"),
+        (("--disparity", "0.3,0.30"), "the same number twice"),
+        (("--disparity", "0.3,3"), "up to 2"),
+        (("--limit", "0"), "--limit must be between"),
+        (("--runs", "0"), "--runs must be between"),
+        (("--base-runs", "0"), "--base-runs must be between"),
+        (("--residual", "gone.safetensors"), "not found"),
+        (("-c", "x.pt"), "no checkpoint"),
+        (("--precision", "fp8"), "--precision fp8"),
+        (("--root", "gone"), "gone: no such folder"),
+    ],
+)
+def test_bad_input_is_one_line(words: tuple[str, ...], message: str, scenes: Path, tmp_path: Path) -> None:
+    done = bench_of(scenes, tmp_path / "out", *words)
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert message in done.err
+    assert not (tmp_path / "out").exists()

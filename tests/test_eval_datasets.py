@@ -1,0 +1,705 @@
+"""The evaluation's datasets: small trees in the official formats, a point that must land on its pixel, and scales."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scenes import motorcycle
+from torch.nn.functional import grid_sample
+
+from spackle.bases.depth_maps import DepthMap
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.evaluation import paper
+from spackle.evaluation.alignment import SAME, align, to_base
+from spackle.evaluation.case import Case, Points
+from spackle.evaluation.datasets import DATASETS, get_dataset
+from spackle.evaluation.datasets.sampling import spread
+from spackle.evaluation.load import dense_cells, load_case
+from spackle.image import working_size
+
+Array = NDArray[Any]
+WIDTH, HEIGHT, FOCAL = 48, 36, 40.0
+POINTS = np.array([[x, y, 4 + 0.5 * x + 0.2 * y] for x in (-1.0, -0.3, 0.4, 1.1) for y in (-0.8, 0.0, 0.7)])
+
+
+# -- cameras that know nothing of ours: OpenCV axes, the first pixel's corner is (0, 0) ------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Eye:
+    """A camera in the world."""
+
+    at: tuple[float, float, float]
+    turn: float = 0.0  # radians to the right
+    width: int = WIDTH
+    height: int = HEIGHT
+    focal: float = FOCAL
+
+    @property
+    def to_world(self) -> Array:
+        """[4, 4], columns right, down, forward, eye."""
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        return np.array([[c, 0, s, self.at[0]], [0, 1, 0, self.at[1]], [-s, 0, c, self.at[2]], [0, 0, 0, 1.0]])
+
+    def pixel(self, point: Array) -> tuple[float, float, float]:
+        """x, y and depth."""
+        right, down, forward, eye = self.to_world[:3].T
+        x, y, z = (float((point - eye) @ axis) for axis in (right, down, forward))
+        return self.focal * x / z + self.width / 2, self.focal * y / z + self.height / 2, z
+
+
+EYES = [Eye((0, 0, 0)), Eye((0.4, 0, 0), -0.06), Eye((0, 0.5, 0.1), 0.05), Eye((0.9, 0, 0)), Eye((-0.5, 0.1, 0), 0.02)]
+
+
+def photo(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shades = np.arange(width * height * 3, dtype=np.uint32).reshape(height, width, 3) * 7 % 251
+    Image.fromarray(shades.astype(np.uint8)).save(path)
+    return path
+
+
+def pfm(path: Path, values: Array) -> None:
+    height, width = values.shape
+    path.write_bytes(f"Pf\n{width} {height}\n-1.0\n".encode() + values[::-1].astype("<f4").tobytes())
+
+
+def middlebury_2014(scene: Path, *, cx: float = 20.25, doffs: float = 3.5, truth: str = "disp0.pfm") -> Path:
+    """A plane with disparity 5 at quarter size; cx counts from the first pixel's centre."""
+    photo(scene / "im0.png")
+    photo(scene / "im1.png")
+    text = f"cam0=[{FOCAL} 0 {cx}; 0 {FOCAL} 17.5; 0 0 1]\ncam1=[{FOCAL} 0 {cx + doffs}; 0 {FOCAL} 17.5; 0 0 1]\n"
+    text += f"doffs={doffs}\nbaseline=193.001\nwidth={WIDTH}\nheight={HEIGHT}\nndisp=20\nisint=0\nvmin=1\nvmax=9\n"
+    (scene / "calib.txt").write_text(text)
+    disparity = np.full((HEIGHT, WIDTH), 5.0)
+    disparity[0, 0] = np.inf
+    if truth:
+        pfm(scene / truth, disparity)
+    return scene
+
+
+def booster(scene: Path) -> Path:
+    for name in ("im0.png", "im1.png"):
+        photo(scene / "camera_00" / name)
+        photo(scene / "camera_02" / name)
+    left, right = (
+        [[FOCAL, 0, 22, 0], [0, FOCAL, 18, 0], [0, 0, 1, 0]],
+        [[FOCAL, 0, 25, -3200.0], [0, FOCAL, 18, 0], [0, 0, 1, 0]],
+    )
+    text = '<?xml version="1.0"?>\n<opencv_storage>\n'
+    for name, rows in (("proj_matL", left), ("proj_matR", right)):
+        data = " ".join(f"{float(v):.17e}" for row in rows for v in row)
+        text += f'<{name} type_id="opencv-matrix"><rows>3</rows><cols>4</cols><dt>d</dt><data>{data}</data></{name}>\n'
+    (scene / "calib_00-02.xml").write_text(text + "<baselineLR>8.0e+01</baselineLR>\n</opencv_storage>\n")
+    disparity = np.full((HEIGHT, WIDTH), 7.0, np.float32)
+    disparity[:2] = 0
+    np.save(scene / "disp_00.npy", disparity)
+    return scene
+
+
+def wildrgbd(scene: Path, eyes: Sequence[Eye] = EYES, scale: float = 0.15) -> Path:
+    """The world shrunk to what a hand holds."""
+    K = [FOCAL, 0, 0, 0, FOCAL, 0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, 1]  # by columns; integers are pixel centres
+    lines = []
+    for number, eye in enumerate(eyes):
+        photo(scene / "rgb" / f"{number:05d}.png")
+        photo(scene / "masks" / f"{number:05d}.png")
+        pose = eye.to_world.copy()
+        pose[:3, 3] *= scale
+        lines.append(" ".join([str(number), *(f"{v:.9f}" for v in pose.ravel())]))
+        (scene / "depth").mkdir(exist_ok=True)
+        Image.fromarray(np.full((HEIGHT, WIDTH), 700, np.uint16)).save(scene / "depth" / f"{number:05d}.png")
+    (scene / "cam_poses.txt").write_text("\n".join(lines) + "\n")
+    (scene / "metadata").write_text(json.dumps({"w": WIDTH, "h": HEIGHT, "K": K, "fps": 30}))
+    return scene
+
+
+def quaternion(eye: Eye) -> list[float]:
+    """wxyz of world-to-camera."""
+    return [np.cos(eye.turn / 2), 0, -np.sin(eye.turn / 2), 0]
+
+
+def colmap(
+    folder: Path, names: Sequence[str], eyes: Sequence[Eye] = EYES, *, binary: bool, bend: float | None = None
+) -> None:
+    """All points seen by all photos, each photo with one keypoint that matched nothing; one point is unreliable."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lens = [FOCAL, WIDTH / 2, HEIGHT / 2, bend] if bend is not None else [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    world = [*POINTS, np.array([0.0, 0.0, 99.0])]
+    ids, errors = [10 + 3 * k for k in range(len(world))], [0.5] * len(POINTS) + [7.0]
+    images = []
+    for number, (name, eye) in enumerate(zip(names, eyes, strict=False)):
+        shift = -eye.to_world[:3, :3].T @ np.array(eye.at)
+        seen = [(*eye.pixel(point)[:2], key) for point, key in zip(world, ids, strict=True)] + [(1.0, 1.0, -1)]
+        images.append((number + 1, [*quaternion(eye), *shift], name, seen))
+    if binary:
+        model = 2 if bend is not None else 1
+        (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 4, model, WIDTH, HEIGHT, *lens))
+        data = struct.pack("<Q", len(images))
+        for key, pose, name, seen in images:
+            data += struct.pack("<i7di", key, *pose, 4) + name.encode() + b"\0" + struct.pack("<Q", len(seen))
+            data += b"".join(struct.pack("<ddq", *point) for point in seen)
+        (folder / "images.bin").write_bytes(data)
+        data = struct.pack("<Q", len(world))
+        for key, point, error in zip(ids, world, errors, strict=True):
+            track = [(image[0], 0) for image in images]
+            data += struct.pack("<Q3d3BdQ", key, *point, 1, 2, 3, error, len(track))
+            data += b"".join(struct.pack("<ii", *entry) for entry in track)
+        (folder / "points3D.bin").write_bytes(data)
+        return
+    model = "SIMPLE_RADIAL" if bend is not None else "PINHOLE"
+    (folder / "cameras.txt").write_text(f"# Camera list\n4 {model} {WIDTH} {HEIGHT} {' '.join(map(str, lens))}\n")
+    text = "# Image list with two lines of data per image:\n"
+    for key, pose, name, seen in images:
+        text += f"{key} {' '.join(map(repr, map(float, pose)))} 4 {name}\n"
+        text += " ".join(f"{float(x)!r} {float(y)!r} {point}" for x, y, point in seen) + "\n"
+    (folder / "images.txt").write_text(text)
+    rows = [f"{k} {' '.join(map(str, p))} 1 2 3 {e} 1 0 2 0" for k, p, e in zip(ids, world, errors, strict=True)]
+    (folder / "points3D.txt").write_text("\n".join(["# 3D points", *rows]) + "\n")
+
+
+def eth3d(scene: Path, eyes: Sequence[Eye] = EYES) -> Path:
+    names = [f"dslr_images_undistorted/DSC_{k:04d}.JPG" for k in range(len(eyes))]
+    for name in names:
+        photo(scene / "images" / name)
+    colmap(scene / "dslr_calibration_undistorted", names, eyes, binary=False)
+    return scene
+
+
+def tanks(scene: Path, eyes: Sequence[Eye] = EYES, *, sparse: str = "sparse/0", binary: bool = True) -> Path:
+    names = [f"{k:06d}.jpg" for k in range(len(eyes))]
+    for name in names:
+        photo(scene / sparse.partition("sparse")[0] / "images" / name)
+    colmap(scene / sparse, names, eyes, binary=binary)
+    return scene
+
+
+def llff(scene: Path, eyes: Sequence[Eye] = EYES, *, bounds: bool = True, sparse: bool = False) -> Path:
+    """Photos at a quarter of the size that the poses are for."""
+    for k in range(len(eyes)):
+        photo(scene / "images_4" / f"image{k:03d}.png", WIDTH // 4, HEIGHT // 4)
+    if bounds:
+        rows = []
+        for eye in eyes:
+            right, down, forward, at = eye.to_world[:3].T
+            matrix = np.stack([down, right, -forward, at, [eye.height, eye.width, eye.focal]], axis=1)
+            rows.append([*matrix.ravel(), 3.0, 6.0])
+        np.save(scene / "poses_bounds.npy", np.array(rows))
+    if sparse:
+        colmap(scene / "sparse/0", [f"IMG_{4026 + k}.JPG" for k in range(len(eyes))], eyes, binary=True, bend=0.001)
+    return scene
+
+
+TREES: dict[str, Callable[[Path], Path]] = {
+    "middlebury": lambda root: middlebury_2014(root / "Piano-perfect"),
+    "booster": lambda root: booster(root / "train/balanced/Bathroom"),
+    "wildrgbd": lambda root: wildrgbd(root / "apple/scenes/scene_000"),
+    "eth3d": lambda root: eth3d(root / "courtyard"),
+    "llff": lambda root: llff(root / "fern"),
+    "tanks": lambda root: tanks(root / "Truck"),
+}
+EXPECTED = {"middlebury": 1, "booster": 2, "wildrgbd": 5, "eth3d": 5, "llff": 5, "tanks": 5}
+
+
+def cases(name: str, root: Path) -> list[Case]:
+    return list(get_dataset(name).cases(root))
+
+
+def error_of(name: str, root: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        cases(name, root)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def assert_lands(case: Case, eyes: Sequence[Eye], index: int, order: Sequence[int], scale: float = 1.0) -> None:
+    """World points must land on their pixels in the case's photo and in its second views."""
+    assert case.camera is not None
+    assert case.camera.K.dtype == torch.float32
+    assert torch.equal(case.camera.world_to_camera, torch.eye(4))
+    own = np.linalg.inv(eyes[index].to_world)
+    local = torch.from_numpy(POINTS @ own[:3, :3].T + own[:3, 3]) * scale
+    for camera, eye in [
+        (case.camera, eyes[index]),
+        *zip([s.camera for s in case.seconds], [eyes[k] for k in order], strict=True),
+    ]:
+        uv, z = camera.project(local.float())
+        expected = torch.tensor([eye.pixel(point) for point in POINTS])
+        torch.testing.assert_close(uv, expected[:, :2].float(), atol=2e-3, rtol=0)
+        torch.testing.assert_close(z / scale, expected[:, 2].float(), atol=1e-4, rtol=1e-5)
+
+
+# -- the registry, and roots of something else -----------------------------------------------------------------------
+
+
+def test_registry_agrees_with_the_papers_tables() -> None:
+    assert {dataset.title: dataset.paper_images for dataset in DATASETS.values()} == paper.IMAGES
+    assert all(get_dataset(name).name == name and get_dataset(name).terms for name in DATASETS)
+
+
+@pytest.mark.parametrize(
+    ("typed", "hint"), [("midlebury", "did you mean middlebury"), ("LLFF", "llff"), ("x", "give one of")]
+)
+def test_a_misspelt_dataset_gets_the_nearest_name(typed: str, hint: str) -> None:
+    with pytest.raises(InputError, match=hint):
+        get_dataset(typed)
+
+
+@pytest.mark.parametrize("there", TREES)
+@pytest.mark.parametrize("asked", TREES)
+def test_each_tree_is_read_by_its_dataset_and_recognised_by_the_others(asked: str, there: str, tmp_path: Path) -> None:
+    scene = TREES[there](tmp_path / "data")
+    if asked != there:
+        message = error_of(asked, tmp_path / "data")
+        assert f"no scene of {asked}" in message
+        assert "expected" in message
+        assert f"this looks like {there}" in message
+        return
+    found = cases(asked, tmp_path / "data")
+    assert len(found) == EXPECTED[there]
+    assert [case.name for case in cases(asked, scene)] == [case.name for case in found]  # a scene alone is a root too
+    assert len({case.name for case in found}) == len(found)
+    assert all(case.photo.is_file() and all(view.photo.is_file() for view in case.seconds) for case in found)
+    assert all(case.metric == (there in ("middlebury", "booster", "wildrgbd", "eth3d")) for case in found)
+    assert load_case(found[0]).seconds
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_roots_without_anything(name: str, tmp_path: Path) -> None:
+    assert "no such folder" in error_of(name, tmp_path / "nowhere")
+    assert "looks like" not in error_of(name, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "says"),
+    [
+        ("middlebury", "Piano-perfect/calib.txt", "calib.txt: no such calibration"),
+        ("middlebury", "Piano-perfect/im1.png", "im1.png: no such photo"),
+        ("middlebury", "Piano-perfect/disp0.pfm", "no disp0GT.pfm or disp0.pfm: unpack the ground truth"),
+        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "calib_00-02.xml: no such calibration"),
+        ("booster", "train/balanced/Bathroom/camera_02/im1.png", "im1.png: no such photo"),
+        ("booster", "train/balanced/Bathroom/disp_00.npy", "give train/balanced"),
+        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "cam_poses.txt: no such list of poses"),
+        ("wildrgbd", "apple/scenes/scene_000/metadata", "metadata: no such description"),
+        ("wildrgbd", "apple/scenes/scene_000/depth/00001.png", "00001.png: no such depth map"),
+        ("eth3d", "courtyard/dslr_calibration_undistorted/images.txt", "images.txt: no such part of a COLMAP model"),
+        ("eth3d", "courtyard/images/dslr_images_undistorted/DSC_0002.JPG", "DSC_0002.JPG: no such photo"),
+        ("llff", "fern/images_4/image001.png", "5 rows, but there are 4 photos"),
+        ("tanks", "Truck/sparse/0/cameras.bin", "expected cameras, images, points3D"),
+        ("tanks", "Truck/images/000003.jpg", "000003.jpg: no such photo"),
+    ],
+)
+def test_a_missing_file_is_named(name: str, missing: str, says: str, tmp_path: Path) -> None:
+    TREES[name](tmp_path)
+    (tmp_path / missing).unlink()
+    assert says in error_of(name, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "content"),
+    [
+        ("middlebury", "Piano-perfect/calib.txt", "cam0=[1 2]\n"),
+        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "<opencv_storage><proj_matL/></opencv_storage>"),
+        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "no XML"),
+        ("wildrgbd", "apple/scenes/scene_000/metadata", '{"w": 4, "h": 3, "K": [1, 2]}'),
+        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "0 1 2 3\n"),
+        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "0 " + "nan " * 16),
+        ("eth3d", "courtyard/dslr_calibration_undistorted/cameras.txt", "4 PINHOLE 48 36 40 40\n"),
+        ("eth3d", "courtyard/dslr_calibration_undistorted/images.txt", "1 0 0 0 0 0 0 0 4 a.jpg\n\n"),
+        ("eth3d", "courtyard/dslr_calibration_undistorted/points3D.txt", "1 2\n"),
+        ("llff", "fern/poses_bounds.npy", "not NumPy"),
+        ("tanks", "Truck/sparse/0/images.bin", "\x09" + "\0" * 20),
+        ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30),
+    ],
+)
+def test_a_damaged_file_is_named(name: str, file: str, content: str, tmp_path: Path) -> None:
+    TREES[name](tmp_path)
+    (tmp_path / file).write_bytes(content.encode("latin-1"))
+    assert Path(file).name in error_of(name, tmp_path)
+
+
+@pytest.mark.parametrize(("name", "make"), [("wildrgbd", wildrgbd), ("eth3d", eth3d), ("llff", llff), ("tanks", tanks)])
+def test_a_scene_with_one_photo_is_refused(name: str, make: Callable[..., Path], tmp_path: Path) -> None:
+    make(tmp_path / "one", EYES[:1])
+    assert "at least two photos with a pose are needed, 1 found" in error_of(name, tmp_path)
+
+
+def test_a_lens_that_bends_is_refused(tmp_path: Path) -> None:
+    names = [path.name for path in sorted((tanks(tmp_path / "Truck") / "images").iterdir())]
+    colmap(tmp_path / "Truck/sparse/0", names, binary=True, bend=0.4)
+    assert "bends the corners by over 2%: undistort" in error_of("tanks", tmp_path)
+    (tmp_path / "Truck/sparse/0/cameras.bin").write_bytes(struct.pack("<QiiQQ8d", 1, 4, 5, WIDTH, HEIGHT, *[1.0] * 8))
+    assert "lens model 5 is no pinhole" in error_of("tanks", tmp_path)
+
+
+# -- rectified pairs -------------------------------------------------------------------------------------------------
+
+
+def assert_pair(case: Case, pixel: tuple[int, int], disparity: float, z: float) -> None:
+    """The centre of a left pixel must be seen `disparity` pixels further left, at the depth that is known there."""
+    assert case.camera is not None
+    assert case.depth is not None
+    known = case.depth()
+    x, y = pixel
+    assert bool(known.valid[y, x])
+    torch.testing.assert_close(float(known.depth[y, x]), z, rtol=1e-5, atol=0)
+    point = case.camera.unproject(torch.tensor([x + 0.5, y + 0.5]), known.depth[y, x])
+    uv, depth = case.seconds[0].camera.project(point)
+    torch.testing.assert_close(uv, torch.tensor([x + 0.5 - disparity, y + 0.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(float(depth), z, rtol=1e-5, atol=0)
+    assert known.K is not None
+    assert torch.equal(known.K, case.camera.K)
+
+
+@pytest.mark.parametrize("truth", ["disp0.pfm", "disp0GT.pfm"])
+def test_middlebury_2014(truth: str, tmp_path: Path) -> None:
+    middlebury_2014(tmp_path / "trainingQ/Piano", truth=truth)
+    middlebury_2014(tmp_path / "testQ/Djembe", truth="")
+    (case,) = cases("middlebury", tmp_path)
+    assert case.name == "Piano"
+    assert_pair(case, (30, 9), 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
+    assert case.camera is not None
+    assert float(case.camera.K[0, 2]) == 20.75  # the file counts from the middle of the first pixel
+    assert case.depth is not None
+    assert not bool(case.depth().valid[0, 0])
+
+
+def test_of_perfect_and_imperfect_the_perfect_one_is_taken(tmp_path: Path) -> None:
+    for name in ("Piano-perfect", "Piano-imperfect", "Couch-imperfect"):
+        middlebury_2014(tmp_path / name)
+    assert [case.name for case in cases("middlebury", tmp_path)] == ["Couch-imperfect", "Piano-perfect"]
+
+
+def test_two_sizes_of_one_scene_are_refused(tmp_path: Path) -> None:
+    for name in ("trainingQ", "trainingH"):
+        middlebury_2014(tmp_path / name / "Piano")
+    assert "give the folder of one size" in error_of("middlebury", tmp_path)
+
+
+@pytest.mark.parametrize("photos", [".", "Illum2/Exp1"])
+@pytest.mark.parametrize(("height", "shrink"), [(1110, 1), (555, 2), (370, 3)])
+def test_middlebury_2006(height: int, shrink: int, photos: str, tmp_path: Path) -> None:
+    scene = tmp_path / "Aloe"
+    for name in ("view1.png", "view5.png"):
+        photo(scene / photos / name, 40, height)
+    levels = np.full((height, 40), 90, np.uint8)
+    levels[0] = 0
+    Image.fromarray(levels).save(scene / "disp1.png")
+    (scene / "dmin.txt").write_text("270\n")
+    (case,) = cases("middlebury", tmp_path)
+    assert case.metric
+    assert_pair(case, (30, 9), 90 / shrink, 3740 * 0.16 / (90 + 270))
+    assert case.depth is not None
+    assert not case.depth().valid[0].any()
+
+
+@pytest.mark.parametrize(("width", "levels"), [(450, 4), (900, 2), (1800, 1), (434, 8)])
+@pytest.mark.parametrize("suffixes", [(".ppm", ".pgm"), (".png", ".png")])
+def test_middlebury_2003_and_2001(width: int, levels: int, suffixes: tuple[str, str], tmp_path: Path) -> None:
+    scene = tmp_path / "cones"
+    for name in ("im2", "im6"):
+        photo(scene / f"{name}{suffixes[0]}", width, 24)
+    Image.fromarray(np.full((24, width), 120, np.uint8)).save(scene / f"disp2{suffixes[1]}")
+    (case,) = cases("middlebury", tmp_path)
+    size, disparity = width / 450, 120 / levels
+    assert_pair(case, (300, 9), disparity, 1000 * size * 0.1 / (disparity + 30 * size))
+    assert not case.metric
+
+
+def test_a_scene_description(tmp_path: Path) -> None:
+    for name in ("left.png", "right.png"):
+        photo(tmp_path / "mb_Art" / name)
+    Image.fromarray(np.full((HEIGHT, WIDTH), 30, np.uint8)).save(tmp_path / "mb_Art/disparity.png")
+    facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.png", "disparity_scale": 1 / 3}
+    lens = {"focal_px": FOCAL, "cx": 24.0, "cy": 18.0, "doffs_px": 2.0, "baseline_m": 0.16, "invalid": 0}
+    (tmp_path / "mb_Art/scene.json").write_text(json.dumps(facts | lens))
+    (case,) = cases("middlebury", tmp_path)
+    assert_pair(case, (30, 9), 10.0, FOCAL * 0.16 / 12)
+    (tmp_path / "mb_Art/scene.json").write_text("[]")
+    assert "scene.json: not a scene description" in error_of("middlebury", tmp_path)
+
+
+@pytest.mark.parametrize("truth", ["two_view_training", "two_view_training_gt"])
+def test_eth3d_two_views(truth: str, tmp_path: Path) -> None:
+    scene = middlebury_2014(tmp_path / "two_view_training/playground_1l", doffs=0.0, truth="disp0GT.pfm")
+    target = tmp_path / truth / "playground_1l/disp0GT.pfm"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    (scene / "disp0GT.pfm").rename(target)
+    (case,) = cases("eth3d", tmp_path)
+    assert_pair(case, (30, 9), 5.0, FOCAL * 0.193001 / 5.0)
+    assert "this looks like eth3d" in error_of("middlebury", tmp_path)
+
+
+def test_booster(tmp_path: Path) -> None:
+    booster(tmp_path / "train/balanced/Bathroom")
+    booster(tmp_path / "train/unbalanced/Bathroom")
+    first, second = cases("booster", tmp_path)
+    assert [first.name, second.name] == ["Bathroom/im0", "Bathroom/im1"]
+    assert second.seconds[0].photo == tmp_path / "train/balanced/Bathroom/camera_02/im1.png"
+    assert_pair(second, (30, 9), 7.0, FOCAL * 0.08 / (7.0 + 3.0))
+    assert second.camera is not None
+    assert second.camera.K[:2, 2].tolist() == [22.5, 18.5]
+    assert second.depth is not None
+    assert not second.depth().valid[:2].any()
+
+
+def test_real_photos_match_where_the_cameras_say(tmp_path: Path) -> None:
+    """Motorcycle, written as a scene of 2014: its left pixels are found again in the right photo."""
+    pair = motorcycle()
+    scene, height, width = tmp_path / "Motorcycle", pair.left.camera.height, pair.left.camera.width
+    scene.mkdir()
+    for name, rgb in (("im0.png", pair.left.rgb), ("im1.png", pair.right_rgb)):
+        Image.fromarray((rgb * 255).round().byte().numpy()).save(scene / name)
+    focal, doffs, baseline = 994.978, 31.086, 0.193001
+    depth = pair.left.depth.numpy()
+    with np.errstate(divide="ignore"):
+        pfm(scene / "disp0.pfm", np.where(depth > 0, focal * baseline / depth - doffs, np.inf))
+    lens = f"cam0=[{focal} 0 310.693; 0 {focal} 254.377; 0 0 1]\ndoffs={doffs}\nbaseline=193.001\n"
+    (scene / "calib.txt").write_text(f"{lens}width={width}\nheight={height}\n")
+    loaded = load_case(cases("middlebury", tmp_path)[0])
+    known, right = loaded.case.depth, loaded.seconds[0]
+    assert known is not None
+    valid = known().valid & (torch.rand(height, width, generator=torch.Generator().manual_seed(1)) < 0.1)
+    pixels = loaded.camera.pixel_centers()[valid]
+    uv, _ = right.camera.project(loaded.camera.unproject(pixels, known().depth[valid]))
+
+    def differs(at: torch.Tensor) -> float:
+        size = torch.tensor([right.camera.width, right.camera.height])
+        there = grid_sample(right.rgb.permute(2, 0, 1)[None], (2 * at / size - 1)[None, None], align_corners=False)
+        return 255 * float((there[0, :, 0].T - loaded.photo.rgb[valid]).abs().mean(1).median())
+
+    assert differs(uv) < 4.5  # 3.9 measured; 27 where the pixels stay where they are
+    assert differs(pixels) > 20
+    assert min(differs(uv + torch.tensor([dx, 0.0])) for dx in (-1.0, 1.0)) > differs(uv) + 0.5
+
+
+# -- posed photos ----------------------------------------------------------------------------------------------------
+
+
+def order_of(case: Case, names: Sequence[str]) -> list[int]:
+    return [names.index(view.name) for view in case.seconds]
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "scale"),
+    [
+        ("wildrgbd", lambda root: wildrgbd(root / "apple/scenes/scene_000"), 0.15),
+        ("eth3d", lambda root: eth3d(root / "courtyard"), 1.0),
+        ("tanks", lambda root: tanks(root / "Truck"), 1.0),
+        ("tanks", lambda root: tanks(root / "Truck", sparse="sparse", binary=False), 1.0),
+        ("tanks", lambda root: tanks(root / "Truck", sparse="dense/sparse"), 1.0),
+        ("llff", lambda root: llff(root / "fern"), 1.0),
+        ("llff", lambda root: llff(root / "fern", sparse=True), 1.0),
+        ("llff", lambda root: llff(root / "llff_fern", sparse=True, bounds=False), 1.0),
+    ],
+)
+def test_points_land_on_their_pixels(name: str, make: Callable[[Path], Path], scale: float, tmp_path: Path) -> None:
+    make(tmp_path)
+    found = cases(name, tmp_path)
+    names = [case.name for case in found]
+    assert names == sorted(names)
+    assert sum(len(case.seconds) for case in found) > 5
+    for index, case in enumerate(found):
+        assert_lands(case, EYES, index, order_of(case, names), scale)
+
+
+def test_sparse_points_have_their_pixels_and_depths(tmp_path: Path) -> None:
+    tanks(tmp_path / "Truck")
+    for case, eye in zip(cases("tanks", tmp_path), EYES, strict=True):
+        assert case.points is not None
+        points = case.points()
+        expected = torch.tensor([eye.pixel(point) for point in POINTS]).float()  # not the one with an error of 7 px
+        torch.testing.assert_close(points.uv, expected[:, :2], atol=1e-4, rtol=0)
+        torch.testing.assert_close(points.z, expected[:, 2], atol=1e-4, rtol=0)
+
+
+def test_second_views_are_the_nearest_that_are_neither_the_same_nor_far(tmp_path: Path) -> None:
+    beside = [0.0, 0.01, 0.3, 0.35, 0.4, 0.5, 3.0]  # at a middle depth of 4: 0.2 to 1 is near
+    eyes = [Eye((x, 0, 0)) for x in beside] + [Eye((0.25, 0, 0), 1.0)]
+    llff(tmp_path / "fern", eyes)
+    first = cases("llff", tmp_path)[0]
+    assert [view.name for view in first.seconds] == ["fern/image002", "fern/image003", "fern/image004"]
+    assert first.bounds == (3.0, 6.0)
+
+
+def test_llff_reads_images_4_first_and_matches_by_name_where_it_can(tmp_path: Path) -> None:
+    scene = llff(tmp_path / "fern", sparse=True)
+    photo(scene / "images/IMG_4026.JPG")
+    assert cases("llff", tmp_path)[2].photo == scene / "images_4/image002.png"
+    for k in range(1, 5):
+        photo(scene / f"images/IMG_{4026 + k}.png")
+    for path in (scene / "images_4").iterdir():
+        path.unlink()
+    assert cases("llff", tmp_path)[2].photo == scene / "images/IMG_4028.png"
+
+
+# -- sampling --------------------------------------------------------------------------------------------------------
+
+
+def test_frames_are_spread_evenly_and_by_names_alone() -> None:
+    sizes = {"Barn": 10, "Truck": 100, "Church": 1000}
+    picked = spread(list(sizes), lambda name: range(sizes[name]), 60)
+    taken = {name: [frame for scene, frame in picked if scene == name] for name in sizes}
+    assert {name: len(frames) for name, frames in taken.items()} == {"Barn": 10, "Truck": 25, "Church": 25}
+    for name, frames in taken.items():
+        steps = np.diff(frames)
+        assert steps.min() >= sizes[name] // len(frames)
+        assert steps.max() <= sizes[name] // len(frames) + 1
+    assert sorted(picked) == sorted(spread(list(sizes)[::-1], lambda name: range(sizes[name]), 60))
+    assert len(spread(list(sizes), lambda name: range(sizes[name]), 5000)) == 1110
+
+
+def test_with_more_scenes_than_frames_each_group_gets_its_share() -> None:
+    scenes = [f"{group}/scene_{k:03d}" for group, n in (("apple", 200), ("box", 30), ("car", 5)) for k in range(n)]
+    asked: list[str] = []
+
+    def frames(scene: str) -> range:
+        asked.append(scene)
+        return range(300)
+
+    picked = spread(scenes, frames, 45)
+    counts = {group: sum(scene.startswith(group) for scene, _ in picked) for group in ("apple", "box", "car")}
+    assert counts == {"apple": 20, "box": 20, "car": 5}
+    assert len(asked) == 45  # nobody looks into the other scenes
+
+
+# -- loading ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stored", "cells"),
+    [
+        ((4112, 3008), 431_616),  # Booster
+        ((640, 480), 76_800),  # WildRGB-D
+        ((480, 640), 76_800),
+        ((1920, 1080), 331_776),  # Tanks and Temples, most scenes
+        ((1008, 756), 190_512),  # LLFF, images_4
+        ((6048, 4032), 393_216),  # ETH3D as it was taken; the mean of all is 393,246.72
+        ((6208, 4135), 393_216),  # and undistorted
+    ],
+)
+def test_working_sizes_give_the_papers_dense_counts(stored: tuple[int, int], cells: int) -> None:
+    assert dense_cells(*working_size(*stored)) == cells
+
+
+def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> None:
+    llff(tmp_path / "fern")
+    case = cases("llff", tmp_path)[0]
+    big = dataclasses.replace(case, photo=photo(tmp_path / "big.png", 96, 72))
+    seconds = [dataclasses.replace(case.seconds[0], photo=photo(tmp_path / "odd.png", 36, 27))]
+    loaded = load_case(dataclasses.replace(big, seconds=tuple(seconds)), max_side=64)
+    assert (loaded.full.width, loaded.photo.width, loaded.photo.height) == (96, 64, 48)
+    assert loaded.photo.focal_px == pytest.approx(FOCAL * 64 / 48)
+    assert loaded.cells == 32 * 24
+    (second,) = loaded.seconds
+    assert second.rgb.shape == (26, 36, 3)
+    for eye, camera, width in ((EYES[0], loaded.camera, 64), (EYES[1], second.camera, 36)):
+        uv, _ = camera.project(torch.tensor(POINTS).float())
+        expected = torch.tensor([eye.pixel(point)[:2] for point in POINTS]).float() * width / WIDTH
+        torch.testing.assert_close(uv, expected, atol=2e-3, rtol=0)
+
+
+def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
+    middlebury_2014(tmp_path / "Piano")
+    (case,) = cases("middlebury", tmp_path)
+    (tmp_path / "Piano/im1.png").write_bytes(b"not a PNG")
+    with pytest.raises(InputError, match=r"im1\.png: not an image"):
+        load_case(case)
+    photo(tmp_path / "Piano/im1.png", HEIGHT, WIDTH)
+    with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but its calibration is for 48×36"):
+        load_case(case)
+    (tmp_path / "Piano/im0.png").unlink()
+    with pytest.raises(InputError, match=r"im0\.png: no such photo"):
+        load_case(case)
+    lonely = load_case(Case("lonely", photo(tmp_path / "lonely.png")))
+    assert (lonely.camera.width, lonely.photo.focal_source, lonely.seconds) == (WIDTH, "default 30 mm", ())
+
+
+# -- scales ----------------------------------------------------------------------------------------------------------
+
+
+def ramp(height: int = 60, width: int = 80) -> torch.Tensor:
+    return torch.linspace(2, 5, height)[:, None].expand(height, width).clone()
+
+
+def spoilt(depth: torch.Tensor, share: float) -> torch.Tensor:
+    """Some of it five times as far."""
+    noise = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0))
+    return torch.where(noise < share, 5 * depth, depth)
+
+
+def case_with(**known: Any) -> Case:
+    return Case("case", Path("photo.png"), Camera.from_focal(100.0, 160, 120), **known)
+
+
+def test_a_known_factor_comes_back_under_outliers() -> None:
+    truth = ramp(120, 160)
+    depth = DepthMap(truth, torch.rand(truth.shape) < 0.7, None, None, "depth", Path("d.npy"))
+    z_base = spoilt(ramp() / 3.7, 0.3)
+    seen = torch.ones_like(z_base, dtype=torch.bool)
+    z_base[:, :5], seen[:, 5:10] = torch.nan, False
+    found = align(case_with(depth=lambda: depth), z_base, seen)
+    assert found.scale == pytest.approx(3.7, rel=0.01)
+    assert found.source == "depth"
+    assert 0.6 * 60 * 70 < found.pixels < 0.8 * 60 * 70
+    assert 0 < found.spread < 0.05
+    assert align(case_with(depth=lambda: depth), z_base, seen, base_is_truth=True) == SAME
+
+
+def test_points_give_the_scale_too() -> None:
+    y, x = torch.meshgrid(torch.arange(2, 120, 10) + 0.3, torch.arange(3, 160, 10) + 0.9, indexing="ij")
+    uv = torch.stack([x, y], -1).reshape(-1, 2)
+    points = Points(
+        torch.cat([uv, torch.tensor([[500.0, 5.0], [-1.0, 5.0]])]),
+        0.25 * (2 + 3 * torch.cat([uv[:, 1], torch.ones(2)]) / 120),
+    )
+    found = align(case_with(points=lambda: points), spoilt(ramp(), 0.2), torch.ones(60, 80, dtype=torch.bool))
+    assert found.scale == pytest.approx(0.25, rel=0.02)
+    assert (found.source, found.pixels) == ("points", len(uv))
+
+
+def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
+    seen = torch.ones(60, 80, dtype=torch.bool)
+    found = align(case_with(bounds=(4.0, 10.0)), ramp(), seen)
+    assert found.scale == pytest.approx(2.0, rel=1e-3)
+    assert (found.source, found.pixels) == ("bounds", 0)
+    assert found.spread < 1e-3
+    with pytest.raises(InputError, match="case: no depth of it is known"):
+        align(case_with(), ramp(), seen)
+    few = case_with(points=lambda: Points(torch.ones(3, 2), torch.ones(3)))
+    with pytest.raises(InputError, match="its points and the base's depth share under 8 pixels"):
+        align(few, ramp(), seen)
+
+
+@pytest.mark.parametrize(
+    ("turn", "off", "tolerance"), [(0.0, (9.0, -4.0), 1e-3), (0.2, (0.0, 0.0), 1e-3), (0.05, (1.0, 0.5), 0.02)]
+)
+def test_a_second_camera_in_the_bases_world(turn: float, off: tuple[float, float], tolerance: float) -> None:
+    """The same pixel at the same relative depth must be seen at the same place through either camera."""
+    base, scale = Camera.from_focal(40.0, 48, 36), 2.5
+    K = base.K.clone()
+    K[:2, 2] += torch.tensor(off)
+    given = Camera(K, torch.eye(4), 48, 36).resized(96, 72)
+    pose = torch.from_numpy(np.linalg.inv(Eye((0.4, 0.1, -0.2), turn).to_world)).float()
+    view = dataclasses.replace(given, world_to_camera=pose)
+    pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([48.0, 36.0])
+    z_base = torch.linspace(0.8, 3.0, 50)
+    expected, z = view.project(given.unproject(2 * pixels, scale * z_base))
+    moved = to_base(view, given, base, scale)
+    uv, z_moved = moved.project(base.unproject(pixels, z_base))
+    torch.testing.assert_close(uv, expected, atol=tolerance * 96, rtol=0)
+    torch.testing.assert_close(z_moved * scale, z, rtol=0.02, atol=0)
+    rotation = moved.world_to_camera[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-6, rtol=0)
+    assert (moved.width, moved.height) == (view.width, view.height)

@@ -1,0 +1,576 @@
+"""`spackle evaluate`: metrics beside scikit-image's, tables with the paper's numbers, killed runs that go on."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import math
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from command import Run, names_in, run
+from evaluation_data import fake_pyiqa, write_boxes, write_motorcycle
+from PIL import Image
+from scenes import box_before_wall, shifted
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.evaluation import paper
+from spackle.evaluation.methods import Shot, make_method
+from spackle.evaluation.metrics import psnr, reduction, ssim, ssim_map
+from spackle.evaluation.protocols import Gauges, large_views, measure
+from spackle.evaluation.pyiqa_metrics import DEFINITIONS, NOT_INSTALLED, open_metrics
+from spackle.evaluation.results import Mean, Record, Row
+from spackle.evaluation.results import Run as Results
+from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
+from spackle.evaluation.tables import make_tables
+from spackle.render import get_renderer
+from spackle.residual import hole_mask
+from spackle.trajectory import DepthRange, max_offset
+
+TABLES = ("tables.md", "tables.tex")
+FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package
+OUTPUTS = {"results.json", "times.json", "config.json", "worst.png", "best.png", "images", *TABLES}
+
+
+def noisy(height: int = 57, width: int = 83, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A random image and a disturbed copy, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
+    return image, (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+
+
+# --- metrics
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_psnr_and_ssim_are_scikit_images(seed: int) -> None:
+    theirs = pytest.importorskip("skimage.metrics")
+    image, truth = noisy(seed=seed)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
+    mean, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
+    assert ssim(image, truth) == pytest.approx(mean, abs=1e-6)
+    assert np.abs(ssim_map(image, truth).numpy() - full).max() < 1e-6
+    assert psnr(image, truth) == pytest.approx(
+        theirs.peak_signal_noise_ratio(truth.numpy(), image.numpy(), data_range=1), abs=1e-6
+    )
+
+
+def test_a_mask_restricts_a_metric_to_its_pixels() -> None:
+    theirs = pytest.importorskip("skimage.metrics")
+    image, truth = noisy()
+    mask = torch.zeros(image.shape[:2], dtype=torch.bool)
+    mask[:20, -30:] = True  # up to the border, where half of a hole may be
+    part, other = image[:20, -30:].numpy(), truth[:20, -30:].numpy()
+    assert psnr(image, truth, mask) == pytest.approx(
+        theirs.peak_signal_noise_ratio(other, part, data_range=1), abs=1e-6
+    )
+    assert ssim(image, truth, mask) == pytest.approx(float(ssim_map(image, truth)[mask].mean()), abs=1e-12)
+    changed = torch.where(mask[..., None], image, torch.zeros_like(image))
+    assert psnr(changed, truth, mask) == psnr(image, truth, mask)
+
+
+def test_metrics_of_nothing_and_of_equal_images() -> None:
+    image, truth = noisy()
+    nothing = torch.zeros(image.shape[:2], dtype=torch.bool)
+    assert math.isnan(psnr(image, truth, nothing))
+    assert math.isnan(ssim(image, truth, nothing))
+    assert psnr(image, image) == math.inf
+    assert ssim(image, image) == pytest.approx(1, abs=1e-12)
+    assert reduction(0.2, 0.05) == pytest.approx(0.75)
+    assert math.isnan(reduction(0.0, 0.0))
+
+
+# --- pyiqa, by a stand-in
+
+
+def test_without_pyiqa_each_of_its_metrics_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_pyiqa(monkeypatch, error=ModuleNotFoundError("No module named 'pyiqa'", name="pyiqa"))
+    opened = open_metrics(["niqe", "lpips"], "cpu", download=False)
+    assert opened.metrics == {}
+    assert opened.missing == {"niqe": NOT_INSTALLED, "lpips": NOT_INSTALLED}
+    assert open_metrics([], "cpu", download=False).missing == {}
+
+
+def test_a_torchvision_that_does_not_fit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_pyiqa(monkeypatch, error=RuntimeError("operator torchvision::nms does not exist"))
+    opened = open_metrics(["niqe"], "cpu", download=False)
+    assert opened.missing == {"niqe": "pyiqa cannot be imported: operator torchvision::nms does not exist"}
+
+
+def test_the_variant_of_each_metric_is_pinned_and_images_come_as_pyiqa_wants_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: dict[str, Any] = {}
+    seen: list[tuple[Tensor, ...]] = []
+
+    def create(name: str, device: torch.device, **options: Any) -> Any:
+        print("loading", name)
+        asked[name] = (device, options)
+
+        def metric(*images: Tensor) -> Tensor:
+            seen.append(images)
+            return images[0].mean()[None]
+
+        return metric
+
+    fake_pyiqa(monkeypatch, create)
+    opened = open_metrics(list(DEFINITIONS), "cpu", download=False)
+    assert (opened.version, opened.missing) == ("9.9", {})
+    assert asked["lpips"] == (torch.device("cpu"), {"net": "alex", "version": "0.1"})
+    assert asked["musiq"][1] == {"pretrained": "koniq10k"}
+    assert asked["clipiqa"][1]["backbone"] == "RN50"
+    picture, truth = torch.full((5, 7, 3), 1.5), torch.full((5, 7, 3), 0.25)
+    picture[0, 1, 2] = 0.0
+    assert opened.metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
+    assert opened.metrics["niqe"](truth, None) == pytest.approx(0.25)
+    first, second = seen[0]
+    assert first.shape == second.shape == (1, 3, 5, 7)
+    assert first[0, 2, 0, 1] == 0
+    assert float(first.max()) == 1
+    assert len(seen[1]) == 1
+
+
+def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+    def create(name: str, **options: Any) -> Any:
+        if name == "niqe":
+            socket.create_connection(("weights.invalid", 443), timeout=1)
+        if name == "musiq":
+            raise KeyError("koniq")
+        return lambda image: torch.tensor([math.nan])
+
+    fake_pyiqa(monkeypatch, create)
+    lookup = socket.getaddrinfo
+    opened = open_metrics(["niqe", "musiq", "clipiqa"], "cpu", download=False)
+    assert socket.getaddrinfo is lookup
+    assert opened.missing["niqe"].startswith("weights: not on this machine")
+    assert opened.missing["musiq"] == "pyiqa cannot load it: 'koniq'"
+    assert math.isnan(opened.metrics["clipiqa"](torch.zeros(4, 4, 3), None))
+
+
+# --- tables
+
+
+def results(title: str, protocol: str, methods: list[str], figures: dict[str, dict[str, float | None]]) -> Results:
+    """A run of two images with two views each, and one that was passed over."""
+    settings = ["near"] if protocol == "near-view" else ["0.3", "0.4", "0.5"]
+    rows = tuple(Row(s, v, m, figures[m]) for s in settings for m in methods for v in ("left", "right"))
+    facts = {"base_gaussians": 1000}
+    records = (Record("a", facts, rows), Record("b", facts, rows), Record("c", problem="c: broken"))
+    config = {
+        "title": title,
+        "protocol": protocol,
+        "methods": methods,
+        "base": {"title": "rgbd", "says": "the dataset's own depth"},
+        "disparities": [0.3, 0.4, 0.5],
+        "residual": {"weights": "shipped", "sha256": "0123456789"},
+        "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
+    }
+    return Results(config, records)
+
+
+LARGE: dict[str, dict[str, float | None]] = {
+    "base": {"har_before": 0.2, "har": 0.2, "aux": 0, "aux_share": 0.0, "merged": 1000, "niqe": 4.5, "musiq": None},
+    "spackle": {"har_before": 0.2, "har": 0.05, "aux": 30, "aux_share": 0.03, "merged": 1030, "niqe": 4.25},
+}
+
+
+def cells(table: Table, dataset: str) -> list[tuple[str, ...]]:
+    """The rows of a dataset, without its name."""
+    found, inside = [], False
+    for line in table.lines:
+        inside = line.cells[0] == dataset or (inside and line.cells[0] == "")
+        if inside:
+            found.append(line.cells[1:])
+    return found
+
+
+def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
+    quality, holes, gaussians = make_tables([results("Middlebury", "large-view", ["base", "spackle"], LARGE)])
+    assert (quality.label, holes.label) == ("tab:large_view_nr_iqa", "tab:controlled_disocclusion")
+    assert [name for name, _ in quality.groups] == [
+        "", "S1: disparity 0.3", "S2: disparity 0.4", "S3: disparity 0.5",
+    ]  # fmt: skip
+    assert quality.columns[3:6] == ("CLIPIQA ↑", "NIQE ↓", "MUSIQ ↑")
+    base, spackle, sharp, theirs = cells(quality, "Middlebury")
+    assert base[:5] == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
+    assert spackle[:4] == ("Spackle (rgbd)", "2/23", "", "**4.2500**")
+    assert sharp == ("SHARP (paper)", "23", *(f"{n:.4f}" for n in paper.QUALITY["Middlebury", "SHARP"]))
+    assert theirs[2:5] == ("0.3921", "4.3127", "58.1583")
+    assert cells(holes, "Middlebury")[0][2:5] == ("0.2000", "0.0500", "75.00%")
+    assert cells(holes, "Middlebury")[1][2:5] == ("0.0121", "0.0011", "90.47%")
+    assert cells(gaussians, "Middlebury")[0][2:5] == ("30", "3.00", "1,030")
+    assert cells(gaussians, "LLFF")[1][-3:] == ("23,397", "1.98", "1,203,045")
+    assert cells(quality, "Tanks")[0] == ("not run", *[""] * 10)
+    assert len(cells(holes, "Booster")) == 2
+    assert any("CLIPIQA not run: pyiqa is not installed" in note for note in quality.notes)
+    assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
+    assert any("Noncommercial" in note for note in quality.notes)
+    assert "swipe" in quality.caption
+    assert "shipped weights 01234567" in quality.caption
+    assert "rgbd: the dataset's own depth" in quality.caption
+
+
+def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
+    figures: dict[str, dict[str, float | None]] = {
+        "spackle": {"har_before": 0.1, "aux": 25, "dists": 0.3, "psnr": 20.0, "psnr_hole": 15.5, "ssim_hole": 0.5},
+        "dense": {"har_before": 0.1, "aux": 100, "dists": 0.25, "psnr": 21.0, "psnr_hole": 14.5, "ssim_hole": 0.5},
+    }
+    near, detail, ablation = make_tables([results("LLFF", "near-view", ["spackle", "dense"], figures)])
+    assert [name for name, _ in near.groups] == ["", *paper.DATASETS]
+    assert near.lines[0].cells == ("Spackle (rgbd)", *[""] * 10, "0.3000", "")
+    assert near.lines[3].cells[:3] == ("Direct FT (paper)", "0.1506", "0.4447")
+    assert cells(detail, "LLFF")[0][2:6] == ("0.1000", "20.00", "**15.50**", "")
+    dense, guided, *theirs = cells(ablation, "LLFF")
+    assert dense == ("Dense grid init (rgbd)", "1,000", "100.00", "–", "0.2500", "")
+    assert guided == ("Mask guided init (rgbd)", "1,000", "25.00", "75.00%", "0.3000", "")
+    assert theirs[1][1:4] == ("1,179,648", "96,824.65", "49.18%")
+    assert "LLFF 2/305" in near.caption
+
+
+def test_results_that_do_not_go_together_are_refused() -> None:
+    one = results("LLFF", "large-view", ["base"], LARGE)
+    with pytest.raises(ValueError, match="two results for LLFF"):
+        make_tables([one, one])
+    other = Results({**one.config, "title": "Tanks", "disparities": [0.3]}, one.records)
+    with pytest.raises(ValueError, match="different disparities"):
+        make_tables([one, other])
+
+
+def test_a_mean_leaves_out_what_is_not_finite_and_counts_it() -> None:
+    rows = tuple(Row("near", str(k), "base", {"psnr": value}) for k, value in enumerate((10.0, None, 20.0)))
+    assert Results({}, (Record("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
+    assert Results({}, ()).mean("psnr", "base", "near") == Mean(None, 0, 0)
+
+
+def test_the_papers_numbers_are_whole() -> None:
+    assert {title for title, _ in paper.QUALITY} == set(paper.HOLES) == set(paper.GAUSSIANS) == set(paper.DATASETS)
+    assert {len(row) for row in (*paper.QUALITY.values(), *paper.HOLES.values(), *paper.GAUSSIANS.values())} == {9}
+    for added, share, merged in (row[k : k + 3] for row in paper.GAUSSIANS.values() for k in (0, 3, 6)):
+        assert merged - added == paper.BASE_GAUSSIANS
+        assert share == pytest.approx(100 * added / paper.BASE_GAUSSIANS, abs=0.006)
+    for before, after, less in (row[k : k + 3] for row in paper.HOLES.values() for k in (0, 3, 6)):
+        assert less == pytest.approx(100 * reduction(before, after), abs=1.5)  # of numbers with four digits
+    for dense, _, _, guided, less, _, _ in paper.ABLATION.values():
+        assert less == pytest.approx(100 * reduction(dense, guided), abs=0.006)
+    assert paper.at(paper.HOLES["Booster"], 0.4) == (0.0103, 0.0006, 94.51)
+    assert paper.at(paper.HOLES["Booster"], 0.6) == (None, None, None)
+
+
+def test_a_table_as_markdown_and_as_latex() -> None:
+    table = Table("tab:x", "Ours & theirs, 5 %.", ("A", "B", "C"), (("", 1), ("both", 2)),
+                  (Line(("x_1", "**1**", "a|b")), Line(("", "2", "±3"), rule=True)), notes=("n.",))  # fmt: skip
+    assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in to_markdown([table])
+    text = to_latex([table])
+    assert r"\caption{Ours \& theirs, 5 \%. n.}" in text
+    assert r" & \multicolumn{2}{c}{both} \\" in text
+    assert r"\cmidrule(lr){2-3}" in text
+    assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$3 \\\\" in text
+    assert tex("100%_↑") == r"100\%\_$\uparrow$"
+    with pytest.raises(ValueError, match="different lengths"):
+        Table("t", "", ("A",), (("", 1),), (Line(("1", "2")),))
+
+
+def test_the_best_of_a_column_is_set_off() -> None:
+    assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
+    assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
+    assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
+    assert mark_best([1.0], ["1"], lower=False) == ["1"]
+
+
+# --- methods and views
+
+
+def shot_of(cameras: list[Camera]) -> Shot:
+    """A box before a wall, from elsewhere."""
+    prediction = box_before_wall().lift()
+    renderer = get_renderer()
+    return Shot(prediction, cameras, [renderer.render(prediction.gaussians, camera) for camera in cameras], renderer)
+
+
+def test_large_views_are_the_ends_of_a_swipe_at_each_disparity() -> None:
+    prediction = box_before_wall(width=95, height=71).lift()
+    views = large_views(prediction, (0.3, 0.5))
+    assert [(view.setting, view.name) for view in views] == [
+        ("0.3", "left"), ("0.3", "right"), ("0.5", "left"), ("0.5", "right"),
+    ]  # fmt: skip
+    assert {(view.camera.width, view.camera.height) for view in views} == {(96, 72)}
+    reach = DepthRange.of(prediction.gaussians)
+    for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
+        x, y, z = view.camera.position.tolist()
+        assert x == pytest.approx(sign * max_offset(views[0].camera, float(view.setting), reach), rel=1e-5)
+        assert abs(y) + abs(z) < 1e-6
+
+
+def test_each_method_starts_from_the_same_base() -> None:
+    shot = shot_of([shifted(box_before_wall().camera, side) for side in (0.4, -0.4)])
+    alone, per_view, scene, dense = (
+        list(make_method(name, None).views(shot)) for name in ("base", "seeds", "spackle-scene", "dense")
+    )
+    for index, before in enumerate(shot.before):
+        covered = ~hole_mask(before.alpha)
+        assert torch.equal(alone[index].rgb, before.rgb)
+        assert alone[index].aux == 0
+        for views in (per_view, scene, dense):
+            view = views[index]
+            assert view.alpha is not None
+            assert float(hole_mask(view.alpha).float().mean()) < 0.1 * float((~covered).float().mean())
+            assert float((view.rgb - before.rgb).abs()[covered].mean()) < 0.01
+        cells = before.alpha.numel() / 4
+        assert 0.97 * cells <= (dense[index].aux or 0) <= cells
+        assert (per_view[index].aux or 0) < 0.5 * cells
+    assert scene[0].aux == scene[1].aux  # one set for both
+
+
+def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
+    shot = shot_of([shifted(box_before_wall().camera, 0.4)])
+    base = shot.prediction
+    same = list(make_method("direct-ft", None, lambda: (base, 1.0)).views(shot))
+    assert torch.equal(same[0].rgb, shot.before[0].rgb)
+    g = base.gaussians
+    double = dataclasses.replace(base, gaussians=dataclasses.replace(g, means=2 * g.means, scales=2 * g.scales))
+    other = list(make_method("direct-ft", None, lambda: (double, 2.0)).views(shot))
+    assert float((other[0].rgb - shot.before[0].rgb).abs().max()) < 1e-3
+    with pytest.raises(ValueError, match="a base of its own"):
+        make_method("direct-ft", None)
+
+
+def test_a_metric_that_fails_is_a_remark_and_no_number() -> None:
+    prediction = box_before_wall().lift()
+
+    def broken(picture: Tensor, truth: Tensor | None) -> float:
+        raise RuntimeError("svd did not converge")
+
+    gauges = Gauges(("niqe",), {"niqe": broken}, None)
+    found = measure(
+        prediction, large_views(prediction, (0.3,)), {"base": make_method("base", None)}, gauges, get_renderer()
+    )
+    assert found.remarks == ["niqe failed: svd did not converge"]
+    assert [row.figures["niqe"] for row in found.rows] == [None, None]
+    assert found.pictures["base"].shape == (72, 96, 3)
+
+
+# --- the command
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three small scenes in Middlebury's folders."""
+    root = tmp_path_factory.mktemp("middlebury")
+    for seed, name in enumerate(("Ball", "Chair", "Door")):
+        write_boxes(root / name, seed)
+    return root
+
+
+def evaluate(root: Path, output: Path, *more: object) -> Run:
+    return run("evaluate", "--dataset", "middlebury", "--root", root, "--base", "rgbd", "-o", output, *more)
+
+
+def read(output: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((output / "results.json").read_text())
+    return found
+
+
+def mean_of(found: dict[str, Any], setting: str, method: str, figure: str) -> Any:
+    keys = {"setting": setting, "method": method, "figure": figure}
+    return next(mean for mean in found["means"] if keys.items() <= mean.items())["value"]
+
+
+def same_files(one: Path, other: Path, names: tuple[str, ...] = ("results.json", *TABLES)) -> None:
+    for name in names:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+
+
+def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def create(name: str, **options: Any) -> Any:
+        return lambda image: image.mean() if name == "niqe" else torch.tensor(math.nan)
+
+    fake_pyiqa(monkeypatch, create)
+    output = tmp_path / "out"
+    methods = f"base,{FLAT}seeds,spackle,spackle-scene"
+    done = evaluate(scenes, output, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3,0.5")
+    assert done.code == 0, done.err
+    assert names_in(output) == OUTPUTS
+    found = read(output)
+    assert found["problems"] == {}
+    for setting in ("0.3", "0.5"):
+        before = mean_of(found, setting, "base", "har")
+        assert before > 0.02
+        for method in ("seeds", "spackle", "spackle-scene"):
+            assert mean_of(found, setting, method, "har") < 0.05 * before
+            assert mean_of(found, setting, method, "merged") > mean_of(found, setting, "base", "merged")
+        assert mean_of(found, setting, "spackle", "niqe") > mean_of(
+            found, setting, "base", "niqe"
+        )  # black holes are filled
+    assert mean_of(found, "0.5", "base", "har") > mean_of(found, "0.3", "base", "har")
+    assert {image["name"] for image in found["images"]} == {"Ball", "Chair", "Door"}
+    assert found["config"]["metrics"] == {"niqe": "pyiqa 9.9", "musiq": "pyiqa 9.9"}
+    text = (output / "tables.md").read_text()
+    assert "(6 NaN)" in text
+    assert "3/23" in text
+    assert "PolyForm Noncommercial" in text
+    with Image.open(output / "worst.png") as sheet:
+        assert sheet.width >= 4 * 72
+
+
+def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
+    write_motorcycle(tmp_path / "data" / "Motorcycle")
+    output = tmp_path / "out"
+    methods = f"base,{FLAT}spackle,dense"
+    done = evaluate(
+        tmp_path / "data", output, "--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim"
+    )
+    assert done.code == 0, done.err
+    found = read(output)
+    hole, outside = (
+        {name: mean_of(found, "near", name, f"psnr_{place}") for name in methods.split(",")}
+        for place in ("hole", "outside")
+    )
+    assert all(hole["base"] + 3 < value for name, value in hole.items() if name != "base")
+    assert abs(outside["spackle"] - outside["base"]) < 0.5
+    dense, guided = (mean_of(found, "near", name, "aux") for name in ("dense", "spackle"))
+    assert guided < 0.6 * dense
+    size = found["images"][0]["facts"]
+    assert 0.97 <= dense / (math.ceil(size["width"] / 2) * math.ceil(size["height"] / 2)) <= 1
+    assert "tab:mask_guided_init" in (output / "tables.tex").read_text()
+
+
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: Path) -> None:
+    choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.4")
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert evaluate(scenes, whole, *choices).code == 0
+    words = [
+        "evaluate",
+        "--dataset",
+        "middlebury",
+        "--root",
+        str(scenes),
+        "--base",
+        "rgbd",
+        "-o",
+        str(killed),
+        *choices,
+    ]
+    code = (
+        "import os, sys\n"
+        "from spackle.jobs import evaluate as job\n"
+        "save = job.save_record\n"
+        "def once(*rest):\n"
+        "    save(*rest)\n"
+        "    os.kill(os.getpid(), 9)\n"
+        "job.save_record = once\n"
+        "from spackle.cli import main\n"
+        "main()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, check=False, env=dict(os.environ))
+    assert ended.returncode == -9, ended.stderr
+    assert len(list((killed / "images").glob("*.json"))) == 1
+    assert not (killed / "results.json").exists()
+    again = evaluate(scenes, killed, *choices)
+    assert again.code == 0
+    assert "going on, 1 of 3" in again.err
+    same_files(whole, killed)
+    before = {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
+    assert evaluate(scenes, killed, *choices).code == 0
+    assert before == {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
+    same_files(whole, killed, ("results.json", "worst.png", "best.png", *TABLES))
+    refused = evaluate(scenes, killed, *choices[:-1], "0.5")
+    assert refused.code == 2
+    assert "disparities: [0.4] -> [0.5]" in refused.err
+
+
+def test_a_broken_image_is_named_and_the_others_go_on(scenes: Path, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(scenes, root)
+    whole = (root / "Chair" / "left.png").read_bytes()
+    (root / "Chair" / "left.png").write_bytes(whole[: len(whole) // 2])
+    output = tmp_path / "out"
+    choices = ("--methods", "seeds", "--metrics", "none", "--disparity", "0.3")
+    done = evaluate(root, output, *choices)
+    assert done.code == 0
+    assert sum("passed over:" in line for line in done.lines) == 1
+    found = read(output)
+    assert list(found["problems"]) == ["Chair"]
+    assert str(tmp_path) not in json.dumps(found)
+    assert "1 of 3 images gave no figures: Chair." in (output / "tables.md").read_text()
+    (root / "Chair" / "left.png").write_bytes(whole)
+    assert evaluate(root, output, *choices).code == 0
+    assert read(output)["problems"] == {}
+
+
+def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:
+    choices = ("--methods", "base,seeds", "--metrics", "none", "--limit", "1")
+    one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
+    assert evaluate(scenes, one, *choices).code == 0
+    assert evaluate(scenes, two, *choices, "--protocol", "near-view").code == 0
+    assert len(read(one)["images"]) == 1
+    done = run("tables", one, two, "-o", both)
+    assert done.code == 0, done.err
+    text = (both / "tables.md").read_text()
+    assert "tab:controlled_disocclusion" in text
+    assert "tab:near_view" in text
+    assert run("tables", one, "-o", tmp_path / "again").code == 0
+    same_files(one, tmp_path / "again", TABLES)
+    refused = run("tables", one, one, "-o", both)
+    assert (refused.code, "two results" in refused.err) == (2, True)
+    refused = run("tables", scenes, "-o", both)
+    assert (refused.code, "results.json is missing" in refused.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--methods", "spakle"), "did you mean spackle?"),
+        (("--metrics", "nique"), "did you mean niqe?"),
+        (("--protocol", "near"), "did you mean near-view?"),
+        (("--dataset", "midlebury"), "did you mean middlebury?"),
+        (("--base", "shrap"), "did you mean sharp?"),
+        (("--metrics", "psnr"), "add --protocol near-view"),
+        (("--disparity", "0.3,x"), "not numbers"),
+        (("--disparity", "0.3,3"), "up to 2"),
+        (("--methods", "direct-ft"), "add --base sharp"),
+        (("--methods", ","), "none is given"),
+        (("--limit", "0"), "--limit must be between"),
+        (("--direct-ft", "x.safetensors"), "no method takes it"),
+        (("--residual", "none"), "--residual none"),
+        (("--residual", "gone.safetensors"), "not found"),
+        (("-c", "x.pt"), "no checkpoint"),
+        (("--precision", "fp8"), "--precision fp8"),
+        (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
+    ],
+)
+def test_bad_input_is_one_line(words: tuple[str, ...], message: str, scenes: Path, tmp_path: Path) -> None:
+    done = evaluate(scenes, tmp_path / "out", *words)
+    assert done.code == 2
+    assert len(done.lines) == 1
+    assert message in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_opencv_is_one_line(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    done = evaluate(scenes, tmp_path / "out", "--methods", "inpaint2d", "--metrics", "none")
+    assert (done.code, len(done.lines), "pip install 'spackle-nvs[opencv]'" in done.err) == (2, 1, True)
+
+
+def test_a_dataset_without_what_is_needed_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = evaluate(tmp_path / "empty", tmp_path / "out")
+    assert (done.code, len(done.lines), str(tmp_path / "empty") in done.err) == (2, 1, True)
+
+
+def test_direct_ft_needs_its_weights(scenes: Path, tmp_path: Path) -> None:
+    checkpoint = tmp_path / "sharp.pt"
+    checkpoint.write_bytes(b"0")
+    words = ("--base", "sharp", "-c", checkpoint, "--methods", "direct-ft")
+    done = run("evaluate", "--dataset", "middlebury", "--root", scenes, "-o", tmp_path / "out", *words)
+    assert (done.code, "give --direct-ft FILE" in done.err) == (2, True)
