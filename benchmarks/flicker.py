@@ -88,9 +88,7 @@ def by_view(stack: ViewStack) -> Tensor:
     completer = Completer(stack.base, stack.photo_camera, renderer)
     shields = [completer.photo_shield()]
     with torch.no_grad():
-        drawn = [
-            renderer.render([stack.base, completer.complete_view(view, shields)], view).rgb for view in stack.cameras
-        ]
+        drawn = [completer.completed_view(view, shields)[1].rgb for view in stack.cameras]
     return torch.where(stack.mask[..., None], torch.stack(drawn), stack.rgb)
 
 

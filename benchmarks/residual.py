@@ -47,10 +47,7 @@ class Scene:
         """Numbers of the right camera's view, and its pictures."""
         before = self.renderer.render(self.base, self.beside)
         hole = hole_mask(before.alpha)
-        views = {
-            name: self.renderer.render([self.base, way.complete_view(self.beside)], self.beside)
-            for name, way in self.ways.items()
-        }
+        views = {name: way.completed_view(self.beside, rendering=before)[1] for name, way in self.ways.items()}
         both = [view.rgb for view in views.values()]
         numbers = [hole_area_ratio(before.alpha)]
         numbers += [hole_distance(features, rgb, self.right, hole) for rgb in both]

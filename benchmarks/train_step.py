@@ -22,8 +22,8 @@ import skimage.data
 import torch
 from PIL import Image
 
-from spackle.bases.sharp.precision import PRECISIONS, pick_dtype
 from spackle.jobs.machine import hardware
+from spackle.precision import PRECISIONS, pick_dtype
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.training.cache import Cache, load_sample

@@ -30,7 +30,7 @@ from spackle.render import get_renderer
 from spackle.residual import Completer
 
 CPU = Clock(torch.device("cpu"))
-STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "checks": 2.0, "rerender": 7.0}
+STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rerender": 9.0}
 
 
 def cost(setting: str = "0.3", added: int = 20, factor: float = 1.0) -> ViewCost:

@@ -13,7 +13,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import TILE, CpuRenderer, get_renderer
+from spackle.render import TILE, CpuRenderer, get_renderer, touched_tiles
 from spackle.render.approx import encode_srgb, exp2
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
@@ -316,6 +316,23 @@ def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_s
         assert torch.equal(found[~mask], before[~mask])
         assert torch.equal(getattr(onto, name), before)
         assert not getattr(black, name)[~mask].any()
+
+
+@settings(max_examples=15, deadline=None)
+@given(scenes, st.integers(0, 2**31))
+def test_other_tiles_than_those_touched_do_not_change(scene, more_seed):
+    seed, n, width, height, focal, eps2d, solidity = scene
+    camera = turned_camera(width, height, focal)
+    gaussians, more = random_scene(seed, n, camera, solidity), random_scene(more_seed, 5, camera, solidity)
+    before = CPU.render(gaussians, camera, eps2d=eps2d)
+    after = CPU.render([gaussians, more], camera, eps2d=eps2d)
+    tiles = touched_tiles(more, camera, eps2d)
+    mask = tile_mask(tiles, camera)
+    alone = CPU.render(more, camera, eps2d=eps2d).alpha > 0
+    for name in FIELDS:
+        assert torch.equal(getattr(after, name)[~mask], getattr(before, name)[~mask])
+    assert not (alone & ~mask).any()
+    assert not touched_tiles(more.select(torch.zeros(len(more), dtype=torch.bool)), camera).any()
 
 
 def test_gradients_pass_through_kept_tiles_only():

@@ -558,6 +558,19 @@ def test_completion_closes_a_view(disparity: float, side: int) -> None:
     assert psnr(after.rgb[seen], before.rgb[seen]) > 35
 
 
+@pytest.mark.parametrize("network", [False, True])
+@pytest.mark.parametrize("there", [False, True])
+def test_the_completed_view_is_bit_for_bit_that_of_drawing_everything(network: bool, there: bool) -> None:
+    completer, camera = box_view(0.4)
+    completer = dataclasses.replace(completer, network=trained() if network else None)
+    aux = completer.complete_view(box_view(0.2)[1]) if there else Gaussians.empty()
+    new, drawn = completer.completed_view(camera, aux=aux)
+    whole = CPU.render([completer.base, aux, new], camera)
+    assert len(new) > 100
+    for one, other in zip((drawn.rgb, drawn.depth, drawn.alpha), (whole.rgb, whole.depth, whole.alpha), strict=True):
+        assert torch.equal(one, other)
+
+
 def test_aux_gaussians_already_there_are_seen_and_not_returned() -> None:
     completer, camera = box_view()
     first = completer.complete_view(camera)

@@ -23,11 +23,12 @@ from spackle.bases.sharp.config import FULL, TINY
 from spackle.bases.sharp.decoder import GroupNorm
 from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork
-from spackle.bases.sharp.precision import multiplies_bf16, pick_dtype, set_precision
+from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.pyramid import FULL_WINDOWS, HALF_WINDOWS, WINDOWS, cut, merge
 from spackle.bases.sharp.start import compose, make_start
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.image import Photo, load_photo
+from spackle.precision import multiplies_bf16, pick_dtype
 from spackle.render import CpuRenderer
 
 CPU = torch.device("cpu")

@@ -22,6 +22,7 @@ from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 
+from spackle.downloads.locks import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
@@ -251,6 +252,15 @@ def test_a_full_disk_is_a_line_and_the_last_checkpoint_stays(
     assert "cannot write" in done.lines[-1]
     assert_same_weights(out, whole[0])
     assert not [name for name in names_in(out) if name.startswith(".")]
+
+
+def test_two_runs_do_not_share_a_folder(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with hold(tmp_path / "out" / ".lock"):
+        done = train(place, tmp_path / "out", "optim.steps=1")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "another training is at work" in done.err
+    assert not names_in(tmp_path / "out")
 
 
 # Several processes --------------------------------------------------------------------------------

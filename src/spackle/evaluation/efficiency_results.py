@@ -15,11 +15,10 @@ STAGES = {
     "view": "render of the view",
     "photo": "render at the photo's camera",
     "completion": "mask, seeds, network, placing",
-    "checks": "renders between passes",
-    "rerender": "re-render with aux",
+    "rerender": "re-render of touched tiles, after each pass",
 }
 BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
-EXTRA = ("photo", "completion", "checks", "rerender")  # what Spackle adds to it
+EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
 MS = 1000.0
 
 

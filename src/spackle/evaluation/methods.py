@@ -85,9 +85,9 @@ class PerView:
 
     def views(self, shot: Shot) -> Iterator[View]:
         completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network)
-        for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
-            aux = completer.complete_view(camera, [shot.shield], rendering=before)
-            yield shot.draw(aux, index)
+        for camera, before in zip(shot.cameras, shot.before, strict=True):
+            aux, drawn = completer.completed_view(camera, [shot.shield], rendering=before)
+            yield View(drawn.rgb, drawn.alpha, len(aux))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from spackle.bases.protocol import Base
-from spackle.bases.rgbd import RgbdBase
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets import get_dataset
-from spackle.evaluation.efficiency import Clock, Parameters, ViewBench, count_parameters, time_base
+from spackle.evaluation.efficiency import Clock, Parameters, count_parameters
 from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import Bill, ImageCost
 from spackle.evaluation.efficiency_tables import efficiency_tables
-from spackle.evaluation.load import LoadedCase, load_case
-from spackle.evaluation.protocols import large_views
 from spackle.evaluation.table import to_latex, to_markdown
+from spackle.jobs.bench_image import time_image
 from spackle.jobs.bench_options import BenchOptions, check_bench_options
 from spackle.jobs.evaluate import inputs_digest, spread
 from spackle.jobs.evaluate_case import Bench
@@ -109,7 +105,8 @@ class _Benchmark:
     def _measure(self, case: Case, inputs: str, path: Path) -> ImageCost:
         """One image; a problem of its own is its record, which the next run tries again."""
         try:
-            image = self._time(case)
+            image = time_image(case, self.options, self.tools, self.clock, self.warm)
+            self.warm = True
         except BaseError:
             raise
         except InputError as error:
@@ -122,35 +119,6 @@ class _Benchmark:
             times = f"{found['base_ms']:,.0f} ms, with Spackle {found['spackle_ms']:,.0f}"
             self.reporter.detail(f"  {case.name}, {view.setting}: {times}, {view.added:,} Gaussians added")
         return image
-
-    def _time(self, case: Case) -> ImageCost:
-        """All settings of an image.
-
-        Raises:
-            InputError: a file that cannot be used, or a depth map that the case lacks.
-            BaseError: no image can be worked on.
-        """
-        load = _load_of_machine()
-        loaded = load_case(dataclasses.replace(case, seconds=()))
-        base = time_base(self._base(loaded), loaded.full, self.options.base_times, self.clock, self.warm)
-        self.warm = True
-        try:
-            views = large_views(base.prediction, self.options.disparities)
-        except ValueError as error:
-            raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
-        bench = ViewBench(base, self.tools.renderer, self.tools.network, self.clock)
-        costs = [bench.time_view(view.setting, view.camera, self.options.runs) for view in views if view.name == SIDE]
-        size = {"width": loaded.photo.width, "height": loaded.photo.height}
-        facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}
-        return ImageCost(case.name, facts, tuple(costs))
-
-    def _base(self, loaded: LoadedCase) -> Base:
-        """The network, or the case's own depth."""
-        if self.tools.base is not None:
-            return self.tools.base()
-        if loaded.case.depth is None:
-            raise InputError(f"{loaded.case.name}: has no depth map, which --base rgbd takes")
-        return RgbdBase(loaded.case.depth())
 
     def _finish(self, bill: Bill, parameters: Parameters) -> None:
         """Everything that is made of all images; bench.json comes last and vouches for the rest."""
@@ -177,8 +145,3 @@ def _load(path: Path, inputs: str) -> ImageCost | None:
         return ImageCost.of(content["image"]) if content["inputs"] == inputs else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _load_of_machine() -> float | None:
-    """How many processes want a core, over the last minute; None where the system does not say."""
-    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.filesize import decimal
 
-from spackle.downloads.locks import hold
 from spackle.errors import InputError
 from spackle.jobs.dataset_options import DatasetOptions, check_dataset_options, configuration
 from spackle.jobs.dataset_ray import at_work_on_ray, cluster
 from spackle.jobs.dataset_worker import PARTS, Job, Made, Maker, at_work, part_file
-from spackle.jobs.inputs import LEFTOVER, make_folder, results_folder
+from spackle.jobs.inputs import LEFTOVER, alone_in, make_folder, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.stopping import asked_to_stop
 from spackle.pseudo.build import Seconds, key_of, timed
@@ -26,7 +24,6 @@ from spackle.pseudo.propainter import NOTICE
 from spackle.pseudo.shards import shard_name, write_shard
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
-LOCK = ".lock"
 NAMED = 5  # missing files that are spelled out
 
 
@@ -52,7 +49,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     with cluster(options):
         photos = _photos(source, options, reporter)
         config = configuration(options, photos, maker.inpainter)
-        with results_folder(output, (NAME,)), _alone(output):
+        with results_folder(output, (NAME,)), alone_in(output, "build"):
             manifest = _begin(output, config)
             return _Build(photos, output, options, reporter, config).run(manifest.shards)
 
@@ -65,19 +62,6 @@ def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[P
         reporter.say(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
     with reporter.stage("photos", {}) as step:
         return choose(found, options.sample, options.choices.seed, reporter.say, step)
-
-
-@contextlib.contextmanager
-def _alone(output: Path) -> Iterator[None]:
-    """Two builds in one folder would take each other's parts away."""
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(hold(output / LOCK))
-        except BlockingIOError as error:
-            raise InputError(f"{output}: another build is at work in this folder: wait for it, or end it") from error
-        except OSError as error:
-            raise InputError(f"{output}: cannot write: {error.strerror or error}") from error
-        yield
 
 
 def _begin(output: Path, config: dict[str, Any]) -> Manifest:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import spackle
-from spackle.bases.sharp import Precision
 from spackle.downloads import read_record
 from spackle.downloads.partial import digest
 from spackle.errors import InputError
@@ -18,6 +17,7 @@ from spackle.image import MAX_SIDE
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.request import fingerprint
+from spackle.precision import Precision
 from spackle.pseudo.build import ViewChoices
 from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile

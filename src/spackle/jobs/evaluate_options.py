@@ -8,13 +8,13 @@ import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from spackle.bases.sharp import PRECISIONS
 from spackle.errors import InputError
 from spackle.evaluation.datasets import DATASETS
 from spackle.evaluation.figures import DEFAULT_METRICS, METRICS, PROTOCOLS
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.paper import DISPARITIES
 from spackle.jobs.options import BASES, PredictOptions, check_options
+from spackle.precision import PRECISIONS
 from spackle.trajectory import MAX_DISPARITY
 
 DEFAULT_METHODS = ("base", "spackle")

@@ -9,11 +9,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from spackle.downloads.locks import hold
 from spackle.errors import InputError
 from spackle.formats import check_writable
 from spackle.image import PHOTO_SUFFIXES
 
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")
+LOCK = ".lock"
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
 
 
@@ -79,6 +81,23 @@ def results_folder(path: Path, files: Sequence[str] = ()) -> Iterator[None]:
         for folder in missing:
             with contextlib.suppress(OSError):  # it holds something
                 folder.rmdir()
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path, work: str) -> Iterator[None]:
+    """Keep others out of a folder while the block works there: they would take each other's files away.
+
+    Raises:
+        InputError: somebody else is at work, or nothing can be written.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(hold(folder / LOCK))
+        except BlockingIOError as error:
+            raise InputError(f"{folder}: another {work} is at work in this folder: wait for it, or end it") from error
+        except OSError as error:
+            raise InputError(f"{folder}: cannot write: {error.strerror or error}") from error
+        yield
 
 
 def _remove_leftovers(folder: Path, files: Sequence[str]) -> None:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from spackle.bases.sharp import PRECISIONS, Precision
 from spackle.camera import Camera
 from spackle.downloads import installed
 from spackle.errors import InputError
+from spackle.precision import PRECISIONS, Precision
 from spackle.residual.weights import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
-from spackle.bases.sharp.precision import pick_dtype
 from spackle.errors import InputError
-from spackle.jobs.inputs import results_folder
+from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.train_direct import DirectPlan
 from spackle.jobs.train_plan import Place, Plan
 from spackle.jobs.train_residual import ResidualPlan
 from spackle.jobs.train_run import run_training
+from spackle.precision import pick_dtype
 from spackle.render import get_renderer
 from spackle.training.checkpoint import (
     BEST,
@@ -71,7 +72,7 @@ def train_recipe(
         if recipe.optim.batch % ranks.count:
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {ranks.count} processes")
         device = torch.device(kind, ranks.local) if kind == "cuda" else torch.device(kind)
-        with results_folder(output, (NEWEST, PREVIOUS, BEST, LAST, RUN) if ranks.first else ()):
+        with _results(output) if ranks.first else contextlib.nullcontext():
             speaker = reporter if ranks.first else Reporter(console=Console(quiet=True))
             place = Place(recipe, output, speaker, ranks, device, _judge(recipe, device))
             # Everything that can be refused is refused before long work begins.
@@ -82,6 +83,13 @@ def train_recipe(
             if overwrite and ranks.first:
                 remove_run(output)
             return run_training(place, start, found)
+
+
+@contextlib.contextmanager
+def _results(output: Path) -> Iterator[None]:
+    """Of the first process, which alone writes."""
+    with results_folder(output, (NEWEST, PREVIOUS, BEST, LAST, RUN)), alone_in(output, "training"):
+        yield
 
 
 def _judge(recipe: Recipe, device: torch.device) -> Judge:

@@ -69,7 +69,7 @@ def complete(prediction: BasePrediction, plan: Plan, options: PredictOptions, to
     base = prediction.gaussians
     if tools.residual == "none":
         return Completed(base, Gaussians.empty())
-    completer = Completer(base, prediction.camera, tools.renderer, tools.network)
+    completer = Completer(base, prediction.camera, tools.renderer, tools.network, precision=options.precision)
     if options.mode == "scene":
         given = options.cameras is not None
         return Completed(base, completer.complete_scene(plan.cameras, exact=given, progress=step))

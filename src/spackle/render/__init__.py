@@ -2,9 +2,10 @@
 
 from spackle.errors import InputError
 from spackle.render.cpu import CpuRenderer
+from spackle.render.pipeline import touched_tiles
 from spackle.render.protocol import TILE, Renderer
 
-__all__ = ["TILE", "CpuRenderer", "Renderer", "get_renderer"]
+__all__ = ["TILE", "CpuRenderer", "Renderer", "get_renderer", "touched_tiles"]
 
 
 def get_renderer(device: str = "auto") -> Renderer:

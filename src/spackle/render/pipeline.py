@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.blend import blend_tiles
 from spackle.render.project import Splats, View, count_before, project_chunk
@@ -93,6 +94,15 @@ def wanted_tiles(view: View, tiles: Tensor | None) -> Array:
     if tuple(tiles.shape) != view.tiles:
         raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {view.tiles}")
     return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
+
+
+def touched_tiles(gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> Tensor:
+    """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go."""
+    view = View.of(camera, eps2d)
+    everywhere = wanted_tiles(view, None)
+    splats, spans = project([gaussians], view, everywhere)
+    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, everywhere)
+    return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 
 def project(sets: Sequence[Gaussians], view: View, wanted: Array) -> tuple[Splats, Array]:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.render import Renderer
+from spackle.precision import Precision, pick_dtype
+from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
 from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
@@ -37,6 +38,7 @@ class Completer:
     renderer: Renderer
     network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
     threshold: float = MASK_THRESHOLD
+    precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
 
     def photo_shield(self) -> Shield:
         """What the photo itself shows: no completion may stand in front of that."""
@@ -53,6 +55,20 @@ class Completer:
     ) -> Gaussians:
         """New aux Gaussians for one view, 𝒢̃_aug of eq. 6: one for each masked cell that needs one.
 
+        The arguments are those of `completed_view`.
+        """
+        return self.completed_view(camera, shields, aux, rendering)[0]
+
+    @torch.no_grad()
+    def completed_view(
+        self,
+        camera: Camera,
+        shields: Sequence[Shield] | None = None,
+        aux: Gaussians | None = None,
+        rendering: Rendering | None = None,
+    ) -> tuple[Gaussians, Rendering]:
+        """What `complete_view` adds, and the view with it: as if all were drawn at once, at the cost of what changes.
+
         Args:
             camera: the view to complete.
             shields: views whose content must stay in front; the photo's alone where None.
@@ -62,7 +78,7 @@ class Completer:
         if shields is None:
             shields = [self.photo_shield()]
         there = [self.base] if aux is None else [self.base, aux]
-        return self._fill(camera, shields, there, rendering or self.renderer.render(there, camera))[0]
+        return self._fill(camera, shields, there, rendering or self.renderer.render(there, camera))
 
     @torch.no_grad()
     def complete_scene(
@@ -112,8 +128,10 @@ class Completer:
             new = self._propose(rendering, camera, self.network if turn == 0 else None)
             if not len(new):
                 break
-            added.append(push_behind(new, camera.position, shields))
-            rendering = self.renderer.render([*there, *added], camera)
+            new = push_behind(new, camera.position, shields)
+            added.append(new)
+            tiles = touched_tiles(new, camera)  # the others keep what they show
+            rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
             if hole_area_ratio(rendering.alpha, self.threshold) < CLOSED_HAR:
                 break
         return Gaussians.cat(added), rendering
@@ -130,8 +148,11 @@ class Completer:
     def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
         """[n, 14] for the masked cells."""
         rim = Rim.of(cues, seeds, camera, self.photo_camera)
-        field: Tensor = network(network_input(cues, seeds, rim))
-        return field[0].permute(1, 2, 0)[cues.mask]
+        features = network_input(cues, seeds, rim).contiguous(memory_format=torch.channels_last)
+        dtype = pick_dtype(self.precision, features.device)
+        with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
+            field: Tensor = network(features)
+        return field[0].permute(1, 2, 0)[cues.mask].float()
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:

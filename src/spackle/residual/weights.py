@@ -43,4 +43,5 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
             f"residual weights {path} are of another network: {len(wrong)} tensors differ, e.g. {wrong[0]}"
         )
     network.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
     return network.eval().requires_grad_(False)

@@ -1,6 +1,5 @@
 """SHARP: Apple's network from one photo to Gaussians, written anew for speed and for processors."""
 
 from spackle.bases.sharp.base import SharpBase
-from spackle.bases.sharp.precision import PRECISIONS, Precision
 
-__all__ = ["PRECISIONS", "Precision", "SharpBase"]
+__all__ = ["SharpBase"]

@@ -13,12 +13,12 @@ from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput
-from spackle.bases.sharp.precision import Precision, pick_dtype
 from spackle.bases.sharp.start import compose
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
+from spackle.precision import Precision, pick_dtype
 
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
 WINDOWS_AT_ONCE_GPU = 35
