@@ -49,7 +49,7 @@ def bill(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> Bill
         "title": "Middlebury",
         "disparities": list(disparities),
         "base": {"title": "SHARP", "says": "a network", "device": "cpu"},
-        "residual": {"weights": "shipped", "sha256": "0123456789abcdef"},
+        "residual": {"weights": "shipped", "sha256": "0123456789abcdef", "precision": "bfloat16"},
         "runs": 3,
         "base_runs": 1,
         "hardware": {"cpu": "A Processor", "cores": 2, "threads": 2},

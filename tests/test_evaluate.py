@@ -172,7 +172,7 @@ def results(title: str, protocol: str, methods: list[str], figures: dict[str, di
         "methods": methods,
         "base": {"title": "rgbd", "says": "the dataset's own depth"},
         "disparities": [0.3, 0.4, 0.5],
-        "residual": {"weights": "shipped", "sha256": "0123456789"},
+        "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
         "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
     }
     return Results(config, records)

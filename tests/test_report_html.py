@@ -98,7 +98,7 @@ def results(near: bool, count: int = 11, title: str = "Middlebury", name: str = 
         "methods": list(METHODS),
         "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
         "disparities": None if near else [0.3, 0.4, 0.5],
-        "residual": {"weights": "shipped", "sha256": "0123456789"},
+        "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
         "metrics": {"niqe": "not run: pyiqa is not installed"},
     }
     return Results(config, (*records, Record("gone", problem="gone.png: <b>damaged</b>", remarks=())))

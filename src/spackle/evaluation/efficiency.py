@@ -19,6 +19,7 @@ from spackle.camera import Camera
 from spackle.evaluation.efficiency_results import ViewCost
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
+from spackle.precision import Precision
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet
@@ -124,6 +125,7 @@ class ViewBench:
     renderer: Renderer
     network: ResidualNet | None
     clock: Clock
+    precision: Precision = "auto"  # of the residual's network
 
     @torch.no_grad()
     def time_view(self, setting: str, camera: Camera, runs: int) -> ViewCost:
@@ -138,7 +140,8 @@ class ViewBench:
         """Seconds of every stage behind the base, and how many aux Gaussians came of it."""
         base, timed = self.base.prediction.gaussians, self.clock.time
         inside = ClockedRenderer(self.renderer, self.clock)
-        completer = Completer(base, self.base.prediction.camera, inside, self.network)
+        photo_camera = self.base.prediction.camera
+        completer = Completer(base, photo_camera, inside, self.network, precision=self.precision)
         before, view = timed(lambda: self.renderer.render(base, camera))
         shield, photo = timed(completer.photo_shield)
         inside.seconds = 0.0

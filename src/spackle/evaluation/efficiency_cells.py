@@ -29,15 +29,14 @@ def said(bill: Bill) -> str:
     """The view, the base, the machine: what every table of times has to say."""
     base, residual = bill.config["base"], bill.config["residual"]
     hardware, versions = bill.config["hardware"], bill.config["versions"]
-    weights = f"{residual['weights']} weights {residual['sha256'][:8]}" if residual["sha256"] else "seeds, no weights"
+    weights = "seeds, no weights"
+    if residual["sha256"]:
+        weights = f"{residual['weights']} weights {residual['sha256'][:8]} in {residual['precision']}, on the processor"
     network = f"network in {bill.precision} on {base['device']}" if bill.precision else "no network"
     named = ", ".join(f"{name} {version}" for name, version in versions.items())
     place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
     place += f", {hardware['gpu']} for the base, the rest on the processor" if "gpu" in hardware else ""
-    return (
-        f"{VIEW}. Base {base['title']}: {base['says']} ({network}). Residual: {weights}, in fp32 on the processor. "
-        f"Machine: {place}; {named}."
-    )
+    return f"{VIEW}. Base {base['title']}: {base['says']} ({network}). Residual: {weights}. Machine: {place}; {named}."
 
 
 def notes(bill: Bill) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
+from spackle.precision import Precision
 from spackle.pseudo.opencv import OpencvInpainter
 from spackle.pseudo.views import ViewStack
 from spackle.render import Renderer
@@ -21,7 +22,7 @@ from spackle.residual import Completer, ResidualNet, hole_mask
 from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
 from spackle.residual.cues import Cues
-from spackle.residual.network import network_input
+from spackle.residual.network import predict_deltas
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import make_seeds
 
@@ -82,9 +83,10 @@ class PerView:
     """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
 
     network: ResidualNet | None
+    precision: Precision = "auto"
 
     def views(self, shot: Shot) -> Iterator[View]:
-        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network)
+        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network, precision=self.precision)
         for camera, before in zip(shot.cameras, shot.before, strict=True):
             aux, drawn = completer.completed_view(camera, [shot.shield], rendering=before)
             yield View(drawn.rgb, drawn.alpha, len(aux))
@@ -95,9 +97,10 @@ class OneScene:
     """One set of aux Gaussians for all views of a shot together."""
 
     network: ResidualNet | None
+    precision: Precision = "auto"
 
     def views(self, shot: Shot) -> Iterator[View]:
-        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network)
+        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network, precision=self.precision)
         aux = completer.complete_scene(shot.cameras, exact=True)
         for index in range(len(shot.cameras)):
             yield shot.draw(aux, index)
@@ -111,6 +114,7 @@ class Dense:
     """
 
     network: ResidualNet | None
+    precision: Precision = "auto"
 
     def views(self, shot: Shot) -> Iterator[View]:
         for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
@@ -123,8 +127,8 @@ class Dense:
         seeds = make_seeds(cues, camera, photo_camera)
         deltas = None
         if self.network is not None:
-            field = self.network(network_input(cues, seeds, Rim.of(cues, seeds, camera, photo_camera)))
-            deltas = field[0].permute(1, 2, 0).flatten(0, 1)
+            rim = Rim.of(cues, seeds, camera, photo_camera)
+            deltas = predict_deltas(self.network, cues, seeds, rim, self.precision).flatten(0, 1)
         return compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
 
 
@@ -178,7 +182,10 @@ METHODS: dict[str, About] = {
 
 
 def make_method(
-    name: str, network: ResidualNet | None, direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None
+    name: str,
+    network: ResidualNet | None,
+    direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None,
+    precision: Precision = "auto",
 ) -> Method:
     """A method of `METHODS`; `direct_ft` predicts the photo at hand with the other base, and gives its `unit`."""
     if name == "direct-ft":
@@ -187,10 +194,10 @@ def make_method(
         return DirectFt(*direct_ft())
     plain: dict[str, Callable[[], Method]] = {
         "base": BaseAlone,
-        "spackle": lambda: PerView(network),
-        "spackle-scene": lambda: OneScene(network),
+        "spackle": lambda: PerView(network, precision),
+        "spackle-scene": lambda: OneScene(network, precision),
         "seeds": lambda: PerView(None),
-        "dense": lambda: Dense(network),
+        "dense": lambda: Dense(network, precision),
         "inpaint2d": Inpaint2d,
     }
     return plain[name]()

@@ -39,7 +39,7 @@ def time_image(case: Case, options: BenchOptions, tools: Bench, clock: Clock, wa
         views = large_views(base.prediction, options.disparities)
     except ValueError as error:
         raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
-    bench = ViewBench(base, tools.renderer, tools.network, clock)
+    bench = ViewBench(base, tools.renderer, tools.network, clock, options.base.precision)
     costs = [bench.time_view(view.setting, view.camera, options.runs) for view in views if view.name == SIDE]
     size = {"width": loaded.photo.width, "height": loaded.photo.height}
     facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}

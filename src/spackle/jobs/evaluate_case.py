@@ -66,7 +66,10 @@ def examine(case: Case, bench: Bench) -> tuple[Record, dict[str, Tensor]]:
             return other, 1.0
         return other, alignment.scale / _align(loaded, other, bench, False).scale
 
-    methods = {name: make_method(name, bench.network, direct_ft) for name in bench.options.methods}
+    methods = {
+        name: make_method(name, bench.network, direct_ft, bench.options.base.precision)
+        for name in bench.options.methods
+    }
     measured = measure(prediction, wanted, methods, bench.gauges, bench.renderer)
     facts: dict[str, Any] = {
         "width": loaded.photo.width,

@@ -24,6 +24,7 @@ from spackle.jobs.evaluate_case import Bench
 from spackle.jobs.evaluate_options import EvaluateOptions
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.setup import BaseError, set_up
+from spackle.precision import pick_dtype
 from spackle.render import get_renderer
 from spackle.residual.weights import load_residual
 from spackle.training.features import FeatureNet, load_features
@@ -91,11 +92,18 @@ def configuration(
         "base": about | {"device": metrics_device(options)},
         "methods": list(options.methods),
         "residual": {"weights": "given" if base.residual not in (None, "seeds") else base.residual_weights}
-        | {"sha256": residual},
+        | {"sha256": residual, "precision": _residual_precision(base)},
         "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
         "features": None if options.features is None else weights_digest(options.features),
         "metrics": bench.states,
     }
+
+
+def _residual_precision(base: PredictOptions) -> str | None:
+    """What the residual's network computes in here; None without one."""
+    if base.residual_file is None:
+        return None
+    return str(pick_dtype(base.precision, torch.device("cpu"))).removeprefix("torch.")
 
 
 def _features(options: EvaluateOptions) -> FeatureNet | None:

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.precision import Precision, pick_dtype
+from spackle.precision import Precision
 from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
 from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
 from spackle.residual.cues import MASK_THRESHOLD, Cues, hole_area_ratio
-from spackle.residual.network import ResidualNet, network_input
+from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds, make_seeds
 
@@ -148,11 +148,7 @@ class Completer:
     def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
         """[n, 14] for the masked cells."""
         rim = Rim.of(cues, seeds, camera, self.photo_camera)
-        features = network_input(cues, seeds, rim).contiguous(memory_format=torch.channels_last)
-        dtype = pick_dtype(self.precision, features.device)
-        with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
-            field: Tensor = network(features)
-        return field[0].permute(1, 2, 0)[cues.mask].float()
+        return predict_deltas(network, cues, seeds, rim, self.precision)[cues.mask]
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from spackle.precision import Precision, pick_dtype
 from spackle.residual.compose import COLOR, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.cues import Cues
 from spackle.residual.rim import Rim
@@ -91,6 +92,22 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     channels += [color_logit(rim.rgb) - own, color_logit(rim.mirrored) - own]
     channels += [(rim.distance / RIM_CELLS).log1p()[..., None]]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
+
+
+@torch.no_grad()
+def predict_deltas(network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto") -> Tensor:
+    """Deltas [h, w, 14] float32 of a view's cells.
+
+    Args:
+        network: a `ResidualNet`.
+        cues, seeds, rim: of the same view.
+        precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
+    """
+    features = network_input(cues, seeds, rim).contiguous(memory_format=torch.channels_last)
+    dtype = pick_dtype(precision, features.device)
+    with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
+        field: Tensor = network(features)
+    return field[0].permute(1, 2, 0).float()
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
