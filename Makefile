@@ -2,19 +2,24 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
 .PHONY: demo test test-slow lint types check bench clean clean-cache
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable '.[demo,dev]'
-	# It asks for torchvision, of which a test needs one layer and brings its own.
-	$(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt --no-deps pytorchcv
+	$(PIP) --editable '.[demo]'
 	touch $@
 
-demo: $(VENV)/.installed
+# pytorchcv asks for torchvision, of which a test needs one layer and brings its own.
+$(VENV)/.installed: $(VENV)/.demo
+	$(PIP) --editable '.[demo,dev]'
+	$(PIP) --no-deps pytorchcv
+	touch $@
+
+demo: $(VENV)/.demo
 	$(BIN)/spackle demo --output demo-output
 
 test: $(VENV)/.installed
