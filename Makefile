@@ -23,7 +23,7 @@ demo: $(VENV)/.demo
 	$(BIN)/spackle demo --output demo-output
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow || test $$? -eq 5  # 5: nothing is marked

@@ -16,7 +16,7 @@ from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights
 from torch import Tensor, nn
 
 import spackle
-from spackle.bases.sharp import SharpBase, precision
+from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_square
 from spackle.bases.sharp.checkpoint import expected_shapes
 from spackle.bases.sharp.config import FULL, TINY
@@ -234,7 +234,7 @@ def test_auto_is_bf16_on_ampere_and_later(
     monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], native: bool
 ) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-    assert precision.multiplies_bf16(torch.device("cuda")) is native
+    assert multiplies_bf16(torch.device("cuda")) is native
 
 
 def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
