@@ -454,6 +454,20 @@ def test_booster(tmp_path: Path) -> None:
     assert not second.depth().valid[:2].any()
 
 
+def test_a_photo_of_booster_that_cannot_be_read_spoils_no_other(tmp_path: Path) -> None:
+    scene = booster(tmp_path / "train/balanced/Bathroom")
+    (scene / "camera_00/im0.png").write_bytes(b"no picture")
+    first, second = cases("booster", tmp_path)
+    assert (first.problem, second.problem) == (None, None)  # the first is named in its turn
+    assert_pair(second, (30, 9), 7.0, FOCAL * 0.08 / (7.0 + 3.0))
+    with pytest.raises(InputError, match="not an image"):
+        load_case(first)
+    (scene / "camera_00/im1.png").write_bytes(b"")
+    for case in cases("booster", tmp_path):
+        with pytest.raises(InputError, match="the file is empty"):
+            load_case(case)
+
+
 def test_real_photos_match_where_the_cameras_say(tmp_path: Path) -> None:
     """Motorcycle, written as a scene of 2014: its left pixels are found again in the right photo."""
     pair = motorcycle()

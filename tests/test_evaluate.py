@@ -24,7 +24,9 @@ from scenes import box_before_wall, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.errors import InputError
 from spackle.evaluation import paper
+from spackle.evaluation.case import Case
 from spackle.evaluation.methods import Shot, make_method
 from spackle.evaluation.metrics import psnr, reduction, ssim, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
@@ -33,6 +35,7 @@ from spackle.evaluation.results import Mean, Record, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
+from spackle.jobs.evaluate import problem_of
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.trajectory import DepthRange, max_offset
@@ -444,7 +447,8 @@ def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
     assert "tab:mask_guided_init" in (output / "tables.tex").read_text()
 
 
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("images", [1, 2])
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path, tmp_path: Path) -> None:
     choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.4")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert evaluate(scenes, whole, *choices).code == 0
@@ -466,18 +470,23 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: P
         "save = job.save_record\n"
         "def once(*rest):\n"
         "    save(*rest)\n"
-        "    os.kill(os.getpid(), 9)\n"
+        "    if rest[-1].name.startswith(last):\n"
+        "        os.kill(os.getpid(), 9)\n"
         "job.save_record = once\n"
         "from spackle.cli import main\n"
+        "last = sys.argv.pop()\n"
         "main()\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, check=False, env=dict(os.environ))
+    last = f"{images - 1:05d}"
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *words, last], capture_output=True, check=False, env=dict(os.environ)
+    )
     assert ended.returncode == -9, ended.stderr
-    assert len(list((killed / "images").glob("*.json"))) == 1
+    assert len(list((killed / "images").glob("*.json"))) == images
     assert not (killed / "results.json").exists()
     again = evaluate(scenes, killed, *choices)
     assert again.code == 0
-    assert "going on, 1 of 3" in again.err
+    assert f"going on, {images} of 3" in again.err
     same_files(whole, killed)
     before = {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
     assert evaluate(scenes, killed, *choices).code == 0
@@ -505,6 +514,37 @@ def test_a_broken_image_is_named_and_the_others_go_on(scenes: Path, tmp_path: Pa
     (root / "Chair" / "left.png").write_bytes(whole)
     assert evaluate(root, output, *choices).code == 0
     assert read(output)["problems"] == {}
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture"])
+def test_a_photo_without_a_header_is_passed_over_too(content: bytes, scenes: Path, tmp_path: Path) -> None:
+    root = tmp_path / "data"
+    shutil.copytree(scenes, root)
+    (root / "Chair" / "left.png").write_bytes(content)
+    for protocol in ("large-view", "near-view"):
+        output = tmp_path / protocol
+        done = evaluate(root, output, "--protocol", protocol, "--methods", "base", "--metrics", "none")
+        assert done.code == 0, done.err
+        assert [line for line in done.lines if "passed over: Chair/left.png: " in line]
+        assert list(read(output)["problems"]) == ["Chair"]
+    for scene in root.iterdir():
+        (scene / "left.png").write_bytes(content)
+    done = evaluate(root, tmp_path / "none", "--methods", "base", "--metrics", "none")
+    assert (done.code, len(done.lines), "none of 3 images gave figures" in done.err) == (2, 4, True)
+
+
+def test_what_is_passed_over_is_named_whichever_photo_is_broken(tmp_path: Path) -> None:
+    case = Case("fern/003", tmp_path / "fern/images/003.jpg")
+    error = InputError(f"{tmp_path}/fern/images/007.jpg: not\nan image")
+    assert problem_of(case, error, tmp_path) == "fern/003: fern/images/007.jpg: not an image"
+    assert problem_of(case, InputError("fern/003: has no second photo"), tmp_path) == "fern/003: has no second photo"
+
+
+def test_disparities_may_be_words_of_their_own(scenes: Path, tmp_path: Path) -> None:
+    choices = ("--methods", "base", "--metrics", "none", "--limit", "1")
+    for place, words in enumerate((("0.3,0.5",), ("0.3", "0.5"), ("0.3 0.5",))):
+        assert evaluate(scenes, tmp_path / str(place), "--disparity", *words, *choices).code == 0
+        assert read(tmp_path / str(place))["config"]["disparities"] == [0.3, 0.5]
 
 
 def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:
@@ -537,6 +577,12 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),
         (("--disparity", "0.3,3"), "up to 2"),
+        (("--disparity=-0.3",), "--disparity -0.3: must be above 0"),
+        (("--disparity", "0.3,0.30"), "the same number twice"),
+        (("--disparity", "0.3", "3"), "up to 2"),
+        (("--disparity", "0.3", "x"), "x: a word of no option"),
+        (("0.4",), "0.4: a word of no option"),
+        (("--methods", "base", "spackle"), "lists are given with commas"),
         (("--methods", "direct-ft"), "add --base sharp"),
         (("--methods", ","), "none is given"),
         (("--limit", "0"), "--limit must be between"),

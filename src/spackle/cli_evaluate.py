@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from spackle.errors import InputError
+
 STOPPED = 130  # what shells report of a command that Ctrl-C ended
+WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
+NUMBER = re.compile(r"[\d.,]+")
 
 
 def evaluate(
+    context: typer.Context,
     dataset: Annotated[
         str,
         typer.Option(
@@ -28,7 +34,7 @@ def evaluate(
         ),
     ] = "base,spackle",
     disparity: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Of the large views; the paper's S1, S2, S3.")
+        str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
     ] = "0.3,0.4,0.5",
     metrics: Annotated[
         str | None,
@@ -74,7 +80,7 @@ def evaluate(
         root=root,
         protocol=protocol,
         methods=split_words(methods),
-        disparities=parse_disparities(disparity),
+        disparities=parse_disparities(_with_words(context, disparity)),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
         base=PredictOptions(
             base=base,
@@ -108,6 +114,7 @@ def tables(
 
 
 def bench(
+    context: typer.Context,
     dataset: Annotated[
         str,
         typer.Option(
@@ -116,7 +123,7 @@ def bench(
     ],
     root: Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")],
     disparity: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Of the timed views; the paper's S1, S2, S3.")
+        str, typer.Option(metavar="A,B,…", help="Of the timed views, with commas or spaces; the paper's S1, S2, S3.")
     ] = "0.3,0.4,0.5",
     base: Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")] = "sharp",
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
@@ -148,7 +155,7 @@ def bench(
     options = BenchOptions(
         dataset=dataset,
         root=root,
-        disparities=parse_disparities(disparity),
+        disparities=parse_disparities(_with_words(context, disparity)),
         base=PredictOptions(
             base=base,
             checkpoint=checkpoint,
@@ -166,8 +173,20 @@ def bench(
         raise typer.Exit(STOPPED)
 
 
+def _with_words(context: typer.Context, disparity: str) -> str:
+    """The disparities, with numbers that follow as words of their own; InputError for a word that belongs nowhere."""
+    words = context.args
+    if not words:
+        return disparity
+    source = context.get_parameter_source("disparity")
+    strange = [word for word in words if not NUMBER.fullmatch(word)]
+    if strange or source is None or source.name != "COMMANDLINE":
+        raise InputError(f"{(strange or words)[0]}: a word of no option: lists are given with commas: --methods A,B")
+    return ",".join((disparity, *words))
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command()(evaluate)
+    app.command(context_settings=WORDS)(evaluate)
     app.command()(tables)
-    app.command()(bench)
+    app.command(context_settings=WORDS)(bench)

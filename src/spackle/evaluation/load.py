@@ -56,6 +56,8 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     Raises:
         InputError: a file that is missing or no image, or one of another shape than its camera.
     """
+    if case.problem is not None:
+        raise InputError(case.problem)
     full = load_photo(case.photo)
     if case.camera is not None:
         check_shape(case.photo, full, case.camera)

@@ -20,7 +20,7 @@ from spackle.evaluation.efficiency_tables import efficiency_tables
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.jobs.bench_image import time_image
 from spackle.jobs.bench_options import BenchOptions, check_bench_options
-from spackle.jobs.evaluate import inputs_digest, spread
+from spackle.jobs.evaluate import inputs_digest, problem_of, spread
 from spackle.jobs.evaluate_case import Bench
 from spackle.jobs.evaluate_setup import configuration, metrics_device, open_bench
 from spackle.jobs.evaluate_store import IMAGES, alone_in, begin, stem_of, write_json, write_text
@@ -70,6 +70,8 @@ def _check_cases(cases: Sequence[Case], options: BenchOptions) -> None:
     where = f"{options.root}: {options.dataset}"
     if not cases:
         raise InputError(f"{where}: no images: check the folder")
+    if all(case.problem for case in cases):
+        return  # each is named in its turn
     if options.base.base == "rgbd" and not any(case.depth for case in cases):
         raise InputError(f"{where}: has no depth maps, which --base rgbd takes: take --base sharp")
 
@@ -110,7 +112,7 @@ class _Benchmark:
         except BaseError:
             raise
         except InputError as error:
-            problem = " ".join(str(error).replace(f"{self.options.root}/", "").splitlines())
+            problem = problem_of(case, error, self.options.root)
             self.reporter.say(f"passed over: {problem}")
             return ImageCost(case.name, problem=problem)
         write_json({"inputs": inputs, "image": image.plain()}, path)

@@ -48,8 +48,6 @@ class BenchOptions:
 def check_bench_options(options: BenchOptions) -> None:
     """InputError for an option that cannot be used, whatever the images."""
     check_evaluate_options(options.evaluation)
-    if len(set(options.disparities)) < len(options.disparities):
-        raise InputError("--disparity: the same number twice: leave one out")
     for name, value in (("--runs", options.runs), ("--base-runs", options.base_runs)):
         if value is not None and not 1 <= value <= MAX_RUNS:
             raise InputError(f"{name} must be between 1 and {MAX_RUNS}, got {value}")

@@ -98,6 +98,8 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
     where = f"{options.root}: {options.dataset}"
     if not cases:
         raise InputError(f"{where}: no images: check the folder")
+    if all(case.problem for case in cases):
+        return  # each is named in its turn
     if options.near and not any(case.seconds for case in cases):
         raise InputError(f"{where}: has no second photos: take --protocol large-view")
     if options.base.base == "rgbd" and not any(case.depth for case in cases):
@@ -145,7 +147,7 @@ class _Evaluation:
         except BaseError:
             raise
         except InputError as error:
-            problem = " ".join(str(error).replace(f"{self.bench.options.root}/", "").splitlines())
+            problem = problem_of(case, error, self.bench.options.root)
             self.reporter.say(f"passed over: {problem}")
             return Record(case.name, problem=problem), 0.0
         for remark in record.remarks:
@@ -191,6 +193,12 @@ class _Evaluation:
         for name, order in ((BEST, ranking.names), (WORST, ranking.names[::-1])):
             with atomic_path(self.output / name) as temporary:
                 sheet(run, ranking, order[:CASES], strips).save(temporary)
+
+
+def problem_of(case: Case, error: InputError, root: Path) -> str:
+    """Why a case is passed over, in one line that begins with its name: a photo may be the second one of several."""
+    problem = " ".join(str(error).replace(f"{root}/", "").splitlines())
+    return problem if problem.startswith(case.name) else f"{case.name}: {problem}"
 
 
 def inputs_digest(case: Case) -> str:

@@ -48,7 +48,7 @@ def examine(case: Case, bench: Bench) -> tuple[Record, dict[str, Tensor]]:
         BaseError: no image can be worked on.
     """
     near = bench.options.near
-    if near and not case.seconds:
+    if near and not case.seconds and case.problem is None:
         raise InputError(f"{case.name}: has no second photo")
     loaded = load_case(case if near else dataclasses.replace(case, seconds=()))
     prediction = _predict(loaded, bench)

@@ -55,9 +55,9 @@ def split_words(text: str) -> tuple[str, ...]:
 
 
 def parse_disparities(text: str) -> tuple[float, ...]:
-    """ "0.3,0.4" as numbers; InputError for anything else."""
+    """ "0.3,0.4" or "0.3 0.4" as numbers; InputError for anything else."""
     try:
-        return tuple(float(word) for word in split_words(text))
+        return tuple(float(word) for word in split_words(",".join(text.split())))
     except ValueError as error:
         raise InputError(f"--disparity {text}: not numbers: give them with commas, such as 0.3,0.4,0.5") from error
 
@@ -68,8 +68,8 @@ def check_name(option: str, name: str, known: Iterable[str]) -> None:
     if name in names:
         return
     near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    advice = f"did you mean {near[0]}? " if near else ""
-    raise InputError(f"{option} {name}: unknown: {advice}There are {', '.join(names)}")
+    advice = f"did you mean {near[0]}? There" if near else "there"
+    raise InputError(f"{option} {name}: unknown: {advice} are {', '.join(names)}")
 
 
 def check_evaluate_options(options: EvaluateOptions) -> None:
@@ -119,3 +119,5 @@ def _check_disparities(options: EvaluateOptions) -> None:
     for value in options.disparities:
         if not (math.isfinite(value) and 0 < value <= MAX_DISPARITY):
             raise InputError(f"--disparity {value:g}: must be above 0 and up to {MAX_DISPARITY:g}")
+    if len(set(options.disparities)) < len(options.disparities):
+        raise InputError("--disparity: the same number twice: leave one out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from spackle.bases.depth_maps import DepthMap
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.folders import by_name, photo_files, scene_folders
-from spackle.evaluation.datasets.stereo import HALF_PIXEL, Pair, make_pair, picture_size, read_text
+from spackle.evaluation.datasets.stereo import HALF_PIXEL, BrokenPhoto, Pair, make_pair, picture_size, read_text
 
 CALIBRATION = "calib_00-02.xml"
 
@@ -42,7 +43,11 @@ def _cases(scene: Path) -> list[Case]:
     photos = photo_files(scene / "camera_00")
     if not photos:
         raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
-    pair = _pair(scene / CALIBRATION, picture_size(photos[0]))
+    try:
+        size = _first_size(photos)
+    except BrokenPhoto as error:
+        return [Case(f"{scene.name}/{photo.stem}", photo, problem=str(error)) for photo in photos]
+    pair = _pair(scene / CALIBRATION, size)
     truth = scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
@@ -56,6 +61,14 @@ def _cases(scene: Path) -> list[Case]:
         return pair.case(f"{scene.name}/{photo.stem}", (photo, right), depth, metric=True)
 
     return [case(photo) for photo in photos]
+
+
+def _first_size(photos: Sequence[Path]) -> tuple[int, int]:
+    """Of the first photo that can be read: all of a scene are of one size."""
+    for photo in photos[:-1]:
+        with contextlib.suppress(BrokenPhoto):
+            return picture_size(photo)
+    return picture_size(photos[-1])
 
 
 def _pair(path: Path, size: tuple[int, int]) -> Pair:

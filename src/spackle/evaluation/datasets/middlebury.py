@@ -11,6 +11,7 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.folders import by_name, scene_folders
 from spackle.evaluation.datasets.stereo import (
+    BrokenPhoto,
     Pair,
     make_pair,
     pair_of_2014,
@@ -53,6 +54,13 @@ class Middlebury:
 
 
 def _case(folder: Path) -> Case:
+    try:
+        return _readable(folder)
+    except BrokenPhoto as error:
+        return Case(folder.name, folder, problem=str(error))
+
+
+def _readable(folder: Path) -> Case:
     if (folder / "calib.txt").is_file() or (folder / "im0.png").is_file():
         return pair_of_2014(folder)
     if (folder / "scene.json").is_file():

@@ -26,6 +26,10 @@ HALF_PIXEL = 0.5
 TRUTHS_2014 = ("disp0GT.pfm", "disp0.pfm")  # MiddEval3 and ETH3D; the sets as they were published
 
 
+class BrokenPhoto(InputError):
+    """A photo that is there and cannot be read: a matter of its own case, and not of the folder's layout."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Pair:
     """Two cameras side by side that look the same way."""
@@ -64,7 +68,8 @@ class Pair:
     def case(self, name: str, photos: tuple[Path, Path], depth: Callable[[], DepthMap], *, metric: bool) -> Case:
         """The left photo, with the right one as its second view."""
         for photo in photos:
-            check_file(photo, "photo")
+            if not photo.exists():
+                check_file(photo, "photo")  # raises; what is there and cannot be read is named in its turn
         right = SecondView("right", photos[1], self.right)
         return Case(name, photos[0], self.left, depth=depth, seconds=(right,), metric=metric)
 
@@ -124,8 +129,13 @@ def read_text(path: Path, kind: str, at_most: int = MAX_TEXT_BYTES) -> str:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) from a picture's header; InputError where it cannot be read."""
-    return read_image(path, lambda image: (image.width, image.height))
+    """(width, height) from a picture's header; BrokenPhoto where it cannot be read, InputError where it is missing."""
+    try:
+        return read_image(path, lambda image: (image.width, image.height))
+    except InputError as error:
+        if path.exists():
+            raise BrokenPhoto(str(error)) from error
+        raise
 
 
 def read_levels(path: Path) -> NDArray[Any]:
