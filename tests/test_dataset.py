@@ -8,6 +8,7 @@ import io
 import json
 import os
 import resource
+import runpy
 import shutil
 import signal
 import subprocess
@@ -33,6 +34,7 @@ from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
+from spackle.jobs import dataset_build
 from spackle.jobs.dataset_worker import Job, Made, Maker, _results
 from spackle.pseudo import PseudoDataset, PseudoFiles, PseudoSample
 from spackle.pseudo.archive import END, pack, unpack
@@ -321,6 +323,20 @@ def test_a_finished_build_has_nothing_to_do_and_a_lost_shard_is_made_again(
     assert content(copy) == content(whole[0])
 
 
+def test_a_damaged_part_is_a_line_and_made_again_when_deleted(whole: tuple[Path, Run], place: Path, copy: Path) -> None:
+    (copy / "shard-000001.tar").unlink()
+    part = copy / "parts" / "000002.tar"
+    part.parent.mkdir()
+    part.write_bytes((whole[0] / "shard-000001.tar").read_bytes()[:1000])
+    done = build(place, copy)
+    assert done.code == 2
+    assert f"{part}: not a photo of a dataset, or damaged" in done.lines[-1]
+    assert "delete it, and the same command makes it again" in done.lines[-1]
+    part.unlink()
+    assert build(place, copy).code == 0
+    assert content(copy) == content(whole[0])
+
+
 def test_another_configuration_is_refused_and_the_difference_shown(place: Path, copy: Path) -> None:
     before = content(copy)
     done = build(place, copy, "--inpainter", "none", "--disparity", "0.2", "0.3")
@@ -392,6 +408,10 @@ def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) 
     done = run("dataset", "verify", copy)
     assert (done.code, len(done.lines)) == (2, 1)
     assert run("dataset", "info", copy / "nothing").code == 2
+    (copy / "manifest.json").unlink()
+    (copy / "manifest.json").mkdir()
+    done = run("dataset", "info", copy)
+    assert (done.code, done.lines) == (2, [f"spackle: {copy}/manifest.json: cannot be read: Is a directory"])
 
 
 def test_info_and_preview(whole: tuple[Path, Run], tmp_path: Path) -> None:
@@ -503,7 +523,7 @@ def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     assert any("two.png: the same photo as one.png" in line for line in passed)
     assert any("cmyk.jpg: no depth map" in line for line in passed)
     (entry,) = [line for shard in load_manifest(tmp_path / "out").shards for line in shard.passed_over]
-    assert entry.startswith("cmyk.jpg: ")
+    assert entry.startswith("cmyk.jpg: no depth map in --depth: ")
 
 
 def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
@@ -576,15 +596,36 @@ def test_bad_options_are_a_line_and_leave_nothing(place: Path, tmp_path: Path, o
 
 def test_no_photos_is_a_line(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
+    (tmp_path / "depth").mkdir()
     assert "no photos in this folder" in build(tmp_path, tmp_path / "out").err
     (tmp_path / "photos" / "a.png").write_bytes(b"no")
     assert "none of 1 photos can be used" in build(tmp_path, tmp_path / "out").lines[-1]
     write_inputs(tmp_path, 1)
     shutil.rmtree(tmp_path / "depth")
     (tmp_path / "depth").mkdir()
-    done = build(tmp_path, tmp_path / "out")
-    assert done.code == 2
-    assert "none of 1 photos gave a sample" in done.lines[-1]
+    for _ in range(2):  # nothing stays of the first, and the second says why again
+        done = build(tmp_path, tmp_path / "out")
+        assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
+        assert "none of 1 photos gave a sample, such as 0.png: no depth map in --depth: " in done.lines[-1]
+        assert not (tmp_path / "out").exists()
+
+
+def test_depth_has_to_be_a_folder(place: Path, tmp_path: Path) -> None:
+    for depth in (place / "nowhere", place / "depth" / "0.npy"):
+        done = build(place, tmp_path / "out", "--depth", depth)
+        assert (done.code, len(done.lines)) == (2, 1)
+        assert f"--depth {depth}: no such folder" in done.err
+        assert not (tmp_path / "out").exists()
+
+
+def test_more_photos_than_there_are_keys_are_a_line(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset_build, "MAX_PHOTOS", 4)
+    done = build(place, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "5 photos are too many for a dataset (at most 4): give --sample" in done.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_sharp_needs_no_depth(tmp_path: Path) -> None:
@@ -681,6 +722,19 @@ def test_inpainters_touch_the_holes_alone(name: str) -> None:
     assert bool((targets[stack.mask].amax(-1) > 0.2).all()) == (name != "none")
     seen = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
     assert torch.equal(get_inpainter(name, get_renderer()).complete(seen), stack.rgb)
+
+
+def test_geometry_is_calmer_than_views_completed_one_by_one() -> None:
+    bench = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "flicker.py"))
+    rgb, depth, camera = bench["scene"](128)
+    base = lift(rgb, depth, camera).gaussians
+    cameras = path_cameras(PathChoice("swipe", 0.4), camera, DepthRange.of(base), 8)
+    stack = render_views(base, camera, cameras, get_renderer())
+    order = list(range(1, len(cameras)))
+    calm, off = bench["flicker"](stack, get_inpainter("geometry", get_renderer()).complete(stack), order)
+    restless, other_off = bench["flicker"](stack, bench["by_view"](stack), order)
+    assert calm < restless / 3
+    assert off < 1.1 * other_off
 
 
 def test_without_its_package_opencv_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

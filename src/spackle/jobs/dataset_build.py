@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rich.filesize import decimal
 
 from spackle.errors import InputError
-from spackle.jobs.dataset_options import DatasetOptions, check_dataset_options, configuration
+from spackle.jobs.dataset_options import MAX_PHOTOS, DatasetOptions, check_dataset_options, configuration
 from spackle.jobs.dataset_ray import at_work_on_ray, cluster
 from spackle.jobs.dataset_worker import PARTS, Job, Made, Maker, at_work, part_file
 from spackle.jobs.inputs import LEFTOVER, alone_in, make_folder, results_folder
@@ -60,6 +60,11 @@ def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[P
         more = len(found.missing) - NAMED
         names = ", ".join(found.missing[:NAMED]) + (f" and {more} more" if more > 0 else "")
         reporter.say(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
+    if options.sample is None and len(found.names) > MAX_PHOTOS:
+        raise InputError(
+            f"{source}: {len(found.names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
+            "give --sample, or build several"
+        )
     with reporter.stage("photos", {}) as step:
         return choose(found, options.sample, options.choices.seed, reporter.say, step)
 
@@ -164,7 +169,7 @@ class _Build:
         for number in sorted(n for n, missing in waiting.items() if not missing and n not in shards):
             own = range(number * size, min((number + 1) * size, len(self.photos)))
             parts = [(key_of(i), part_file(self.output, i)) for i in own if i not in problems]
-            passed = [f"{self.photos[i].name}: {self._portable(problems[i])}" for i in own if i in problems]
+            passed = [self._portable(self.photos[i].name, problems[i]) for i in own if i in problems]
             with timed("write", seconds):
                 shards[number] = write_shard(parts, self.output / shard_name(number), passed)
                 self._save(shards, complete=False)
@@ -178,14 +183,13 @@ class _Build:
     def _finish(self, shards: dict[int, ShardEntry], seconds: Seconds, made: int, wall: float) -> str:
         """The last manifest, and no trace of how it came to be."""
         samples = sum(len(shard.samples) for shard in shards.values())
-        if not samples:
-            raise InputError(
-                f"{self.output}: none of {len(self.photos)} photos gave a sample (the lines above say why)"
-            )
-        self._save(shards, complete=True)
+        if samples:
+            self._save(shards, complete=True)
         for file in (self.output / PARTS).iterdir():  # of shards that an earlier run had finished
             file.unlink(missing_ok=True)
         (self.output / PARTS).rmdir()
+        if not samples:
+            self._take_back(shards.values())
         if made:
             stages = ", ".join(f"{stage} {seconds[stage] / made:.2f}" for stage in STAGES)
             self.reporter.say(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
@@ -193,8 +197,18 @@ class _Build:
         self.reporter.say(f"{samples} photos in {len(shards)} shards, {decimal(total)} -> {self.output}")
         return "complete"
 
-    def _portable(self, problem: str) -> str:
-        """A message without the folder that the photos happened to lie in."""
+    def _take_back(self, shards: Collection[ShardEntry]) -> NoReturn:
+        """Nothing came of it, so nothing stays, and the next run tries all photos again."""
+        for name in (NAME, *(shard.file for shard in shards)):
+            (self.output / name).unlink(missing_ok=True)
+        why = min(line for shard in shards for line in shard.passed_over)
+        raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample, such as {why}")
+
+    def _portable(self, name: str, problem: str) -> str:
+        """What is wrong with a photo, without the folders in which it and its depth happened to lie."""
         for photo in self.photos:
             problem = problem.replace(str(photo.path), photo.name)
-        return problem
+        depth = self.options.base.depth
+        if depth is not None and depth.name:  # "." and "/" stand anywhere
+            problem = problem.replace(str(depth), "--depth")
+        return problem if problem.startswith(f"{name}: ") else f"{name}: {problem}"

@@ -71,6 +71,9 @@ def view_choices(seed: int, views: int, trajectory: str | None, disparity: tuple
 def check_dataset_options(options: DatasetOptions) -> None:
     """InputError for an option that cannot be used, whatever the photos."""
     check_options(options.base)
+    depth = options.base.depth
+    if depth is not None and not depth.is_dir():  # one map for all photos would be wrong for all but one
+        raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
     choices = options.choices
     low, high = choices.disparity
     if not 0 < low <= high <= MAX_DISPARITY:

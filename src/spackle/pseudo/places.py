@@ -31,7 +31,7 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"{place}: cannot be read: {reason_in_a_line(error)}") from error
+        raise InputError(f"{place}: cannot be read: {error.strerror or reason_in_a_line(error)}") from error
 
 
 def _open_remote(url: str) -> IO[bytes]:

@@ -39,7 +39,10 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
     with atomic_path(target) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
-            facts = PhotoGroup.of(key, data, str(path)).facts
+            try:
+                facts = PhotoGroup.of(key, data, str(path)).facts
+            except InputError as error:
+                raise InputError(f"{error}: delete it, and the same command makes it again") from error
             digest = hashlib.sha256(data).hexdigest()
             samples.append(SampleEntry(key, facts["photo"]["name"], offset, len(data), digest, tuple(holes_of(facts))))
             file.write(data)
