@@ -25,7 +25,7 @@ from spackle.evaluation.alignment import SAME, align, to_base
 from spackle.evaluation.case import Case, Points
 from spackle.evaluation.datasets import DATASETS, get_dataset
 from spackle.evaluation.datasets.sampling import spread
-from spackle.evaluation.load import dense_cells, load_case
+from spackle.evaluation.load import dense_cells, known_depth, load_case
 from spackle.image import working_size
 
 Array = NDArray[Any]
@@ -717,3 +717,24 @@ def test_a_second_camera_in_the_bases_world(turn: float, off: tuple[float, float
     rotation = moved.world_to_camera[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-6, rtol=0)
     assert (moved.width, moved.height) == (view.width, view.height)
+
+
+def test_points_are_a_depth_map_with_gaps_and_the_nearest_of_a_pixel_stays() -> None:
+    camera = Camera.from_focal(10, 6, 4)
+    uv = torch.tensor([[0.5, 0.5], [5.9, 3.9], [2.2, 1.7], [2.9, 1.1], [6.0, 1.0], [1.0, -0.1], [3.5, 2.5]])
+    points = Points(uv, torch.tensor([4.0, 5.0, 7.0, 3.0, 2.0, 2.0, -1.0]))
+    case = Case("a", Path("a.png"), camera, points=lambda: points)
+    found = known_depth(case)
+    assert found.depth.shape == (4, 6)
+    assert {(int(y), int(x)): float(found.depth[y, x]) for y, x in found.valid.nonzero()} == {
+        (0, 0): 4.0,
+        (3, 5): 5.0,
+        (1, 2): 3.0,
+    }
+    assert torch.equal(found.valid, found.depth > 0)
+    map_of_its_own = dataclasses.replace(found, quantity="disparity")
+    assert known_depth(dataclasses.replace(case, depth=lambda: map_of_its_own)) is map_of_its_own
+    with pytest.raises(InputError, match="a: has no depth map and no points"):
+        known_depth(dataclasses.replace(case, points=None))
+    with pytest.raises(InputError, match="not one of its 2 points lies in the photo"):
+        known_depth(dataclasses.replace(case, points=lambda: Points(uv[4:6], torch.ones(2))))

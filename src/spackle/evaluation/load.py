@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from spackle.bases.depth_maps import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
@@ -67,6 +68,27 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
     seconds = tuple(_load_view(view.name, view.photo, view.camera, max_side) for view in case.seconds)
     return LoadedCase(case, full, photo, dataclasses.replace(camera, world_to_camera=torch.eye(4)), seconds)
+
+
+def known_depth(case: Case) -> DepthMap:
+    """A case's depth map; else its points as one with gaps, each in its pixel of the case's camera, the nearest first.
+
+    Raises:
+        InputError: the case has neither, or a file of it cannot be used.
+    """
+    if case.depth is not None:
+        return case.depth()
+    if case.points is None or case.camera is None:
+        raise InputError(f"{case.name}: has no depth map and no points, of which --base rgbd takes either")
+    points, camera = case.points(), case.camera
+    column, row = points.uv.floor().long().unbind(-1)
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (points.z > 0)
+    order = points.z[inside].argsort(descending=True, stable=True)  # what is written last stays
+    depth = torch.zeros(camera.height, camera.width)
+    depth[row[inside][order], column[inside][order]] = points.z[inside][order].float()
+    if not bool((depth > 0).any()):
+        raise InputError(f"{case.name}: not one of its {len(points.z)} points lies in the photo")
+    return DepthMap(depth, depth > 0, camera.K, None, "depth", case.photo)
 
 
 def check_shape(path: Path, photo: Photo, camera: Camera) -> None:

@@ -72,8 +72,8 @@ def _check_cases(cases: Sequence[Case], options: BenchOptions) -> None:
         raise InputError(f"{where}: no images: check the folder")
     if all(case.problem for case in cases):
         return  # each is named in its turn
-    if options.base.base == "rgbd" and not any(case.depth for case in cases):
-        raise InputError(f"{where}: has no depth maps, which --base rgbd takes: take --base sharp")
+    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
+        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
 
 
 @dataclasses.dataclass

@@ -102,8 +102,8 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
         return  # each is named in its turn
     if options.near and not any(case.seconds for case in cases):
         raise InputError(f"{where}: has no second photos: take --protocol large-view")
-    if options.base.base == "rgbd" and not any(case.depth for case in cases):
-        raise InputError(f"{where}: has no depth maps, which --base rgbd takes: take --base sharp")
+    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
+        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
 
 
 @dataclasses.dataclass

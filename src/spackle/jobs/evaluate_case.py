@@ -14,7 +14,7 @@ from spackle.bases.rgbd import RgbdBase
 from spackle.errors import InputError
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case
-from spackle.evaluation.load import LoadedCase, load_case
+from spackle.evaluation.load import LoadedCase, known_depth, load_case
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import NEAR, Gauges, Wanted, large_views, measure
 from spackle.evaluation.results import Record
@@ -93,9 +93,7 @@ def _predict(loaded: LoadedCase, bench: Bench) -> BasePrediction:
     """The base's Gaussians; InputError where a case has no depth for a base that takes it."""
     if bench.base is not None:
         return _of_network(bench.base).predict(loaded.full)
-    if loaded.case.depth is None:
-        raise InputError(f"{loaded.case.name}: has no depth map, which --base rgbd takes")
-    return RgbdBase(loaded.case.depth()).predict(loaded.full)
+    return RgbdBase(known_depth(loaded.case)).predict(loaded.full)
 
 
 def _of_network(load: Load) -> Base:

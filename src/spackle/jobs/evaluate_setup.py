@@ -31,7 +31,7 @@ from spackle.training.features import FeatureNet, load_features
 
 BASES = {
     "sharp": ("SHARP", "Apple's network, from the photo alone"),
-    "rgbd": ("rgbd", "the dataset's own depth, lifted; not SHARP, so not the paper's base"),
+    "rgbd": ("rgbd", "the dataset's own depth, map or points, lifted; not SHARP, so not the paper's base"),
 }
 NO_FEATURES = "not run: weights: give SqueezeNet's with --features FILE"
 
