@@ -14,16 +14,28 @@ STOPPED = 130  # what shells report of a command that Ctrl-C ended
 WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
 NUMBER = re.compile(r"[\d.,]+")
 
+# Options that both commands have.
+Dataset = Annotated[
+    str,
+    typer.Option(metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."),
+]
+Root = Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")]
+BaseName = Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")]
+Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
+LowMemory = Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")]
+Residual = Annotated[
+    str | None,
+    typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
+]
+Limit = Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")]
+Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
+Precision = Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")]
+
 
 def evaluate(
     context: typer.Context,
-    dataset: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
-        ),
-    ],
-    root: Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")],
+    dataset: Dataset,
+    root: Root,
     protocol: Annotated[
         str, typer.Option(help="large-view: holes at wide moves; near-view: against true second photos.")
     ] = "large-view",
@@ -43,23 +55,20 @@ def evaluate(
             help="Of clipiqa, niqe, musiq, psnr, ssim, distance, dists, lpips, or none; default: the protocol's.",
         ),
     ] = None,
-    base: Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")] = "sharp",
-    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
-    precision: Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")] = "auto",
-    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")] = False,
-    residual: Annotated[
-        str | None,
-        typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
-    ] = None,
+    base: BaseName = "sharp",
+    checkpoint: Checkpoint = None,
+    precision: Precision = "auto",
+    low_memory: LowMemory = False,
+    residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
     features: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet 1.0, for the metric distance.")
     ] = None,
-    limit: Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")] = None,
+    limit: Limit = None,
     download_metrics: Annotated[
         bool, typer.Option("--download-metrics", help="Let pyiqa fetch weights (some are not for commercial use).")
     ] = False,
-    device: Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")] = "auto",
+    device: Device = "auto",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -115,30 +124,22 @@ def tables(
 
 def bench(
     context: typer.Context,
-    dataset: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
-        ),
-    ],
-    root: Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")],
+    dataset: Dataset,
+    root: Root,
     disparity: Annotated[
         str, typer.Option(metavar="A,B,…", help="Of the timed views, with commas or spaces; the paper's S1, S2, S3.")
     ] = "0.3,0.4,0.5",
-    base: Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")] = "sharp",
-    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
-    precision: Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")] = "auto",
-    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")] = False,
-    residual: Annotated[
-        str | None,
-        typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
-    ] = None,
-    limit: Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")] = None,
+    base: BaseName = "sharp",
+    checkpoint: Checkpoint = None,
+    precision: Precision = "auto",
+    low_memory: LowMemory = False,
+    residual: Residual = None,
+    limit: Limit = None,
     runs: Annotated[int, typer.Option(help="How often everything behind the base is timed.")] = 5,
     base_runs: Annotated[
         int | None, typer.Option(help="How often the base is timed. [default: 1 for sharp, else as --runs]")
     ] = None,
-    device: Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")] = "auto",
+    device: Device = "auto",
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: bench-NAME-BASE."),

@@ -22,9 +22,9 @@ from spackle.jobs.bench_image import time_image
 from spackle.jobs.bench_options import BenchOptions, check_bench_options
 from spackle.jobs.evaluate import inputs_digest, problem_of, spread
 from spackle.jobs.evaluate_case import Bench
-from spackle.jobs.evaluate_setup import configuration, metrics_device, open_bench
-from spackle.jobs.evaluate_store import IMAGES, alone_in, begin, stem_of, write_json, write_text
-from spackle.jobs.inputs import results_folder
+from spackle.jobs.evaluate_setup import check_cases, configuration, metrics_device, open_bench
+from spackle.jobs.evaluate_store import IMAGES, begin, stem_of, write_json, write_text
+from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.setup import BaseError
@@ -52,7 +52,7 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> str:
     check_bench_options(options)
     dataset = get_dataset(options.dataset)
     cases = spread(dataset.cases(options.root), options.limit)
-    _check_cases(cases, options)
+    check_cases(cases, options.evaluation)
     tools = open_bench(options.evaluation)
     whole = configuration(options.evaluation, dataset, cases, tools)
     config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
@@ -60,20 +60,9 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> str:
     device = torch.device("cpu" if options.base.base == "rgbd" else metrics_device(options.evaluation))
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
-    with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output):
+    with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output, "benchmark"):
         begin(output, config)
         return _Benchmark(options, cases, output, tools, reporter, config, Clock(device)).run()
-
-
-def _check_cases(cases: Sequence[Case], options: BenchOptions) -> None:
-    """InputError where not one of them has what is needed."""
-    where = f"{options.root}: {options.dataset}"
-    if not cases:
-        raise InputError(f"{where}: no images: check the folder")
-    if all(case.problem for case in cases):
-        return  # each is named in its turn
-    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
-        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
 
 
 @dataclasses.dataclass

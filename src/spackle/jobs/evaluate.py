@@ -24,14 +24,13 @@ from spackle.formats import atomic_path, save_png
 from spackle.jobs.evaluate_case import Bench, examine
 from spackle.jobs.evaluate_options import EvaluateOptions, check_evaluate_options
 from spackle.jobs.evaluate_pictures import find_bench, picture_suffix, save_picture, source_of, write_report
-from spackle.jobs.evaluate_setup import configuration, metrics_device, open_bench
+from spackle.jobs.evaluate_setup import check_cases, configuration, metrics_device, open_bench
 from spackle.jobs.evaluate_store import (
     BEST,
     IMAGES,
     RESULTS,
     TIMES,
     WORST,
-    alone_in,
     begin,
     load_record,
     save_record,
@@ -39,7 +38,7 @@ from spackle.jobs.evaluate_store import (
     write_json,
 )
 from spackle.jobs.evaluate_tables import TABLES, page, write_tables
-from spackle.jobs.inputs import results_folder
+from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.request import fingerprint
@@ -65,11 +64,11 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     check_evaluate_options(options)
     dataset = get_dataset(options.dataset)
     cases = spread(dataset.cases(options.root), options.limit)
-    _check_cases(cases, options)
+    check_cases(cases, options)
     bench = open_bench(options)
     config = configuration(options, dataset, cases, bench)
     _say_what_is_missing(bench, reporter)
-    with results_folder(output, (RESULTS, TIMES, WORST, BEST, *TABLES, *page(html))), alone_in(output):
+    with results_folder(output, (RESULTS, TIMES, WORST, BEST, *TABLES, *page(html))), alone_in(output, "evaluation"):
         begin(output, config)
         return _Evaluation(cases, output, bench, reporter, config, html).run()
 
@@ -91,19 +90,6 @@ def _say_what_is_missing(bench: Bench, reporter: Reporter) -> None:
         reporter.say(f"{', '.join(names)}: {state}")
     if bench.gauges.published:
         reporter.say(NOTICE)
-
-
-def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
-    """InputError where not one of them has what is needed."""
-    where = f"{options.root}: {options.dataset}"
-    if not cases:
-        raise InputError(f"{where}: no images: check the folder")
-    if all(case.problem for case in cases):
-        return  # each is named in its turn
-    if options.near and not any(case.seconds for case in cases):
-        raise InputError(f"{where}: has no second photos: take --protocol large-view")
-    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
-        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
 
 
 @dataclasses.dataclass

@@ -106,6 +106,19 @@ def _residual_precision(base: PredictOptions) -> str | None:
     return str(pick_dtype(base.precision, torch.device("cpu"))).removeprefix("torch.")
 
 
+def check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
+    """InputError where not one of them has what is needed."""
+    where = f"{options.root}: {options.dataset}"
+    if not cases:
+        raise InputError(f"{where}: no images: check the folder")
+    if all(case.problem for case in cases):
+        return  # each is named in its turn
+    if options.near and not any(case.seconds for case in cases):
+        raise InputError(f"{where}: has no second photos: take --protocol large-view")
+    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
+        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
+
+
 def _features(options: EvaluateOptions) -> FeatureNet | None:
     """SqueezeNet, where its weights are given and wanted."""
     if options.features is None or "distance" not in options.wanted_metrics:

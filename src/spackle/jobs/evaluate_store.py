@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from spackle.downloads.locks import hold
 from spackle.errors import InputError
 from spackle.evaluation.results import Record, Run
 from spackle.formats import atomic_path
@@ -19,23 +17,7 @@ from spackle.pseudo.manifest import differences
 IMAGES = "images"
 CONFIG, RESULTS, TIMES = "config.json", "results.json", "times.json"
 MARKDOWN, LATEX, WORST, BEST = "tables.md", "tables.tex", "worst.png", "best.png"
-LOCK = ".lock"
 FORMAT = 1
-
-
-@contextlib.contextmanager
-def alone_in(output: Path) -> Iterator[None]:
-    """Two runs in one folder would do the same work twice; InputError for the second."""
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(hold(output / LOCK))
-        except BlockingIOError as error:
-            raise InputError(
-                f"{output}: another evaluation is at work in this folder: wait for it, or end it"
-            ) from error
-        except OSError as error:
-            raise InputError(f"{output}: cannot write: {error.strerror or error}") from error
-        yield
 
 
 def begin(output: Path, config: Mapping[str, Any]) -> None:

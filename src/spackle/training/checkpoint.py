@@ -31,7 +31,7 @@ class Progress:
     best: float | None = None  # validation loss; None before the first validation
     best_step: int = 0
     stale: int = 0  # validations since then
-    seconds: float = 0.0  # of all sessions together
+    seconds: float = 0.0  # of all its starts together
     history: tuple[dict[str, float], ...] = ()  # what each validation found
 
     def judged(self, found: dict[str, float], min_delta: float) -> Progress:

@@ -42,7 +42,7 @@ class TensorBoardLogs:
     """Event files in a folder."""
 
     def __init__(self, folder: Path, purge_step: int) -> None:
-        """ImportError where tensorboard is not installed; what an earlier session logged after a step is hidden."""
+        """ImportError where tensorboard is not installed; what an earlier start logged after a step is hidden."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of protobuf's, about itself
             import tensorboard  # noqa: F401  # torch's own import of it fails with other words
