@@ -6,12 +6,10 @@ import copy
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from safetensors.torch import save_file
 from scenes import shifted
 from sharp_weights import MICRO
 from torch import Tensor
+from training_runs import killed_at, started, state
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import expected_shapes, load_network
@@ -40,7 +39,6 @@ from spackle.image import Photo
 from spackle.pseudo import PseudoFiles
 from spackle.render import get_renderer
 from spackle.render.reference import ReferenceRenderer
-from spackle.training.checkpoint import Checkpoint, load_checkpoint
 from spackle.training.direct_ft import DirectFt, render_photo
 from spackle.training.logs import NoLogs
 from spackle.training.loop import Trainer
@@ -127,12 +125,6 @@ def arguments(place: Path, output: Path, *more: object) -> list[str]:
 
 def train(place: Path, output: Path, *more: object) -> Run:
     return run(*arguments(place, output, *more))
-
-
-def state(folder: Path) -> Checkpoint:
-    checkpoint, _ = load_checkpoint(folder)
-    assert checkpoint is not None
-    return checkpoint
 
 
 def photo() -> Photo:
@@ -288,13 +280,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Pa
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    kill = """
-import os
-from spackle.training.loop import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 3 else step(self, number)
-"""
-    process = child(place, tmp_path / "out", kill)
+    process = child(place, tmp_path / "out", killed_at(3))
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 2
@@ -306,15 +292,7 @@ Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 3 else 
 
 
 def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
-    """A process of its own, with something done before the command."""
-    words = ["spackle", *arguments(place, output, *more)]
-    code = f"import sys\nsys.argv = {words!r}\n{SMALL}\n{code}\nfrom spackle.cli import main\nmain()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code],
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return started(arguments(place, output, *more), f"{SMALL}\n{code}", **environment)
 
 
 @pytest.mark.slow

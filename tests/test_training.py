@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import resource
 import shutil
 import signal
@@ -21,6 +20,7 @@ from command import Run, names_in, run
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
+from training_runs import killed_at, started, state
 
 from spackle.downloads.locks import hold
 from spackle.gaussians import Gaussians
@@ -28,7 +28,6 @@ from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.residual.weights import load_residual
 from spackle.training.cache import load_sample, save_sample
-from spackle.training.checkpoint import Checkpoint, load_checkpoint
 from spackle.training.data import SampleFiles
 from spackle.training.logs import NoLogs
 from spackle.training.loop import Trainer
@@ -93,12 +92,6 @@ def train(place: Path, output: Path, *more: str) -> Run:
     return run(*arguments(place, output, *more))
 
 
-def state(folder: Path) -> Checkpoint:
-    checkpoint, _ = load_checkpoint(folder)
-    assert checkpoint is not None
-    return checkpoint
-
-
 def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
     a, b = state(one), state(other)
     assert a.progress.step == b.progress.step
@@ -107,15 +100,7 @@ def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
 
 
 def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
-    """A process of its own, with something done before the command."""
-    words = ["spackle", *arguments(place, output, *more)]
-    code = f"import sys\nsys.argv = {words!r}\n{code}\nfrom spackle.cli import main\nmain()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code],
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return started(arguments(place, output, *more), code, **environment)
 
 
 # A run and what comes out -------------------------------------------------------------------------
@@ -165,13 +150,7 @@ def test_without_tensorboard_a_line_is_said(place: Path, tmp_path: Path, monkeyp
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    kill = """
-import os
-from spackle.training.loop import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 4 else step(self, number)
-"""
-    process = child(place, tmp_path / "out", kill)
+    process = child(place, tmp_path / "out", killed_at(4))
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 3

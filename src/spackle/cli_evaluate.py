@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from spackle.errors import InputError
+
+if TYPE_CHECKING:
+    from spackle.jobs.options import PredictOptions
 
 STOPPED = 130  # what shells report of a command that Ctrl-C ended
 WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
@@ -81,7 +84,6 @@ def evaluate(
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
     from spackle.jobs.evaluate import evaluate as run
     from spackle.jobs.evaluate_options import EvaluateOptions, parse_disparities, split_words
-    from spackle.jobs.options import PredictOptions
     from spackle.jobs.progress import Reporter
 
     options = EvaluateOptions(
@@ -91,15 +93,7 @@ def evaluate(
         methods=split_words(methods),
         disparities=parse_disparities(_with_words(context, disparity)),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
-        base=PredictOptions(
-            base=base,
-            checkpoint=checkpoint,
-            precision=precision,  # type: ignore[arg-type]  # checked with the other options
-            low_memory=low_memory,
-            residual=residual,
-            device=device,
-            render=False,
-        ),
+        base=_base_options(base, checkpoint, precision, low_memory, residual, device),
         direct_ft=direct_ft,
         features=features,
         limit=limit,
@@ -150,28 +144,35 @@ def bench(
     from spackle.jobs.bench import bench as run
     from spackle.jobs.bench_options import BenchOptions
     from spackle.jobs.evaluate_options import parse_disparities
-    from spackle.jobs.options import PredictOptions
     from spackle.jobs.progress import Reporter
 
     options = BenchOptions(
         dataset=dataset,
         root=root,
         disparities=parse_disparities(_with_words(context, disparity)),
-        base=PredictOptions(
-            base=base,
-            checkpoint=checkpoint,
-            precision=precision,  # type: ignore[arg-type]  # checked with the other options
-            low_memory=low_memory,
-            residual=residual,
-            device=device,
-            render=False,
-        ),
+        base=_base_options(base, checkpoint, precision, low_memory, residual, device),
         limit=limit,
         runs=runs,
         base_runs=base_runs,
     )
     if run(options, output or Path(f"bench-{dataset}-{base}"), Reporter(verbose)) == "stopped":
         raise typer.Exit(STOPPED)
+
+
+def _base_options(
+    base: str, checkpoint: Path | None, precision: str, low_memory: bool, residual: str | None, device: str
+) -> PredictOptions:
+    from spackle.jobs.options import PredictOptions
+
+    return PredictOptions(
+        base=base,
+        checkpoint=checkpoint,
+        precision=precision,  # type: ignore[arg-type]  # checked with the other options
+        low_memory=low_memory,
+        residual=residual,
+        device=device,
+        render=False,
+    )
 
 
 def _with_words(context: typer.Context, disparity: str) -> str:

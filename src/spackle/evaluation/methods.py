@@ -43,7 +43,11 @@ class Shot:
     @functools.cached_property
     def shield(self) -> Shield:
         """What the photo shows, which no completion may cover."""
-        return Completer(self.base, self.prediction.camera, self.renderer).photo_shield()
+        return self.completer(None).photo_shield()
+
+    def completer(self, network: ResidualNet | None, precision: Precision = "auto") -> Completer:
+        """What fills its holes; with seeds alone where there is no network."""
+        return Completer(self.base, self.prediction.camera, self.renderer, network, precision=precision)
 
     def draw(self, aux: Gaussians, index: int) -> View:
         """A view with aux Gaussians on top of the base."""
@@ -86,7 +90,7 @@ class PerView:
     precision: Precision = "auto"
 
     def views(self, shot: Shot) -> Iterator[View]:
-        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network, precision=self.precision)
+        completer = shot.completer(self.network, self.precision)
         for camera, before in zip(shot.cameras, shot.before, strict=True):
             aux, drawn = completer.completed_view(camera, [shot.shield], rendering=before)
             yield View(drawn.rgb, drawn.alpha, len(aux))
@@ -100,7 +104,7 @@ class OneScene:
     precision: Precision = "auto"
 
     def views(self, shot: Shot) -> Iterator[View]:
-        completer = Completer(shot.base, shot.prediction.camera, shot.renderer, self.network, precision=self.precision)
+        completer = shot.completer(self.network, self.precision)
         aux = completer.complete_scene(shot.cameras, exact=True)
         for index in range(len(shot.cameras)):
             yield shot.draw(aux, index)

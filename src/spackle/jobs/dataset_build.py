@@ -14,7 +14,7 @@ from spackle.errors import InputError
 from spackle.jobs.dataset_options import MAX_PHOTOS, DatasetOptions, check_dataset_options, configuration
 from spackle.jobs.dataset_ray import at_work_on_ray, cluster
 from spackle.jobs.dataset_worker import PARTS, Job, Made, Maker, at_work, part_file
-from spackle.jobs.inputs import LEFTOVER, alone_in, make_folder, results_folder
+from spackle.jobs.inputs import alone_in, make_folder, remove_half_written, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.stopping import asked_to_stop
 from spackle.pseudo.build import Seconds, key_of, timed
@@ -82,10 +82,7 @@ def _begin(output: Path, config: dict[str, Any]) -> Manifest:
     if lines := differences(manifest.config, new.config):
         raise InputError(f"{output}: holds a dataset of another configuration ({'; '.join(lines)}): choose another -o")
     make_folder(output / PARTS)
-    for folder in (output, output / PARTS):  # what a killed run left half-written
-        for file in folder.iterdir():
-            if LEFTOVER.fullmatch(file.name):
-                file.unlink(missing_ok=True)
+    remove_half_written(output, output / PARTS)
     return manifest
 
 

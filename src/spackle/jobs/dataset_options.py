@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ from spackle.errors import InputError
 from spackle.image import MAX_SIDE
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options
-from spackle.jobs.request import fingerprint
+from spackle.jobs.request import digest_of, fingerprint
 from spackle.precision import Precision
 from spackle.pseudo.build import ViewChoices
 from spackle.pseudo.inpainters import Inpainter, InpainterOptions
@@ -104,7 +102,7 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
     Threads are part of it: SHARP's last bits depend on their number. Workers are not.
     """
     base = options.base
-    inputs = hashlib.sha256(json.dumps([inputs_of(photo, base) for photo in photos]).encode()).hexdigest()
+    inputs = digest_of([inputs_of(photo, base) for photo in photos])
     choices = dataclasses.asdict(options.choices)
     return {
         "spackle": spackle.__version__,

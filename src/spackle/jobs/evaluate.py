@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,7 +39,7 @@ from spackle.jobs.evaluate_tables import TABLES, page, write_tables
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
-from spackle.jobs.request import fingerprint
+from spackle.jobs.request import digest_of, fingerprint
 from spackle.jobs.setup import BaseError
 from spackle.jobs.stopping import asked_to_stop
 
@@ -195,4 +193,4 @@ def inputs_digest(case: Case) -> str:
             parts.append(fingerprint(path, "photo"))
         except InputError:
             parts.append("none")
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return digest_of(parts)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from spackle.jobs.dataset_options import weights_digest
 from spackle.jobs.evaluate_case import Bench
 from spackle.jobs.evaluate_options import EvaluateOptions
 from spackle.jobs.options import PredictOptions
+from spackle.jobs.request import digest_of
 from spackle.jobs.setup import BaseError, set_up
 from spackle.precision import pick_dtype
 from spackle.render import get_renderer
@@ -77,7 +76,7 @@ def configuration(
     """Everything that decides the figures, ready for JSON; nothing of where files lie."""
     base = options.base
     title, says = BASES[base.base]
-    names = hashlib.sha256(json.dumps([case.name for case in cases]).encode()).hexdigest()
+    names = digest_of([case.name for case in cases])
     weights = None if base.base_weights is None else weights_digest(base.base_weights)
     about = {"name": base.base, "title": title, "says": says, "weights": weights, "precision": base.precision}
     residual = base.residual_file and weights_digest(base.residual_file)

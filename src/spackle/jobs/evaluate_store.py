@@ -11,7 +11,7 @@ from typing import Any
 from spackle.errors import InputError
 from spackle.evaluation.results import Record, Run
 from spackle.formats import atomic_path
-from spackle.jobs.inputs import LEFTOVER, make_folder
+from spackle.jobs.inputs import make_folder, remove_half_written
 from spackle.pseudo.manifest import differences
 
 IMAGES = "images"
@@ -27,10 +27,7 @@ def begin(output: Path, config: Mapping[str, Any]) -> None:
         InputError: it holds another one, and says where they differ.
     """
     make_folder(output / IMAGES)
-    for folder in (output, output / IMAGES):  # what a killed run left half-written
-        for file in folder.iterdir():
-            if LEFTOVER.fullmatch(file.name):
-                file.unlink(missing_ok=True)
+    remove_half_written(output, output / IMAGES)
     path = output / CONFIG
     if not path.exists():
         write_json({"format": FORMAT, **config}, path)

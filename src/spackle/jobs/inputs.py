@@ -100,6 +100,14 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         yield
 
 
+def remove_half_written(*folders: Path) -> None:
+    """Delete what killed runs left of any file; for folders in which nobody else is at work (see `alone_in`)."""
+    for folder in folders:
+        for file in folder.iterdir():
+            if LEFTOVER.fullmatch(file.name):
+                file.unlink(missing_ok=True)
+
+
 def _remove_leftovers(folder: Path, files: Sequence[str]) -> None:
     """Delete temporary files of these names; others may belong to a run that is still at work."""
     wanted = set(files)

@@ -29,7 +29,7 @@ def shared_digest(options: PredictOptions) -> str:
     for name in IRRELEVANT:
         del choices[name]
     choices |= {"spackle": spackle.__version__, "residual": options.residual_weights}
-    return _digest([choices, *(file and fingerprint(file, kind) for kind, file in files.items())])
+    return digest_of([choices, *(file and fingerprint(file, kind) for kind, file in files.items())])
 
 
 def request_of(photo: Path, options: PredictOptions, shared: str) -> str:
@@ -43,7 +43,7 @@ def request_of(photo: Path, options: PredictOptions, shared: str) -> str:
         depth = find_depth(options.depth, photo)
         files.append(fingerprint(depth, "depth map"))
         files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
-    return _digest([shared, *files])
+    return digest_of([shared, *files])
 
 
 def fingerprint(file: Path, kind: str) -> str:
@@ -58,5 +58,6 @@ def fingerprint(file: Path, kind: str) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
-def _digest(value: object) -> str:
+def digest_of(value: object) -> str:
+    """SHA-256 of a value as JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

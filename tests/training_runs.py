@@ -1,0 +1,38 @@
+"""Training runs as processes of their own, and what they leave."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from spackle.training.checkpoint import Checkpoint, load_checkpoint
+
+
+def state(folder: Path) -> Checkpoint:
+    checkpoint, _ = load_checkpoint(folder)
+    assert checkpoint is not None
+    return checkpoint
+
+
+def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
+    """A command in a process of its own, with something done before it."""
+    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def killed_at(number: int) -> str:
+    """Code for `started`: the process is killed when a step begins."""
+    return f"""
+import os
+from spackle.training.loop import Trainer
+step = Trainer.step
+Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
+"""
