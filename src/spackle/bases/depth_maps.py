@@ -40,6 +40,7 @@ class DepthMap:
     quantum: float | None  # step of integer values: metres of depth, or 1/m of inverse depth
     quantity: Literal["depth", "disparity"]  # what was stored, hence the unit of `quantum`
     path: Path
+    note: str = ""  # for the report: what a photo's own depth map was
 
     def check_shape(self, height: int, width: int, photo: StrPath) -> None:
         """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
@@ -92,7 +93,7 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {values.size} pixels has a {quantity}")
     integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
-    step = _step(values[known.numpy()]) if integers else None
+    step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
     K = None if lens is None else lens.K
     return DepthMap(metres.where(known, 0.0), known, K, quantum, quantity, Path(path))
@@ -208,7 +209,7 @@ def _as_disparity(stored: Array, is_png: bool, lens: _Calibration, path: StrPath
     return depth, valid & np.isfinite(depth), lens.scale / (lens.baseline_m * lens.focal_px)
 
 
-def _step(values: Array) -> float | None:
+def grid_step(values: Array) -> float | None:
     """The grid of whole numbers that all values lie on; None where one is not whole."""
     if values.max() > 1 << 53 or not np.array_equal(values, np.round(values)):
         return None

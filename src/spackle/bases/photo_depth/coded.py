@@ -1,0 +1,122 @@
+"""Depth as a photo stores it: a picture of codes, and what the codes mean."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+import warnings
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from spackle.bases.depth_maps import ASPECT_TOLERANCE, grid_step
+from spackle.bases.photo_depth.turn import UPRIGHT, Turn
+from spackle.errors import reason_in_a_line
+from spackle.image import LENSES, MAX_PIXELS
+
+Array = NDArray[Any]
+
+
+class BrokenDepth(Exception):
+    """A photo has a depth map that cannot be used; the message completes "the depth map in the photo …"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """Codes to values, along a straight line."""
+
+    quantity: Literal["depth", "disparity"]
+    first: float  # value of the lowest code: metres of depth, or 1/m of disparity
+    last: float  # value of the highest code
+    lowest: float = 0.0
+    highest: float | None = None  # None: the highest that the picture's format has
+
+    def decode(self, codes: Array, full: int) -> tuple[Array, float | None]:
+        """Depth in metres, not above zero where unknown, and the step between two neighbouring codes in use.
+
+        Args:
+            codes: [H, W] whole numbers.
+            full: the highest code of the picture's format.
+        """
+        highest = full if self.highest is None else self.highest
+        if not all(map(math.isfinite, (self.first, self.last, self.lowest, highest))) or highest <= self.lowest:
+            raise BrokenDepth("does not say what its values mean: a number of its range makes no sense")
+        if self.first == self.last or max(self.first, self.last) <= 0:
+            raise BrokenDepth(f"announces a {self.quantity} from {self.first:g} to {self.last:g}")
+        if int(codes.min()) == int(codes.max()):
+            raise BrokenDepth("has the same value everywhere")
+        slope = (self.last - self.first) / (highest - self.lowest)
+        grid = grid_step(codes)
+        step = None if grid is None else abs(slope) * grid
+        with np.errstate(all="ignore"):  # what comes out infinite is marked by the caller
+            values = self.first + slope * (codes.astype(np.float64) - self.lowest)
+            if self.quantity == "depth":
+                return values, step
+            # Not above zero is the horizon and what noise has pushed beyond it: far, but not unknown.
+            return 1 / np.maximum(values, abs(slope) / 2), step
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """Intrinsics in pixels of a picture of this size."""
+
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[float, float]  # (width, height)
+
+    def matrix(self, width: int, height: int) -> Tensor | None:
+        """[3, 3] for a width×height map; None where the numbers cannot be this map's: the photo's own lens counts."""
+        numbers = (*self.focal, *self.center, *self.size)
+        if not all(map(math.isfinite, numbers)) or min(self.size) <= 0:
+            return None
+        shortest, longest = (lens * max(self.size) for lens in LENSES)
+        believable = all(shortest <= focal <= longest for focal in self.focal)
+        inside = all(0 < center < side for center, side in zip(self.center, self.size, strict=True))
+        fits = abs(self.size[0] * height / (self.size[1] * width) - 1) <= ASPECT_TOLERANCE
+        if not (believable and inside and fits):
+            return None
+        x, y = width / self.size[0], height / self.size[1]
+        fx, fy, cx, cy = self.focal[0] * x, self.focal[1] * y, self.center[0] * x, self.center[1] * y
+        return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclasses.dataclass(frozen=True)
+class CodedDepth:
+    """A depth map as it lies in the file."""
+
+    codes: Array  # [H, W] whole numbers
+    full: int  # the highest code of the picture's format
+    scale: Scale
+    source: str  # whose layout, of what quantity, how far to be trusted: for the report
+    lens: Lens | None = None
+    turned: Turn = UPRIGHT  # what the decoder has done to the codes, but not to the lens
+    turn: Turn = UPRIGHT  # what is still to do to get to the photo as Pillow opens it
+    along_ray: bool = False  # distances from the eye instead of z
+    unit_known: bool = True
+
+
+def read_codes(picture: bytes) -> tuple[Array, int]:
+    """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # broken EXIF of a depth map: not worth a line
+            with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+                check_pixels(*image.size)
+                if image.mode.startswith("I"):
+                    return np.asarray(image).astype(np.uint16), 65535
+                return np.asarray(image.convert("L")), 255
+    except BrokenDepth:
+        raise
+    except Exception as error:  # a decoder at work on a stranger's bytes raises anything
+        raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
+
+
+def check_pixels(width: int, height: int) -> None:
+    """BrokenDepth unless a map of this size may be decoded."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise BrokenDepth(f"is {width}×{height}, and at most 100 megapixels are read")
