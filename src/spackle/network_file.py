@@ -1,0 +1,43 @@
+"""A network's weights out of a safetensors file."""
+
+from __future__ import annotations
+
+import os
+from typing import TypeVar
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import nn
+
+from spackle.errors import InputError
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def read_network(network: Network, path: str | os.PathLike[str], what: str, otherwise: str) -> Network:
+    """Fill a network from a file, ready to be asked; half precision is widened to single.
+
+    Args:
+        network: of the architecture that the file is for.
+        path: the file.
+        what: for messages: whose weights they are.
+        otherwise: for messages: what to give in place of a file that is missing.
+
+    Raises:
+        InputError: a missing or broken file, or weights of another architecture.
+    """
+    if not os.path.isfile(path):
+        raise InputError(f"{what} weights {path} not found: give {otherwise}")
+    try:
+        tensors = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{what} weights {path} are not readable as safetensors: {error}") from error
+    expected = network.state_dict()
+    wrong = sorted(name for name in expected.keys() & tensors.keys() if expected[name].shape != tensors[name].shape)
+    wrong += sorted(expected.keys() ^ tensors.keys())
+    if wrong:
+        raise InputError(f"{what} weights {path} are of another network: {len(wrong)} tensors differ, e.g. {wrong[0]}")
+    network.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+    return network.eval().requires_grad_(False)
