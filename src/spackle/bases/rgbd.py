@@ -6,12 +6,16 @@ import dataclasses
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, undo_quantisation
 from spackle.bases.depth_maps import DepthMap
+from spackle.bases.edges import find_edges
 from spackle.bases.missing import fill_missing
+from spackle.bases.noise import smooth_noise
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sharpen import settle
+from spackle.bases.sky import push_sky
+from spackle.bases.upsample import sample
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
@@ -66,9 +70,9 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         depth: any size of the same aspect ratio.
         camera: the photo's camera, at the world's origin.
     """
-    inverse_depth, valid = _inverse_depth(depth, camera.height, camera.width)
-    missing = 1.0 - float(valid.float().mean())
-    inverse_depth = fill_missing(inverse_depth, rgb, valid)
+    sky = push_sky(*_inverse_depth(depth, rgb, camera))
+    missing = 1.0 - float(sky.known.float().mean())
+    inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
     colors = srgb_to_linear(rgb)
@@ -76,21 +80,30 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
     )
     notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
+    if sky.share:
+        notes["sky"] = round(sky.share, 4)
     if depth.depth.shape != inverse_depth.shape:
         notes["depth_resampled_from"] = f"{depth.depth.shape[1]}×{depth.depth.shape[0]}"
     return BasePrediction(gaussians, camera, notes)
 
 
-def _inverse_depth(depth: DepthMap, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Inverse depth and its validity on the photo's grid, [H, W]; nearest, so that edges stay edges."""
+def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse depth on the photo's grid [H, W], the photo, and where the depth is known [H, W].
+
+    Noise is evened out in the map as it came; then every smeared or resampled edge is moved to where
+    the photo has it. A clean map of the photo's size stays as it is.
+    """
     inverse = torch.where(depth.valid, 1.0 / depth.depth, torch.zeros_like(depth.depth))
     if depth.quantity == "disparity" and depth.quantum is not None:
         inverse = undo_quantisation(inverse, depth.valid, depth.quantum)
-    if inverse.shape == (height, width):
-        return inverse, depth.valid
-    stacked = torch.stack([inverse, depth.valid.float()])[None]
-    resized = interpolate(stacked, size=(height, width), mode="nearest-exact")[0]
-    return resized[0], resized[1] > 0.5
+    known = depth.valid.contiguous().numpy()
+    smooth = smooth_noise(inverse.contiguous().numpy(), known)
+    rows, columns = known.shape
+    fx, fy = camera.focal
+    edges = find_edges(smooth, known, (fx * columns / camera.width, fy * rows / camera.height))
+    sampled = sample(smooth, known, edges, camera.height, camera.width)
+    settled, found = settle(sampled, rgb.contiguous().numpy())
+    return torch.from_numpy(settled), rgb, torch.from_numpy(found)
 
 
 def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:

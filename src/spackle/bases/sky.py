@@ -1,0 +1,149 @@
+"""The sky: one distance for all of it, behind everything else."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from spackle._numba import kernel
+from spackle.surface import EDGE
+
+NEAR_QUANTILE = 0.9  # of the inverse depth: what counts as the scene's near side
+FAR_QUANTILE = 0.05  # and as its far side
+FAR = 0.1  # at the photo's border a sky is at least ten times as far away as the near side
+GETS_NEAR = 0.25  # and nowhere nearer than this: a predicted sky often sinks towards the horizon
+LEVEL = 0.02  # and no nearer than the far side of all else, by no more than this in units of the near side
+OUTDOORS_M = 10.0  # where the sky's own depth is unknown, what else is far must be farther than rooms are long
+BRIGHT = 0.6  # sRGB; a sky is that bright, or blue
+DIM = 0.35  # and may go on in clouds as dark as that
+BLUE, DARKEST_BLUE = 1.1, 0.25  # blue over red, and the least blue
+SMOOTH = 0.12  # largest change between neighbouring pixels of the sky, sum of the channels
+LEAST_SHARE = 0.01  # of the photo
+MOST_NEAR = 0.25  # of a sky may be nearer than at the border: a floor that runs to the horizon comes nearer steadily
+MOST_LEAKS = 0.1  # of a sky's outline: where it goes on nearer in the same colours, it is a floor or a ceiling
+CLOSING_PX = 2  # specks in the sky that are as far as it is, belong to it
+BEYOND = 0.1  # the sky's inverse depth, in units of the far side of all else
+CLEAR = 1.1  # and all else is at least by this factor nearer
+
+
+@dataclasses.dataclass(frozen=True)
+class Sky:
+    """A photo's inverse depth with the sky in its place."""
+
+    inverse_depth: Tensor  # [H, W]
+    known: Tensor  # [H, W] bool
+    share: float  # of the photo
+
+
+def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> Sky:
+    """Find the sky and put it at one distance, behind everything else; leave the photo as it is where none is found.
+
+    A sky begins at the photo's upper border, spreads without sharp changes, is bright or blue, and its
+    depth is unknown or among the farthest: what is as near as the rest is a wall or a ceiling, whatever
+    its colour. One distance, because a sky whose depth varies swims as the camera moves.
+
+    Args:
+        inverse_depth: [H, W], positive where known.
+        rgb: [H, W, 3] sRGB.
+        known: [H, W] bool.
+    """
+    nothing = Sky(inverse_depth, known, 0.0)
+    near = _quantile(inverse_depth, known, NEAR_QUANTILE)
+    far = ~known | (inverse_depth <= FAR * near)
+    if not far[0].any():
+        return nothing
+    reach = known & (inverse_depth <= GETS_NEAR * near)
+    sky = _spread(rgb, far & _looks(rgb, BRIGHT), reach & _looks(rgb, DIM))
+    rest = known & ~sky
+    if float(sky.float().mean()) < LEAST_SHARE or not rest.any():
+        return nothing
+    horizon = _quantile(inverse_depth, rest, FAR_QUANTILE)
+    if not _stands_behind(sky, inverse_depth, known, near, horizon) or _leaks(sky, inverse_depth, rgb, known):
+        return nothing
+    sky |= _closed(sky) & reach
+    distance = BEYOND * min(horizon, FAR * near)
+    inverse_depth = torch.where(sky, distance, torch.where(known, inverse_depth.clamp_min(CLEAR * distance), 0.0))
+    return Sky(inverse_depth, known | sky, float(sky.float().mean()))
+
+
+def _quantile(inverse_depth: Tensor, where: Tensor, q: float) -> float:
+    """Of up to a hundred thousand of the pixels: enough, and soon sorted."""
+    values = inverse_depth[where]
+    return float(values[:: 1 + len(values) // 100_000].quantile(q)) if len(values) else 0.0
+
+
+def _looks(rgb: Tensor, bright: float) -> Tensor:
+    """[H, W] bool: bright, or blue."""
+    red, green, blue = rgb.unbind(-1)
+    is_blue = (blue >= BLUE * red) & (blue >= green) & (blue > DARKEST_BLUE)
+    return (rgb.amin(-1) > bright) | is_blue
+
+
+def _spread(rgb: Tensor, strict: Tensor, lenient: Tensor) -> Tensor:
+    """What smooth steps connect to strict candidates on the upper border, through candidates of either kind."""
+    arrays = (rgb, strict[0], strict | lenient)
+    return torch.from_numpy(_flood(*(a.contiguous().numpy() for a in arrays)))
+
+
+@kernel
+def _flood(rgb: Any, first_row: Any, candidates: Any) -> Any:
+    height, width = candidates.shape
+    found = np.zeros((height, width), np.bool_)
+    stack = np.empty(height * width, np.int64)
+    count = 0
+    for x in range(width):
+        if first_row[x]:
+            found[0, x] = True
+            stack[count] = x
+            count += 1
+    while count:
+        count -= 1
+        y, x = stack[count] // width, stack[count] % width
+        for k in range(4):
+            v, u = y + (k == 0) - (k == 1), x + (k == 2) - (k == 3)
+            if v < 0 or u < 0 or v >= height or u >= width or found[v, u] or not candidates[v, u]:
+                continue
+            change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
+            if change + abs(rgb[y, x, 2] - rgb[v, u, 2]) <= SMOOTH:
+                found[v, u] = True
+                stack[count] = v * width + u
+                count += 1
+    return found
+
+
+def _stands_behind(sky: Tensor, inverse_depth: Tensor, known: Tensor, near: float, horizon: float) -> bool:
+    """Whether the sky is about as far as the far side of all else; where it has no depth, whether that side is far."""
+    depths = inverse_depth[sky & known]
+    if 2 * len(depths) < int(sky.sum()):
+        return horizon * OUTDOORS_M <= 1
+    middle = float(depths.median())
+    return middle <= horizon + LEVEL * near and float((depths > FAR * near).float().mean()) <= MOST_NEAR
+
+
+def _leaks(sky: Tensor, inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> bool:
+    """Whether what has been left out of the sky for its depth alone goes on as the sky does."""
+    looks, outline, leaks = _looks(rgb, DIM), 0, 0
+    for axis in (0, 1):
+        size = sky.shape[axis] - 1
+        for one, other in ((0, 1), (1, 0)):
+            inside, outside = (
+                [t.narrow(axis, start, size) for t in (sky, inverse_depth, rgb, known, looks)] for start in (one, other)
+            )
+            rim = inside[0] & ~outside[0]
+            alike = ((inside[2] - outside[2]).abs().sum(-1) <= SMOOTH) & outside[4] & outside[3]
+            continues = ~inside[3] | (outside[1] - inside[1] <= EDGE * outside[1])
+            outline += int(rim.sum())
+            leaks += int((rim & alike & continues).sum())
+    return leaks > MOST_LEAKS * outline
+
+
+def _closed(mask: Tensor) -> Tensor:
+    """A mask with its narrow gaps closed."""
+    size = 2 * CLOSING_PX + 1
+    grown = max_pool2d(mask.float()[None, None], size, stride=1, padding=CLOSING_PX)
+    return -max_pool2d(-grown, size, stride=1, padding=CLOSING_PX)[0, 0] > 0

@@ -1,0 +1,117 @@
+"""The sky of a photo: found only where depth and colour agree, and then at one distance behind everything."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from plain_cleanup import plain_flood
+from scenes import Scene, motorcycle_base, slanted_plane, texture
+from torch import Tensor
+
+from spackle.bases import sky
+from spackle.bases.sky import push_sky
+from spackle.camera import Camera
+
+
+@dataclasses.dataclass(frozen=True)
+class Outdoors:
+    """A field, a house, a flagpole and a sky, as a network sees them."""
+
+    scene: Scene
+    sky: Tensor  # [H, W] bool
+    pole: Tensor  # [H, W] bool
+
+
+def outdoors(sky_depth: Tensor | float = 80.0, height: int = 96, width: int = 128) -> Outdoors:
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    inverse = torch.where(y > height // 2, 0.01 * (y - height // 2), 1 / torch.as_tensor(sky_depth))
+    blue = torch.tensor([0.35, 0.55, 0.9]) + 0.02 * texture(height, width)
+    rgb = torch.where((y > height // 2)[..., None], texture(height, width, (0.35, 0.4, 0.2)), blue)
+    house, pole = (x > 20) & (x < 50) & (y > 30) & (y < 60), (x >= 90) & (x < 92) & (y > 10) & (y < 80)
+    for thing, inverse_depth, color in ((house, 0.1, (0.5, 0.3, 0.25)), (pole, 0.2, (0.2, 0.2, 0.2))):
+        inverse = torch.where(thing, inverse_depth, inverse)
+        rgb = torch.where(thing[..., None], torch.tensor(color), rgb)
+    sky_mask = (y <= height // 2) & ~house & ~pole
+    return Outdoors(Scene(rgb.float(), 1 / inverse, Camera.from_focal(100, width, height)), sky_mask, pole)
+
+
+def test_the_sky_is_one_plane_behind_everything() -> None:
+    """However its predicted depth varies."""
+    waves = 80 + 40 * texture(96, 128)[..., 0].sub(0.5).mul(10)
+    found = outdoors(waves)
+    base = found.scene.lift()
+    z = base.gaussians.means[: 96 * 128, 2].reshape(96, 128)
+    assert base.notes["sky"] == pytest.approx(float(found.sky.float().mean()), abs=0.01)
+    assert float(z[found.sky].max() / z[found.sky].min()) < 1 + 1e-5
+    assert float(z[~found.sky].max()) < float(z[found.sky].min())
+    torch.testing.assert_close(z[found.pole], torch.full_like(z[found.pole], 5.0))
+
+
+def test_a_sky_without_depth_is_far_and_not_as_near_as_the_roofs() -> None:
+    found = outdoors()
+    unknown = dataclasses.replace(found.scene, depth=torch.where(found.sky, 0.0, found.scene.depth)).lift()
+    z = unknown.gaussians.means[: 96 * 128, 2].reshape(96, 128)
+    assert float(z[found.sky].min()) > 100
+    assert unknown.notes["depth_filled"] == 0
+    near = dataclasses.replace(found.scene, depth=torch.where(found.sky, 0.0, 0.1 * found.scene.depth))
+    assert "sky" not in near.lift().notes  # a model on a table, or a room: what is unknown there is filled
+
+
+def room(height: int = 96, width: int = 128) -> Scene:
+    """A white ceiling and wall above a brown floor."""
+    y = torch.arange(height)[:, None].expand(height, width)
+    inverse = torch.maximum(0.006 * (y - height / 2).abs(), torch.tensor(0.2))
+    rgb = torch.where((y < 64)[..., None], torch.full((3,), 0.92), texture(height, width, (0.45, 0.3, 0.2)))
+    return Scene(rgb, 1 / inverse, Camera.from_focal(100, width, height))
+
+
+def test_a_white_ceiling_is_no_sky() -> None:
+    scene = room()
+    assert "sky" not in scene.lift().notes
+    unknown = torch.where(torch.arange(96)[:, None] < 40, 0.0, scene.depth)
+    assert "sky" not in dataclasses.replace(scene, depth=unknown).lift().notes
+    assert "sky" not in motorcycle_base().notes
+
+
+def test_a_floor_that_runs_to_the_horizon_is_no_sky() -> None:
+    """A lake or a field of snow: at the photo's border as far and as bright as any sky."""
+    scene = slanted_plane(1.5, 1000, 0)
+    for color in ((0.4, 0.55, 0.8), (0.95, 0.95, 0.97)):
+        rgb = torch.tensor(color).expand(*scene.depth.shape, 3) + 0.02 * texture(*scene.depth.shape)
+        assert "sky" not in dataclasses.replace(scene, rgb=rgb.clamp(0, 1)).lift().notes
+    assert "sky" not in scene.lift().notes  # spots of it are blue
+
+
+@pytest.mark.parametrize("color", [(0.3, 0.45, 0.2), (0.5, 0.4, 0.3), (0.1, 0.1, 0.15)])
+def test_what_is_far_without_looking_like_a_sky_stays_where_it_is(color: tuple[float, float, float]) -> None:
+    found = outdoors()
+    rgb = torch.where(found.sky[..., None], torch.tensor(color), found.scene.rgb)
+    prediction = dataclasses.replace(found.scene, rgb=rgb).lift()
+    assert "sky" not in prediction.notes
+    z = prediction.gaussians.means[: 96 * 128, 2].reshape(96, 128)
+    torch.testing.assert_close(z[:28], torch.full_like(z[:28], 80.0).where(~found.pole[:28], z[:28]))
+
+
+def test_specks_in_the_sky_belong_to_it_and_a_lake_does_not() -> None:
+    found = outdoors()
+    rgb = found.scene.rgb.clone()
+    rgb[20, 60:62] = 0.1  # birds, which the depth does not know
+    rgb[70:90, 60:80] = torch.tensor([0.35, 0.55, 0.9])
+    pushed = push_sky(1 / found.scene.depth, rgb, torch.ones(96, 128, dtype=torch.bool))
+    far = pushed.inverse_depth == pushed.inverse_depth.min()
+    assert bool(far[20, 60:62].all())
+    assert not bool(far[49:].any())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_flood_matches_growing_by_rings(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    rgb = (0.5 + 0.03 * generator.standard_normal((15, 20, 3))).astype(np.float32)
+    candidates = generator.random((15, 20)) < 0.8
+    first = candidates[0] & (generator.random(20) < 0.5)
+    found = sky._flood(rgb, first, candidates)
+    assert found[5:].any()
+    assert np.array_equal(found, plain_flood(rgb, first, candidates))
