@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from spackle.bases.sharp.device import enough_memory, pick_device
+from spackle.bases.device import enough_memory, pick_device
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import working_size

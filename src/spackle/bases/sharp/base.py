@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from spackle.bases.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput
 from spackle.bases.sharp.start import compose
 from spackle.bases.sharp.unproject import stretch_gaussians

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from spackle.bases.device import enough_memory
 from spackle.bases.sharp.config import CONFIGS, SharpConfig
 from spackle.bases.sharp.decoder_file import owner_of, with_owner
-from spackle.bases.sharp.device import enough_memory
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.tensor_file import plain_text, read_tensors

@@ -12,7 +12,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from spackle.bases.sharp.device import enough_memory
+from spackle.bases.device import enough_memory
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 

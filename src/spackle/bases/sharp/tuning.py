@@ -8,9 +8,9 @@ import os
 import torch
 from torch import Tensor, nn
 
+from spackle.bases.device import own_arithmetic
 from spackle.bases.sharp.base import WINDOWS_AT_ONCE, WINDOWS_AT_ONCE_GPU, to_square
 from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.device import own_arithmetic
 from spackle.bases.sharp.network import Seen, SharpNetwork
 from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.start import compose

@@ -1,4 +1,4 @@
-"""Where SHARP runs: on which device, with how much memory, and untouched by settings that the caller has for others."""
+"""Where a network runs: on which device, with how much memory, untouched by settings that a caller has for others."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from spackle.errors import InputError
 _SHORTAGES = (
     "DefaultCPUAllocator",
     "not enough memory",
-    "Cannot allocate memory",  # the system, when a file is to be mapped
+    "allocate memory",  # the system, when a file is to be mapped; and torch
     "out of memory",  # CUDA outside torch's allocator
     "_ALLOC_FAILED",  # cuBLAS and cuDNN
 )
+
+
+class MemoryShort(InputError):
+    """There was too little memory; the next time there may be enough."""
 
 
 def pick_device(device: torch.device | str | None) -> torch.device:
     """The device that a caller means: for None a CUDA device where there is one, else the processor.
 
     Raises:
-        InputError: a device that is not there, or one of a kind that SHARP does not run on.
+        InputError: a device that is not there, or one of a kind that networks do not run on here.
     """
     present = torch.cuda.is_available()
     if device is None:
@@ -34,12 +38,18 @@ def pick_device(device: torch.device | str | None) -> torch.device:
     except (RuntimeError, TypeError) as error:
         raise InputError(f"{shown}: there is no such device: give cpu or cuda") from error
     if target.type not in ("cpu", "cuda"):
-        raise InputError(f"{shown}: SHARP does not run there: give cpu or cuda")
+        raise InputError(f"{shown}: networks do not run there: give cpu or cuda")
     if target.type == "cuda" and not present:
         raise InputError(f"{shown}: torch finds no CUDA device: give cpu, or install a torch and a driver for CUDA")
     if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
         raise InputError(f"{shown}: the last CUDA device is cuda:{torch.cuda.device_count() - 1}: give that or another")
     return target
+
+
+def memory_is_short(error: BaseException) -> bool:
+    """Whether that is what an exception says, in one of torch's many ways."""
+    named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+    return named or any(words in str(error) for words in _SHORTAGES)
 
 
 @contextmanager
@@ -50,15 +60,15 @@ def enough_memory(*advice: str) -> Iterator[None]:
         advice: what to do about it; closing other programs is always named.
 
     Raises:
-        InputError: memory was short.
+        MemoryShort: memory was short.
     """
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-        if not named and not any(words in str(error) for words in _SHORTAGES):
+        if not memory_is_short(error):
             raise
-        raise InputError(f"not enough memory for SHARP: {', or '.join([*advice, 'close other programs'])}") from error
+        remedies = ", or ".join([*advice, "close other programs"])
+        raise MemoryShort(f"not enough memory for the network: {remedies}") from error
 
 
 @contextmanager
