@@ -40,6 +40,7 @@ from spackle.pseudo import PseudoFiles
 from spackle.render import get_renderer
 from spackle.render.reference import ReferenceRenderer
 from spackle.training.direct_ft import DirectFt, render_photo
+from spackle.training.learner import Learner
 from spackle.training.logs import NoLogs
 from spackle.training.loop import Trainer
 from spackle.training.pseudo_photos import VIEWS_AT_ONCE, PseudoPhotos
@@ -214,7 +215,7 @@ def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: ob
     judge = Judge(recipe.loss, None, get_renderer(), torch.float32, CPU)
     owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
     photos = PseudoPhotos.of(recipe.data, place / "data", owner.sha256)
-    method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), judge.renderer, 4, 0)
+    method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), judge, 4, 0)
     losses: list[float] = []
 
     def note(step: int, numbers: dict[str, float]) -> None:
@@ -224,8 +225,8 @@ def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: ob
         """Nobody is told."""
 
     watch = Watch(note, nothing, nothing, lambda: False)
-    decoder = base.network.gaussian_decoder().let_learn()
-    assert Trainer(recipe, method, decoder, judge, folder, NoLogs(), watch, Ranks()).run() == "steps"
+    learner = Learner(base.network.gaussian_decoder().let_learn(), recipe.optim, CPU, Ranks())
+    assert Trainer(recipe, method, learner, folder, NoLogs(), watch, Ranks()).run() == "steps"
     return losses
 
 

@@ -166,12 +166,18 @@ def test_a_completed_view_behind_the_photos_shield_shows_the_photo_as_the_base_d
 
 TWINS = {
     "_numba.py": "the decorators",
+    "bases/edges.py": "test_cleanup.py",
     "bases/missing.py": "test_rgbd.py",
+    "bases/noise.py": "test_cleanup.py",
     "bases/sharp/jacobi.py": "test_sharp_unproject.py",
+    "bases/sharpen.py": "test_cleanup.py",
+    "bases/sky.py": "test_sky.py",
+    "bases/upsample.py": "test_cleanup.py",
     "fill.py": "test_fill.py",
     "render": "test_render.py",
     "residual/carve.py": "test_residual.py",
     "residual/rim.py": "test_rim.py",
+    "training/depth/raycast.py": "test_lite_scenes.py",
 }
 
 

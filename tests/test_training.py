@@ -29,6 +29,7 @@ from spackle.residual.network import ResidualNet
 from spackle.residual.weights import load_residual
 from spackle.training.cache import load_sample, save_sample
 from spackle.training.data import SampleFiles
+from spackle.training.learner import Learner
 from spackle.training.logs import NoLogs
 from spackle.training.loop import Trainer
 from spackle.training.ranks import Ranks
@@ -389,7 +390,8 @@ def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path)
     torch.manual_seed(0)
     watch = Watch(note, nothing, nothing, lambda: False)
     method = ResidualMethod(files, judge, recipe.optim.batch)
-    trainer = Trainer(recipe, method, ResidualNet(), judge, tmp_path, NoLogs(), watch, Ranks())
+    learner = Learner(ResidualNet(), recipe.optim, judge.device, Ranks())
+    trainer = Trainer(recipe, method, learner, tmp_path, NoLogs(), watch, Ranks())
     assert trainer.run() == "steps"
     assert len(found) == 12
     assert found[-1] < 0.5 * found[0]

@@ -13,11 +13,10 @@ from spackle.errors import InputError
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.train_direct import DirectPlan
+from spackle.jobs.train_lite import LitePlan
 from spackle.jobs.train_plan import Place, Plan
 from spackle.jobs.train_residual import ResidualPlan
 from spackle.jobs.train_run import run_training
-from spackle.precision import pick_dtype
-from spackle.render import get_renderer
 from spackle.training.checkpoint import (
     BEST,
     LAST,
@@ -29,12 +28,11 @@ from spackle.training.checkpoint import (
     load_checkpoint,
     remove_run,
 )  # fmt: skip
-from spackle.training.features import load_features
+from spackle.training.depth.recipe import LiteRecipe
 from spackle.training.method import MethodName
 from spackle.training.ranks import joined_ranks
-from spackle.training.recipe import DeviceName, Recipe, plain
-from spackle.training.recipe_file import load_recipe
-from spackle.training.validation import Judge
+from spackle.training.recipe import DeviceName, plain
+from spackle.training.recipe_file import load_lite_recipe, load_recipe
 
 
 def train_recipe(
@@ -54,7 +52,7 @@ def train_recipe(
         overrides: `key=value` on top of it.
         output: a folder for all results.
         reporter: the first process speaks through it.
-        method: what learns: the residual, or the base's own decoder.
+        method: what learns: the residual, a base's own decoder, or the network of the lite base.
         checkpoint: weights of the base, where it is the base that learns.
         overwrite: start anew where `output` holds a run; the samples in it stay.
 
@@ -64,9 +62,9 @@ def train_recipe(
     Raises:
         InputError: a recipe, file or folder that cannot be used, a loss that is no number.
     """
-    if method == "residual" and checkpoint is not None:
-        raise InputError(f"-c {checkpoint}: --method residual learns without a base: leave the option out")
-    recipe = load_recipe(path, overrides)
+    if method != "direct-ft" and checkpoint is not None:
+        raise InputError(f"-c {checkpoint}: --method {method} learns without a base: leave the option out")
+    recipe = load_lite_recipe(path, overrides) if method == "lite" else load_recipe(path, overrides)
     kind = _device_kind(recipe.run.device)
     with joined_ranks(kind) as ranks:
         if recipe.optim.batch % ranks.count:
@@ -74,15 +72,20 @@ def train_recipe(
         device = torch.device(kind, ranks.local) if kind == "cuda" else torch.device(kind)
         with _results(output) if ranks.first else contextlib.nullcontext():
             speaker = reporter if ranks.first else Reporter(console=Console(quiet=True))
-            place = Place(recipe, output, speaker, ranks, device, _judge(recipe, device))
             # Everything that can be refused is refused before long work begins.
-            plan: Plan = ResidualPlan.of(place) if method == "residual" else DirectPlan.of(place, checkpoint)
-            found = None if overwrite else _checkpoint(place, plan)
+            plan: Plan
+            if isinstance(recipe, LiteRecipe):
+                plan = LitePlan.of(Place(recipe, output, speaker, ranks, device))
+            elif method == "direct-ft":
+                plan = DirectPlan.of(Place(recipe, output, speaker, ranks, device), checkpoint)
+            else:
+                plan = ResidualPlan.of(Place(recipe, output, speaker, ranks, device))
+            found = None if overwrite else _checkpoint(plan)
             start = plan.start()
             ranks.wait()  # nobody looks for checkpoints any more
             if overwrite and ranks.first:
                 remove_run(output)
-            return run_training(place, start, found)
+            return run_training(plan.place, start, found)
 
 
 @contextlib.contextmanager
@@ -92,15 +95,9 @@ def _results(output: Path) -> Iterator[None]:
         yield
 
 
-def _judge(recipe: Recipe, device: torch.device) -> Judge:
-    """The recipe's loss; InputError where its feature network cannot be read."""
-    loss = recipe.loss
-    features = load_features(loss.features if loss.perceptual else "none", loss.features_path, device)
-    return Judge(loss, features, get_renderer(), pick_dtype(recipe.optim.precision, device), device)
-
-
-def _checkpoint(place: Place, plan: Plan) -> Checkpoint | None:
+def _checkpoint(plan: Plan) -> Checkpoint | None:
     """The one to go on from; InputError where the folder holds another run."""
+    place = plan.place
     checkpoint, problem = load_checkpoint(place.output)
     if checkpoint is None:
         return None

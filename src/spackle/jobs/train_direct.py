@@ -12,24 +12,28 @@ from spackle.bases.sharp.tuning import TunableSharp
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.jobs.dataset_options import weights_digest
+from spackle.jobs.train_judge import feature_name, judge_of
 from spackle.jobs.train_plan import Place, Start, parameters
 from spackle.training.direct_ft import DirectFt
 from spackle.training.method import MethodName
 from spackle.training.pseudo_photos import VIEWS_AT_ONCE, PseudoPhotos, only_dataset
+from spackle.training.recipe import Recipe
+from spackle.training.validation import Judge
 
 
 @dataclasses.dataclass(frozen=True)
 class DirectPlan:
     """A checkpoint and a dataset that belong together; the network is not loaded."""
 
-    place: Place
+    place: Place[Recipe]
+    judge: Judge
     owner: Owner
     photos: PseudoPhotos
 
     name: ClassVar[MethodName] = "direct-ft"
 
     @staticmethod
-    def of(place: Place, checkpoint: Path | None) -> DirectPlan:
+    def of(place: Place[Recipe], checkpoint: Path | None) -> DirectPlan:
         """Look at the files.
 
         Args:
@@ -39,7 +43,7 @@ class DirectPlan:
         Raises:
             InputError: a recipe, checkpoint or dataset that cannot be used.
         """
-        recipe, least = place.recipe, VIEWS_AT_ONCE * place.ranks.count
+        judge, recipe, least = judge_of(place), place.recipe, VIEWS_AT_ONCE * place.ranks.count
         if recipe.optim.batch % least:
             raise InputError(
                 f"optim.batch={recipe.optim.batch}: with --method direct-ft each process takes {VIEWS_AT_ONCE} views "
@@ -49,7 +53,7 @@ class DirectPlan:
             raise InputError(f"init={recipe.init}: --method direct-ft starts from SHARP's checkpoint: leave it out")
         data = only_dataset(recipe.data)
         owner = _owner(checkpoint)
-        return DirectPlan(place, owner, PseudoPhotos.of(recipe.data, data, owner.sha256))
+        return DirectPlan(place, judge, owner, PseudoPhotos.of(recipe.data, data, owner.sha256))
 
     @property
     def digest(self) -> str:
@@ -58,18 +62,19 @@ class DirectPlan:
 
     def start(self) -> Start:
         """Load SHARP."""
-        recipe, judge = self.place.recipe, self.place.judge
+        recipe, judge = self.place.recipe, self.judge
         base = TunableSharp.load(self.owner.path, judge.precision, judge.device)
         decoder = base.network.gaussian_decoder().let_learn()
         counts = parameters(base.network)
-        method = DirectFt(base, self.owner, self.photos, judge.renderer, recipe.optim.batch, recipe.run.seed)
+        method = DirectFt(base, self.owner, self.photos, judge, recipe.optim.batch, recipe.run.seed)
         self.place.reporter.say(
             f"{method.items} photos to learn from, {method.judged_items} to be judged by; "
             f"{counts['learn']:,} weights of SHARP learn, {counts['stay']:,} stay"
         )
         samples = {"train": method.items, "validation": method.judged_items, "digest": self.digest}
         weights = {"file": self.owner.path.name, "sha256": self.owner.sha256}
-        return Start(method, decoder, {"samples": samples, "parameters": counts, "checkpoint": weights})
+        facts = {"features": feature_name(judge), "samples": samples, "parameters": counts, "checkpoint": weights}
+        return Start(method, decoder, facts)
 
 
 def _owner(checkpoint: Path | None) -> Owner:

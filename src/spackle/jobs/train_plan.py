@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import nn
 
 from spackle.jobs.progress import Reporter
+from spackle.precision import pick_dtype
+from spackle.training.learner import even
 from spackle.training.method import Method, MethodName
 from spackle.training.ranks import Ranks
-from spackle.training.recipe import Recipe
-from spackle.training.validation import Judge
+from spackle.training.recipe import AnyRecipe
+
+R_co = TypeVar("R_co", bound=AnyRecipe, covariant=True)
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class Place(Generic[R_co]):
     """A recipe and where it is followed."""
 
-    recipe: Recipe
+    recipe: R_co
     output: Path
     reporter: Reporter  # silent but in the first process
     ranks: Ranks
     device: torch.device  # of the networks
-    judge: Judge
+
+    @property
+    def precision(self) -> torch.dtype:
+        """What the networks compute in."""
+        return pick_dtype(self.recipe.optim.precision, self.device)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +43,15 @@ class Start:
     method: Method
     network: nn.Module
     facts: dict[str, Any]  # about it, for run.json
+    pace: Callable[[str], float] = even  # of each weight, see `Learner`
 
 
 class Plan(Protocol):
     """What can be refused at once has been; the long work is still to come."""
+
+    @property
+    def place(self) -> Place[AnyRecipe]:
+        """Of the run."""
 
     @property
     def name(self) -> MethodName:

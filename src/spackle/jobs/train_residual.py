@@ -9,6 +9,7 @@ import torch
 
 from spackle.jobs.inputs import make_folder
 from spackle.jobs.progress import Reporter
+from spackle.jobs.train_judge import feature_name, judge_of
 from spackle.jobs.train_plan import Place, Start, parameters
 from spackle.residual.network import ResidualNet
 from spackle.residual.weights import load_residual
@@ -16,6 +17,7 @@ from spackle.training.data import SampleFiles, Supply
 from spackle.training.method import MethodName
 from spackle.training.recipe import Recipe
 from spackle.training.residual_method import ResidualMethod
+from spackle.training.validation import Judge
 
 CACHE = "cache"  # in the output, where the recipe names no other place
 
@@ -24,17 +26,19 @@ CACHE = "cache"  # in the output, where the recipe names no other place
 class ResidualPlan:
     """Files were found, no sample is made."""
 
-    place: Place
+    place: Place[Recipe]
+    judge: Judge
     network: ResidualNet
     supply: Supply
 
     name: ClassVar[MethodName] = "residual"
 
     @staticmethod
-    def of(place: Place) -> ResidualPlan:
+    def of(place: Place[Recipe]) -> ResidualPlan:
         """Look for a recipe's files; InputError where they cannot be used."""
+        judge = judge_of(place)
         network = _first_network(place.recipe).requires_grad_()
-        return ResidualPlan(place, network, Supply.of(place.recipe.data, place.judge.renderer))
+        return ResidualPlan(place, judge, network, Supply.of(place.recipe.data, judge.renderer))
 
     @property
     def digest(self) -> str:
@@ -44,9 +48,10 @@ class ResidualPlan:
     def start(self) -> Start:
         """Make the samples that are missing."""
         samples, place = self._samples(), self.place
-        method = ResidualMethod(samples, place.judge, place.recipe.optim.batch, place.ranks.count)
+        method = ResidualMethod(samples, self.judge, place.recipe.optim.batch, place.ranks.count)
         counts = {"train": len(samples.train), "validation": len(samples.validation), "digest": samples.digest}
-        return Start(method, self.network, {"samples": counts, "parameters": parameters(self.network)})
+        facts = {"features": feature_name(self.judge), "samples": counts, "parameters": parameters(self.network)}
+        return Start(method, self.network, facts)
 
     def _samples(self) -> SampleFiles:
         """Made by the first process, found by the others."""

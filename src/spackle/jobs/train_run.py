@@ -11,9 +11,11 @@ from spackle.jobs.report import write_report
 from spackle.jobs.stopping import asked_to_stop
 from spackle.jobs.train_plan import Place, Start
 from spackle.training.checkpoint import LOGS, RUN, Checkpoint, Progress
+from spackle.training.learner import Learner
 from spackle.training.logs import NoLogs, open_logs
 from spackle.training.loop import Trainer
-from spackle.training.recipe import plain
+from spackle.training.method import Method
+from spackle.training.recipe import AnyRecipe, plain
 from spackle.training.watch import Watch
 
 _END = {
@@ -23,7 +25,7 @@ _END = {
 }
 
 
-def run_training(place: Place, begin: Start, checkpoint: Checkpoint | None) -> str:
+def run_training(place: Place[AnyRecipe], begin: Start, checkpoint: Checkpoint | None) -> str:
     """Train, from the first step or from a checkpoint's; returns why it ended, as `Trainer.run` has it.
 
     Raises:
@@ -38,7 +40,7 @@ def run_training(place: Place, begin: Start, checkpoint: Checkpoint | None) -> s
         write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), place.output / RUN)
 
     def validated(progress: Progress) -> None:
-        say(_summary(progress))
+        say(_summary(progress, begin.method))
         write(progress)
 
     with (
@@ -47,7 +49,8 @@ def run_training(place: Place, begin: Start, checkpoint: Checkpoint | None) -> s
         asked_to_stop(alone=ranks.count == 1) as stop,
     ):
         watch = Watch(lambda step, numbers: tell(step, f"loss {numbers['loss']:.4f}"), validated, write, stop)
-        trainer = Trainer(recipe, begin.method, begin.network, place.judge, place.output, logs, watch, ranks)
+        learner = Learner(begin.network, recipe.optim, place.device, ranks, begin.pace)
+        trainer = Trainer(recipe, begin.method, learner, place.output, logs, watch, ranks)
         if checkpoint:
             trainer.resume(checkpoint)
         why = trainer.run()
@@ -57,22 +60,15 @@ def run_training(place: Place, begin: Start, checkpoint: Checkpoint | None) -> s
     return why
 
 
-def _facts(place: Place, begin: Start) -> dict[str, Any]:
+def _facts(place: Place[AnyRecipe], begin: Start) -> dict[str, Any]:
     """What run.json says of a run whatever becomes of it."""
-    judge = place.judge
-    features = judge.features.name if judge.features else "none"
-    facts = {"method": begin.method.name, "features": features, **begin.facts}
-    facts |= {"precision": str(judge.precision).removeprefix("torch."), "processes": place.ranks.count}
+    facts = {"method": begin.method.name, "aim": begin.method.aim, **begin.facts}
+    facts |= {"precision": str(place.precision).removeprefix("torch."), "processes": place.ranks.count}
     return facts | {"recipe": plain(place.recipe), "versions": versions(), "hardware": hardware(place.device)}
 
 
-def _summary(progress: Progress) -> str:
+def _summary(progress: Progress, method: Method) -> str:
     """The last validation in a line."""
     found = progress.history[-1]
     best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
-    places = {"hole_psnr": "in the hole", "seen_psnr": "to the base outside of it"}
-    psnr = "".join(f", {found[name]:.2f} dB {place}" for name, place in places.items() if name in found)
-    return (
-        f"step {progress.step}: validation loss {found['loss']:.4f} ({best}){psnr}, "
-        f"holes {found['har_before']:.1%} -> {found['har_after']:.2%}"
-    )
+    return f"step {progress.step}: validation {method.aim} {found[method.aim]:.4f} ({best}){method.words(found)}"

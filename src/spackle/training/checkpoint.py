@@ -28,18 +28,18 @@ class Progress:
     """How far a run has come, as plain numbers."""
 
     step: int = 0  # steps done
-    best: float | None = None  # validation loss; None before the first validation
+    best: float | None = None  # of what the method aims at, such as the loss; None before the first validation
     best_step: int = 0
     stale: int = 0  # validations since then
     seconds: float = 0.0  # of all its starts together
     history: tuple[dict[str, float], ...] = ()  # what each validation found
 
-    def judged(self, found: dict[str, float], min_delta: float) -> Progress:
-        """After a validation."""
+    def judged(self, found: dict[str, float], aim: str, min_delta: float) -> Progress:
+        """After a validation whose number called `aim` says which weights are best; the lower the better."""
         history = (*self.history, found)
         best = math.inf if self.best is None else self.best
-        if math.isfinite(found["loss"]) and found["loss"] < best - min_delta:
-            return dataclasses.replace(self, best=found["loss"], best_step=self.step, stale=0, history=history)
+        if math.isfinite(found[aim]) and found[aim] < best - min_delta:
+            return dataclasses.replace(self, best=found[aim], best_step=self.step, stale=0, history=history)
         return dataclasses.replace(self, stale=self.stale + 1, history=history)
 
 

@@ -32,7 +32,7 @@ def composite(rng: np.random.Generator, photos: Photos, height: int, width: int)
     inverse_depth = _background(rng, height, width)
     for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):
         picture = random_crop(rng, photos(rng), height, width)
-        shape = _shape(rng, picture)
+        shape = outline(rng, picture)
         share = float((shape > 0.5).float().mean())
         if not AREA[0] < share < AREA[1]:
             continue
@@ -78,7 +78,7 @@ def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Ten
     return a * x + b * y
 
 
-def _shape(rng: np.random.Generator, picture: Tensor) -> Tensor:
+def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     """An outline [H, W] in 0..1, soft over about a pixel as a camera's edges are."""
     height, width = picture.shape[:2]
     cloud = _noise(rng, height, width, _between(rng, 0.1, 0.35))

@@ -57,15 +57,15 @@ class Supply:
                 names.extend([source.name, *(file.relative_to(folder).as_posix() for file in files)])
 
         if data.photos is not None:
-            photos = _find(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+            photos = find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
             add(Composites(photos, renderer, data.disparity), data.shares.composites, data.photos, photos)
-        found = [_find(frames.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for frames in data.rgbd]
+        found = [find_files(frames.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for frames in data.rgbd]
         for camera, frames in zip(data.rgbd, found, strict=True):
             share = data.shares.rgbd * len(frames) / sum(map(len, found))  # every frame counts alike
             source = RgbdFrames(frames, renderer, data.disparity, camera.focal_px, camera.unit_m)
             add(source, share, camera.folder, frames)
         if data.stereo is not None:
-            scenes = [file.parent for file in _find(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
+            scenes = [file.parent for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
             for reverse, share, name in ((True, data.shares.stereo, "stereo"), (False, data.shares.pairs, "pairs")):
                 add(StereoPairs(scenes, renderer, data.disparity, reverse, name), share, data.stereo, scenes)
         if data.pseudo is not None and data.shares.pseudo > 0:
@@ -121,7 +121,7 @@ class Supply:
         return SampleFiles(learned, judged, digest)
 
 
-def _find(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
+def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
     """All files below a folder whose names end so, in order.
 
     Raises:

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from spackle.bases.device import enough_memory
 from spackle.bases.sharp.decoder_file import Owner, decoder_bytes
-from spackle.bases.sharp.device import enough_memory
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.formats import atomic_path
 from spackle.pseudo import PseudoSample
@@ -27,7 +27,8 @@ from spackle.render import Renderer
 from spackle.training.method import MethodName
 from spackle.training.pseudo_photos import VIEWS_AT_ONCE, PseudoPhotos
 from spackle.training.step import Batch
-from spackle.training.validation import PICTURED
+from spackle.training.validation import PICTURED, Judge
+from spackle.training.view_method import ViewMethod
 
 PICTURE_SIDE = 512  # pixels of a picture's longer side
 
@@ -61,13 +62,13 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoS
 
 
 @dataclasses.dataclass(frozen=True)
-class DirectFt:
+class DirectFt(ViewMethod):
     """Items are photos, one at a time: SHARP's decoder keeps gigabytes for the gradient of each."""
 
     base: TunableSharp
     owner: Owner
     photos: PseudoPhotos
-    renderer: Renderer
+    judge: Judge
     views: int  # of a step, of all processes together: a multiple of VIEWS_AT_ONCE
     seed: int  # of the views that are drawn
 
@@ -98,12 +99,12 @@ class DirectFt:
 
     def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> Batch:
         """Views of one photo, drawn with what the decoder says; InputError where they cannot be read."""
-        return render_photo(network, self.base, self._drawn(step, *items), self.renderer)
+        return render_photo(network, self.base, self._drawn(step, *items), self.judge.renderer)
 
     def complete_judged(self, network: nn.Module, items: Sequence[int]) -> Batch:
         """All views of one photo, likewise."""
         (item,) = items
-        return render_photo(network, self.base, self.photos.all(self.photos.judged[item]), self.renderer)
+        return render_photo(network, self.base, self.photos.all(self.photos.judged[item]), self.judge.renderer)
 
     def _drawn(self, step: int, item: int) -> list[PseudoSample]:
         """The views that a step takes of a photo: nothing but the arguments decides."""
@@ -115,7 +116,7 @@ class DirectFt:
         places, rows = self.photos.judged, []
         for place in places[:: max(1, 2 * len(places) // PICTURED)][: PICTURED // 2]:
             views = self.photos.widest(place)
-            done = render_photo(network, self.base, views, self.renderer)
+            done = render_photo(network, self.base, views, self.judge.renderer)
             rows += [torch.cat(row, dim=1) for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
         shown = [_reduced(row, len(self.columns.split(","))) for row in rows]
         widest = max(row.shape[1] for row in shown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,22 @@ from spackle.training.recipe import OptimRecipe
 from spackle.training.schedule import ema_decay, learning_rate
 
 
+def even(name: str) -> float:
+    """One learning rate for all weights, whatever their names."""
+    return 1.0
+
+
 class Learner:
     """All that a step changes."""
 
-    def __init__(self, network: nn.Module, optim: OptimRecipe, device: torch.device, ranks: Ranks) -> None:
+    def __init__(
+        self,
+        network: nn.Module,
+        optim: OptimRecipe,
+        device: torch.device,
+        ranks: Ranks,
+        pace: Callable[[str], float] = even,
+    ) -> None:
         """Before the first step.
 
         Args:
@@ -30,12 +43,18 @@ class Learner:
             optim: learning rate, decay and the like.
             device: where it learns.
             ranks: this process among those that share the gradients.
+            pace: a weight's name to a factor on its learning rate.
         """
-        self.optim = optim
+        self.optim, self.device = optim, device
         self.network: nn.Module = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
-        learning = [weight for weight in network.parameters() if weight.requires_grad]
-        self.optimizer = torch.optim.AdamW(learning, optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
+        learning: dict[float, list[nn.Parameter]] = {}
+        for name, weight in network.named_parameters():
+            if weight.requires_grad:
+                learning.setdefault(pace(name), []).append(weight)
+        self.paces = list(learning)
+        groups = [{"params": weights} for weights in learning.values()]
+        self.optimizer = torch.optim.AdamW(groups, optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
         # Gradients are averaged over the processes while they are computed.
         self.wrapped: nn.Module = DistributedDataParallel(network) if ranks.count > 1 else network
 
@@ -70,8 +89,8 @@ class Learner:
     def update(self, step: int) -> float:
         """Move the weights along their gradients, and the average after them; returns the learning rate."""
         rate = learning_rate(step, self.optim)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        for group, pace in zip(self.optimizer.param_groups, self.paces, strict=True):
+            group["lr"] = pace * rate
         self.optimizer.step()
         decay = ema_decay(step, self.optim.ema)
         with torch.no_grad():

@@ -8,8 +8,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from torch import nn
-
 from spackle.errors import InputError
 from spackle.formats import save_png
 from spackle.training.checkpoint import BAD, BEST, LAST, PICTURES, Checkpoint, Progress, save_checkpoint
@@ -17,9 +15,9 @@ from spackle.training.learner import Learner
 from spackle.training.logs import Logs
 from spackle.training.method import Method, chunks
 from spackle.training.ranks import Ranks
-from spackle.training.recipe import Recipe, plain
+from spackle.training.recipe import AnyRecipe, plain
 from spackle.training.schedule import samples_of_step
-from spackle.training.validation import Judge, validate
+from spackle.training.validation import validate
 from spackle.training.watch import Means, Watch
 
 
@@ -28,10 +26,9 @@ class Trainer:
 
     def __init__(
         self,
-        recipe: Recipe,
+        recipe: AnyRecipe,
         method: Method,
-        network: nn.Module,
-        judge: Judge,
+        learner: Learner,
         folder: Path,
         logs: Logs,
         watch: Watch,
@@ -42,16 +39,14 @@ class Trainer:
         Args:
             recipe: optim and run count here.
             method: what to learn, and from what.
-            network: the first weights; trained in place.
-            judge: the loss.
+            learner: the first weights; trained in place.
             folder: for results; exists.
             logs: for the curves.
             watch: told what goes on.
             ranks: this process; the first one writes.
         """
-        self.recipe, self.method, self.judge, self.folder = recipe, method, judge, folder
+        self.recipe, self.method, self.learner, self.folder = recipe, method, learner, folder
         self.logs, self.watch, self.ranks = logs, watch, ranks
-        self.learner = Learner(network, recipe.optim, judge.device, ranks)
         self.progress, self.on_disk = Progress(), -1  # the step of the newest checkpoint
 
     def resume(self, checkpoint: Checkpoint) -> None:
@@ -86,7 +81,7 @@ class Trainer:
         items = samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
         mine = self._find_gradients(step, items)
         mine["stop"] = float(self.watch.stop())
-        means = ranks.mean(list(mine.values()), self.judge.device)
+        means = ranks.mean(list(mine.values()), self.learner.device)
         numbers = dict(zip(mine, means, strict=True))
         if not (math.isfinite(numbers["loss"]) and math.isfinite(numbers["gradient"])):
             self._reject(step, items, mine["loss"], numbers)
@@ -100,7 +95,7 @@ class Trainer:
         for part in parts:
             share = len(part) / len(items)
             with self.learner.adding_up(last=part is parts[-1]):
-                loss, terms = self.judge.total(self.method.complete(self.learner.wrapped, step, part))
+                loss, terms = self.method.loss(self.learner.wrapped, step, part)
                 (share * loss).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": loss.detach(), **terms}.items():
                 numbers[name] = numbers.get(name, 0.0) + share * float(value)
@@ -109,9 +104,9 @@ class Trainer:
     def judge_average(self) -> None:
         """Validate the averaged weights, keep them where they are the best so far, and draw what they do."""
         average = self.learner.average
-        found = validate(average, self.method, self.judge, self.ranks)
+        found = validate(average, self.method, self.learner.device, self.ranks)
         step = self.progress.step
-        self.progress = self.progress.judged({"step": step, **found}, self.recipe.run.min_delta)
+        self.progress = self.progress.judged({"step": step, **found}, self.method.aim, self.recipe.run.min_delta)
         if not self.ranks.first:
             return
         self.logs.numbers("validation", found, step)

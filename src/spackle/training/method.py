@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Protocol, TypeVar
 
 from torch import Tensor, nn
 
-from spackle.training.step import Batch
-
 T = TypeVar("T")
-MethodName = Literal["residual", "direct-ft"]  # as --method spells them, and checkpoints
+MethodName = Literal["residual", "direct-ft", "lite"]  # as --method spells them, and checkpoints
 
 
 class Method(Protocol):
-    """A network's task: items, which are counted from 0, in; views that it completed, out."""
+    """A network's task: items, which are counted from 0, in; a loss out."""
 
     @property
     def name(self) -> MethodName:
@@ -49,18 +47,29 @@ class Method(Protocol):
     def remedy(self) -> str:
         """What to do about items that make a loss that is no number."""
 
-    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> Batch:
-        """Views of items to learn from, with gradients; the same for the same step.
+    @property
+    def measures(self) -> Sequence[str]:
+        """What `judged` finds, by name."""
+
+    @property
+    def aim(self) -> str:
+        """Which of them says what weights are best: the lower the better."""
+
+    def loss(self, network: nn.Module, step: int, items: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [] of items to learn from, with gradients, and its terms []; the same for the same step.
 
         Raises:
             InputError: an item that cannot be read.
         """
 
-    def complete_judged(self, network: nn.Module, items: Sequence[int]) -> Batch:
-        """Views of items to be judged by; InputError likewise."""
+    def judged(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
+        """How good a network is on items to be judged by: values of each measure; InputError likewise."""
+
+    def words(self, found: Mapping[str, float]) -> str:
+        """What a line about a validation says behind its aim: the means of the measures, from a comma on."""
 
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: rows of a few judged views in `columns`; InputError likewise."""
+        """[H, W, 3] sRGB: rows of a few judged items in `columns`; InputError likewise."""
 
     def keep(self, step: int, items: Sequence[int], folder: Path) -> None:
         """Copy items to learn from, or their names, to a folder."""

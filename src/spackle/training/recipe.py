@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from spackle.precision import Precision
 from spackle.training.losses import LossWeights
@@ -110,6 +110,18 @@ class Recipe:
     init: Path | None = None  # weights to start from
 
 
+class AnyRecipe(Protocol):
+    """What every recipe has, whatever its network learns from."""
+
+    @property
+    def optim(self) -> OptimRecipe:
+        """How it learns."""
+
+    @property
+    def run(self) -> RunRecipe:
+        """How often it looks up."""
+
+
 # What may differ when a run goes on: how long it is, how often it looks up, and where its files lie.
 # The samples themselves are held together by their digest.
 FREE: tuple[str, ...] = (
@@ -122,6 +134,7 @@ FREE: tuple[str, ...] = (
 )
 FREE += ("run.device", "loss.features_path", "data.cache", "data.photos", "data.stereo", "data.rgbd")
 FREE += ("data.pseudo", "data.shares.pseudo")  # younger than some checkpoints
+FREE += ("data.validation_stereo",)
 
 
 def plain(value: Any) -> Any:

@@ -9,13 +9,16 @@ import typing
 from collections.abc import Sequence
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union
+from typing import Any, Literal, TypeVar, Union
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 from spackle.residual.cues import CELL
-from spackle.training.recipe import Recipe
+from spackle.training.depth.recipe import LITE_RANGES, LiteRecipe, check_lite
+from spackle.training.recipe import OptimRecipe, Recipe
 from spackle.trajectory import MAX_DISPARITY
+
+R = TypeVar("R", Recipe, LiteRecipe)
 
 POSITIVE = 1e-12
 LEAST_SIDE = 36  # pixels that the feature networks need
@@ -45,11 +48,12 @@ RANGES: dict[str, tuple[float, float]] = {
     "run.seed": (0, 2**31 - 1),
     **{f"run.{name}": (1, 1e9) for name in ("validate_every", "save_every", "log_every", "patience")},
     "run.min_delta": (0, 1e6),
+    **LITE_RANGES,
 }
 
 
 def load_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe; what the file leaves out is as `Recipe` has it.
+    """Read a recipe of the residual or of direct-ft; what the file leaves out is as `Recipe` has it.
 
     Args:
         path: a YAML file. Relative paths in it are relative to the working directory.
@@ -58,20 +62,33 @@ def load_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     Raises:
         InputError: a missing or broken file, an unknown key, a value that cannot be.
     """
+    recipe = _load(Recipe, path, overrides)
+    _check_together(recipe, str(path))
+    return recipe
+
+
+def load_lite_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> LiteRecipe:
+    """Read a recipe of the lite base likewise; what the file leaves out is as `LiteRecipe` has it."""
+    recipe = _load(LiteRecipe, path, overrides)
+    _check_rates(recipe.optim, str(path))
+    check_lite(recipe, str(path))
+    return recipe
+
+
+def _load(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str]) -> R:
     check_file(path, "recipe")
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a recipe: {reason_in_a_line(error)}") from error
     raw = _parse(text, str(path)) or {}
-    recipe: Recipe = _build(Recipe, raw, "", str(path))
+    recipe: R = _build(kind, raw, "", str(path))
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise InputError(f"{override!r}: neither an option nor key=value, such as optim.steps=100")
         _set(raw, key.split("."), _parse(value, override), override)
-        recipe = _build(Recipe, raw, "", override)
-    _check_together(recipe, str(path))
+        recipe = _build(kind, raw, "", override)
     return recipe
 
 
@@ -196,13 +213,17 @@ def _refused(key: str, value: Any, allowed: str, file: str) -> InputError:
     return InputError(f"{file}: {key or 'the recipe'} cannot be {str(value)[:60]!r}; it takes {allowed}")
 
 
+def _check_rates(optim: OptimRecipe, file: str) -> None:
+    if optim.min_lr > optim.lr:
+        raise InputError(f"{file}: optim.min_lr {optim.min_lr:g} is above optim.lr {optim.lr:g}")
+
+
 def _check_together(recipe: Recipe, file: str) -> None:
     """InputError for values that are possible each, but not together."""
     low, high = recipe.data.disparity
     if low > high:
         raise InputError(f"{file}: data.disparity runs from {low:g} down to {high:g}; give the smaller number first")
-    if recipe.optim.min_lr > recipe.optim.lr:
-        raise InputError(f"{file}: optim.min_lr {recipe.optim.min_lr:g} is above optim.lr {recipe.optim.lr:g}")
+    _check_rates(recipe.optim, file)
     if recipe.loss.dilation % 2 == 0:
         raise InputError(f"{file}: loss.dilation {recipe.loss.dilation} is even; a square around a pixel is odd")
     if recipe.loss.features == "none":

@@ -18,10 +18,11 @@ from spackle.training.data import SampleFiles
 from spackle.training.method import MethodName
 from spackle.training.step import Batch
 from spackle.training.validation import PICTURED, Judge
+from spackle.training.view_method import ViewMethod
 
 
 @dataclasses.dataclass(frozen=True)
-class ResidualMethod:
+class ResidualMethod(ViewMethod):
     """Items are samples, of one size; all of a step go through the network together."""
 
     samples: SampleFiles

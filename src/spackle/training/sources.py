@@ -78,10 +78,7 @@ class RgbdFrames:
 
     def view(self, rng: np.random.Generator) -> Sample:
         color = self.frames[int(rng.integers(len(self.frames)))]
-        rgb = load_photo(color).rgb
-        stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
-        stored.check_shape(rgb.shape[0], rgb.shape[1], color)
-        depth = dataclasses.replace(stored, depth=stored.depth * (self.unit_m / 0.001))  # it was read as millimetres
+        rgb, depth = load_frame(color, self.unit_m)
         camera = Camera.from_focal(self.focal_px, rgb.shape[1], rgb.shape[0])
         return _reverse(rng, rgb, depth, camera, self.disparity, self.renderer)
 
@@ -104,6 +101,22 @@ class StereoPairs:
         base = lift(left, depth, camera).gaussians
         rendering = self.renderer.render(base, beside)
         return Sample.of(base, rendering, beside, camera, right, torch.ones_like(rendering.alpha, dtype=torch.bool))
+
+
+def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
+    """A depth camera's photo [H, W, 3] sRGB and its depth, which lies beside it.
+
+    Args:
+        color: NAME.color.jpg.
+        unit_m: of the depth map's numbers; 0 and 65535 are unknown.
+
+    Raises:
+        InputError: a file that is missing or broken.
+    """
+    rgb = load_photo(color).rgb
+    stored = load_depth(color.with_name(color.name.replace(".color.", ".depth.")).with_suffix(".png"))
+    stored.check_shape(rgb.shape[0], rgb.shape[1], color)
+    return rgb, dataclasses.replace(stored, depth=stored.depth * (unit_m / 0.001))  # it was read as millimetres
 
 
 def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:

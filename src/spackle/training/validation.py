@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from spackle.render import Renderer
-from spackle.residual.cues import hole_area_ratio
-from spackle.training.distance import hole_psnr
 from spackle.training.features import FeatureNet
 from spackle.training.losses import total_loss
 from spackle.training.method import Method, chunks
@@ -21,8 +18,6 @@ from spackle.training.sample import Sample
 from spackle.training.step import Batch, complete_samples
 
 PICTURED = 6  # views in the picture
-DECIBELS = ("hole_psnr", "seen_psnr")
-NUMBERS = ("loss", "color", "alpha", "preserve", "perceptual", *DECIBELS, "har_before", "har_after")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,46 +47,27 @@ class Judge:
 
 
 @torch.no_grad()
-def validate(network: nn.Module, method: Method, judge: Judge, ranks: Ranks) -> dict[str, float]:
-    """Means over the judged views, each in its own right; the same in all processes.
+def validate(network: nn.Module, method: Method, device: torch.device, ranks: Ranks) -> dict[str, float]:
+    """Means over the judged items, each in its own right; the same in all processes.
 
     Args:
         network: the averaged one.
-        method: whose views count.
-        judge: the loss.
+        method: whose items and measures count.
+        device: where the processes' sums are added up.
         ranks: the processes that share the work.
 
     Returns:
-        loss and its terms; hole_psnr and seen_psnr in dB, inside of the holes against the target and outside of them
-        against the base, of the views in which they are not infinite; har_before and har_after, the share of hole
-        pixels.
+        The method's measures, but those that no item has.
 
     Raises:
         InputError: an item that cannot be read.
     """
-    totals, counts = dict.fromkeys(NUMBERS, 0.0), dict.fromkeys(NUMBERS, 0)
+    totals, counts = dict.fromkeys(method.measures, 0.0), dict.fromkeys(method.measures, 0)
     mine = range(ranks.rank, method.judged_items, ranks.count)
     for part in chunks(mine, method.at_once):
-        done = method.complete_judged(network, part)
-        loss, terms = judge.total(done)
-        means = {name: float(value) for name, value in {"loss": loss, **terms}.items()}
-        found = {name: [value] * len(done.rgb) for name, value in means.items()}
-        for name, values in {**found, **_of_images(done)}.items():
-            finite = [value for value in values if math.isfinite(value)] if name in DECIBELS else values
-            totals[name] += sum(finite)
-            counts[name] += len(finite)
-    sums = ranks.sum([*totals.values(), *counts.values()], judge.device)
-    pairs = zip(NUMBERS, sums[: len(NUMBERS)], sums[len(NUMBERS) :], strict=True)
+        for name, values in method.judged(network, part).items():
+            totals[name] += sum(values)
+            counts[name] += len(values)
+    sums = ranks.sum([*totals.values(), *counts.values()], device)
+    pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
     return {name: total / count for name, total, count in pairs if count}
-
-
-def _of_images(batch: Batch) -> dict[str, list[float]]:
-    """What is measured of each completed view."""
-    views = list(zip(batch.rgb, batch.target, batch.hole & batch.valid, strict=True))
-    seen = zip(batch.rgb, batch.base_rgb, ~batch.hole, strict=True)
-    return {
-        "hole_psnr": [hole_psnr(rgb, target, hole) for rgb, target, hole in views],
-        "seen_psnr": [hole_psnr(rgb, base, rest) for rgb, base, rest in seen],
-        "har_before": [float(hole.double().mean()) for hole in batch.hole],
-        "har_after": [hole_area_ratio(alpha) for alpha in batch.alpha],
-    }

@@ -1,0 +1,101 @@
+"""The lite base: rough depth from the photo alone, by a network that comes with the package."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.device import own_arithmetic, pick_device
+from spackle.bases.lite.network import STRIDE, LiteNet
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.rgbd import lift
+from spackle.image import Photo, resize_photo
+from spackle.network_file import read_network
+
+SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
+# What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
+# thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
+INPUT_PIXELS = (192 * 256, 256 * 320, 288 * 384)
+# The network knows inverse depth up to a factor. The nearest things are put at an arm's length and a half; what is
+# farther than that by this ratio is sky to it.
+NEAREST_M = 1.5
+NEAREST_QUANTILE = 0.999  # trajectories take the 0.1 % nearest for the nearest depth; beyond are specks
+FARTHEST = 60.0
+
+
+class LiteBase:
+    """A small network's depth, lifted as a measured one is: plausible parallax, not measurement."""
+
+    name = "lite"
+
+    def __init__(self, network: LiteNet, device: torch.device) -> None:
+        self.network = network.to(device)
+        self.device = device
+
+    @classmethod
+    def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
+        """Read the network's weights.
+
+        Args:
+            path: a file that `spackle train --method lite` wrote; None takes the weights of the package.
+            device: cpu or a CUDA device; where None, CUDA if it is there.
+
+        Raises:
+            InputError: a file or device that cannot be used.
+        """
+        target = pick_device(device)
+        return cls(read_network(LiteNet(), path or SHIPPED, "lite", "a .safetensors file"), target)
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Gaussians of the pixels of the photo at its working size, as `rgbd.lift` makes them."""
+        photo = resize_photo(photo)
+        inverse_depth = self.inverse_depth(photo.rgb)
+        near = inverse_depth.flatten().kthvalue(1 + round(NEAREST_QUANTILE * (inverse_depth.numel() - 1))).values
+        depth = NEAREST_M / (inverse_depth / near).clamp(1 / FARTHEST, 1)
+        known = torch.ones_like(depth, dtype=torch.bool)
+        if progress:
+            progress(1, 2)
+        prediction = lift(photo.rgb, DepthMap(depth, known, None, None, "disparity", photo.path), photo.camera)
+        if progress:
+            progress(2, 2)
+        notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
+        return dataclasses.replace(prediction, notes=notes)
+
+    @torch.no_grad()
+    def inverse_depth(self, rgb: Tensor) -> Tensor:
+        """What the network says of a photo and of its mirror image, at several sizes: the mean of the logarithms.
+
+        Args:
+            rgb: [H, W, 3] sRGB in 0..1, of any size.
+
+        Returns:
+            [h, w] float32 inverse depth up to a factor, on the processor; about 144×192, of the photo's shape.
+        """
+        picture = rgb.permute(2, 0, 1)[None].to(self.device)
+        height, width = rgb.shape[:2]
+        sizes = [network_size(height, width, pixels) for pixels in INPUT_PIXELS]
+        finest = tuple(side // 2 for side in sizes[-1])
+        said = [interpolate(self._look(picture, size)[None, None], size=finest, mode="bilinear") for size in sizes]
+        return torch.cat(said).mean(0)[0].exp().cpu()
+
+    def _look(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], seen at a size (h, w), both ways round."""
+        seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
+        both = torch.cat([seen, seen.flip(-1)]).contiguous(memory_format=torch.channels_last)
+        with own_arithmetic(self.device):
+            straight, mirrored = self.network(both).float()
+        mean: Tensor = (straight + mirrored.flip(-1)) / 2
+        return mean
+
+
+def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
+    """(height, width) of what the network sees of a photo: nearly its shape, nearly `pixels`."""
+    scale = math.sqrt(pixels / (height * width))
+    tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
+    return tall, wide

@@ -1,0 +1,155 @@
+"""The network of the lite base: EfficientNet-Lite0's features, and a small decoder to inverse depth."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, pad, relu, relu6
+
+STRIDE = 32  # both sides of the input are multiples of it
+# Stages of EfficientNet-Lite0 (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation):
+# blocks, kernel, stride, expansion, channels.
+STAGES = (
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
+STEM = 32
+TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
+SPREADS = (6.0, 9.0, 8.0, 7.0, 3.0)  # standard deviations of those features, nearly, on photos
+DECODER = (24, 40, 64, 96, 160)  # its channels at those scales
+MEAN, STD = 127.0 / 255, 128.0 / 255  # the input that the features were learned on
+
+
+class SameConv(nn.Conv2d):
+    """A convolution with TensorFlow's "same" padding for sides that the stride divides, and a bias.
+
+    The bias is what is left of the batch normalisation behind it, which is folded in.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+        super().__init__(inputs, outputs, kernel, stride, groups=groups)
+        total = kernel - stride
+        self.margins = (total // 2, total - total // 2) * 2
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(pad(x, self.margins) if any(self.margins) else x)
+
+
+class Block(nn.Module):
+    """MBConv: wider by a 1×1, spatial mixing channel by channel, narrower by a 1×1; plus itself where it fits."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        middle = inputs * expansion
+        self.expand = SameConv(inputs, middle, 1) if expansion > 1 else None
+        self.depthwise = SameConv(middle, middle, kernel, stride, groups=middle)
+        self.project = SameConv(middle, outputs, 1)
+        self.skips = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = x if self.expand is None else relu6(self.expand(x))
+        y = self.project(relu6(self.depthwise(y)))
+        return x + y if self.skips else y
+
+
+class Encoder(nn.Module):
+    """EfficientNet-Lite0 without its head."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = SameConv(3, STEM, 3, 2)
+        self.stages = nn.ModuleList()
+        inputs = STEM
+        for count, kernel, stride, expansion, outputs in STAGES:
+            blocks = []
+            for n in range(count):
+                blocks.append(Block(inputs, outputs, kernel, stride if n == 0 else 1, expansion))
+                inputs = outputs
+            self.stages.append(nn.Sequential(*blocks))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """[B, 3, H, W] sRGB in 0..1 to the features of `TAPS`, finest first."""
+        x = relu6(self.stem((x - MEAN) / STD))
+        features = []
+        for index, stage in enumerate(self.stages):
+            x = stage(x)
+            if index in TAPS:
+                features.append(x)
+        return features
+
+
+class Fuse(nn.Module):
+    """What coarser scales know, refined by the features of this one."""
+
+    def __init__(self, coarse: int, skip: int, outputs: int) -> None:
+        super().__init__()
+        self.lateral = nn.Conv2d(skip, outputs, 1)
+        self.reduce = nn.Conv2d(coarse, outputs, 1)
+        self.mix = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.refine = nn.Conv2d(outputs, outputs, 3, padding=1)
+
+    def forward(self, coarse: Tensor, skip: Tensor) -> Tensor:
+        up = interpolate(self.reduce(coarse), size=skip.shape[-2:], mode="bilinear", align_corners=False)
+        x = up + self.lateral(skip)
+        refined: Tensor = x + self.refine(relu(self.mix(relu(x))))
+        return refined
+
+
+class LiteNet(nn.Module):
+    """A photo to its inverse depth, up to a factor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = Encoder()
+        channels = [STAGES[stage][-1] for stage in TAPS]
+        top = DECODER[-1]
+        self.top = nn.Conv2d(channels[-1] + 2, top, 1)
+        self.context = nn.Conv2d(channels[-1], top, 1)
+        self.spread = nn.Sequential(
+            nn.Conv2d(top, top, 3, padding=2, dilation=2, groups=top), nn.ReLU(), nn.Conv2d(top, top, 1)
+        )
+        self.fuse = nn.ModuleList(Fuse(DECODER[n + 1], channels[n], DECODER[n]) for n in reversed(range(len(TAPS) - 1)))
+        self.head = nn.Sequential(nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1))
+        self._start()
+
+    def _start(self) -> None:
+        """First weights of the decoder: values of about one everywhere, and corrections that begin at nothing."""
+        for name, module in self.named_modules():
+            if isinstance(module, nn.Conv2d) and not name.startswith("encoder."):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+        with torch.no_grad():
+            for weight in (self.top.weight, self.context.weight):
+                weight /= SPREADS[-1]
+            for fuse, spread in zip(self.fuse, reversed(SPREADS[:-1]), strict=True):
+                fuse.get_parameter("lateral.weight").div_(spread)
+                fuse.get_parameter("reduce.weight").mul_(0.5)
+                fuse.get_parameter("refine.weight").zero_()
+            self.get_parameter("spread.2.weight").zero_()
+            self.get_parameter("head.2.weight").mul_(0.2)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        """[B, 3, H, W] sRGB in 0..1, sides multiples of 32, to log inverse depth [B, H/2, W/2] up to a constant."""
+        *finer, coarsest = self.encoder(rgb)
+        # Where in the picture something stands says much about how far it is.
+        x = self.top(torch.cat([coarsest, _places(coarsest)], dim=1))
+        x = x + self.context(coarsest.mean(dim=(2, 3), keepdim=True))
+        x = x + self.spread(relu(x))
+        for fuse, skip in zip(self.fuse, reversed(finer), strict=True):
+            x = fuse(x, skip)
+        inverse_depth: Tensor = self.head(relu(x))[:, 0]
+        return inverse_depth
+
+
+def _places(x: Tensor) -> Tensor:
+    """[B, 2, h, w]: x and y of each cell, -1..1 across the picture."""
+    batch, _, height, width = x.shape
+    rows = (torch.arange(height, device=x.device, dtype=x.dtype) + 0.5) * (2 / height) - 1
+    columns = (torch.arange(width, device=x.device, dtype=x.dtype) + 0.5) * (2 / width) - 1
+    grid = torch.stack([columns.expand(height, width), rows[:, None].expand(height, width)])
+    return grid.expand(batch, -1, -1, -1)

@@ -1,0 +1,1 @@
+"""Training the lite base: photos with depth, made and measured."""

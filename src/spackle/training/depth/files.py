@@ -1,0 +1,107 @@
+"""The files that a recipe of the lite base names: what is learned from, and what is judged by."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from spackle.errors import InputError
+from spackle.image import PHOTO_SUFFIXES
+from spackle.training.cache import digest_of
+from spackle.training.data import find_files
+from spackle.training.depth.frames import Group, Measured, of_camera, of_scenes
+from spackle.training.depth.recipe import LiteData
+from spackle.training.recipe import plain
+
+SCENES_VERSION = 1  # goes up whenever the same photos would make other scenes
+STEREO = "stereo"  # the group of data.validation_stereo
+
+
+@dataclasses.dataclass(frozen=True)
+class LiteFiles:
+    """Sorted; what has no share is empty."""
+
+    data: LiteData
+    photos: Sequence[Path]
+    stereo: Sequence[Measured]
+    rgbd: Sequence[Measured]
+    groups: Sequence[Group]
+
+    @staticmethod
+    def of(data: LiteData) -> LiteFiles:
+        """Look for them.
+
+        Raises:
+            InputError: a folder that is missing or without such files; nothing to learn from, or to be judged by.
+        """
+        shares, groups = data.shares, []
+        photos = [] if data.photos is None else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+        stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo")
+        rgbd: list[Measured] = []
+        for camera in data.rgbd:
+            learned, judged = of_camera(camera, data.validation)
+            rgbd += learned
+            groups.append(Group(camera.folder.resolve().name, judged))
+        if data.validation_stereo is not None:
+            groups.append(Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo")))
+            _check_apart(stereo, groups[-1].files, data.validation_stereo)
+        files = LiteFiles(
+            data,
+            photos if shares.made else (),
+            stereo if shares.stereo else (),
+            rgbd if shares.rgbd else (),
+            _with_own_names([group for group in groups if group.files]),
+        )
+        if not (files.photos or files.stereo or files.rgbd):
+            raise InputError(
+                "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a share above 0"
+            )
+        if not files.groups:
+            raise InputError(
+                "the recipe has nothing to judge the network by: give data.rgbd with a share in data.validation, "
+                "or scenes as data.validation_stereo=FOLDER"
+            )
+        return files
+
+    @property
+    def scenes_digest(self) -> str:
+        """Twelve digits: the same made scenes have the same ones, wherever the photos lie and however many are made."""
+        photos = [] if self.data.photos is None else _below(self.data.photos, self.photos)
+        return digest_of((SCENES_VERSION, self.data.seed, list(self.data.size), photos))
+
+    @property
+    def digest(self) -> str:
+        """Twelve digits of all that is learned from and judged by."""
+        facts: dict[str, Any] = plain(self.data)
+        for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd"):
+            facts.pop(name)
+        names = [_names(files) for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))]
+        return digest_of((self.scenes_digest, facts, names))
+
+
+def _check_apart(learned: Sequence[Measured], judged: Sequence[Measured], folder: Path) -> None:
+    """InputError where a scene is in both."""
+    if both := {file.path.resolve() for file in learned} & {file.path.resolve() for file in judged}:
+        raise InputError(f"{folder}: data.validation_stereo has scenes of data.stereo in it, such as {min(both)}")
+
+
+def _with_own_names(groups: Sequence[Group]) -> list[Group]:
+    """The same groups; where two have one name, the later ones are numbered."""
+    named: dict[str, Group] = {}
+    for group in groups:
+        name, number = group.name, 1
+        while name in named:
+            number += 1
+            name = f"{group.name}-{number}"
+        named[name] = dataclasses.replace(group, name=name)
+    return list(named.values())
+
+
+def _below(folder: Path, files: Sequence[Path]) -> list[str]:
+    return [file.relative_to(folder).as_posix() for file in files]
+
+
+def _names(files: Sequence[Measured]) -> list[tuple[str, float | None]]:
+    return [(file.path.name, file.unit_m) for file in files]

@@ -1,0 +1,77 @@
+"""What a training run of the lite base is made of, as values."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from spackle.bases.lite.network import STAGES, STRIDE
+from spackle.errors import InputError
+from spackle.training.depth.losses import DepthLossWeights
+from spackle.training.recipe import OptimRecipe, RgbdFolder, RunRecipe
+
+RANDOM = Path("random")  # in place of the encoder's file: weights that have seen nothing, for tests and experiments
+WEIGHTS, RUN = DepthLossWeights(), RunRecipe()
+
+
+@dataclasses.dataclass(frozen=True)
+class LiteShares:
+    """How often a picture comes from each source; they need not add up to 1. One without data counts as 0."""
+
+    made: float = 0.5
+    stereo: float = 0.28
+    rgbd: float = 0.22
+
+
+@dataclasses.dataclass(frozen=True)
+class LiteData:
+    """Where photos with depth come from."""
+
+    photos: Path | None = None  # a folder, with its subfolders: the surfaces of made scenes are cut from them
+    rgbd: tuple[RgbdFolder, ...] = ()  # of these the focal length is not asked for
+    stereo: Path | None = None  # a folder of scenes, each with a scene.json
+    made: int = 4000  # made scenes
+    shares: LiteShares = LiteShares()
+    size: tuple[int, int] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
+    cache: Path | None = None  # a folder for the made scenes; inside the output where None
+    seed: int = 0  # of the made scenes alone, so that runs with other seeds learn from the same ones
+    validation: float = 0.2  # share of each folder of `rgbd`, the last frames by name: neighbours look alike
+    validation_stereo: Path | None = None  # scenes to be judged by; those of `stereo` are learned from, all of them
+
+
+@dataclasses.dataclass(frozen=True)
+class LiteOptim(OptimRecipe):
+    """As for the other methods, and what the encoder, which comes with weights of its own, does otherwise."""
+
+    encoder_rate: float = 0.1  # factor on the encoder's learning rate
+    frozen: int = 2  # the encoder's first stages stay as they are, and its stem with them; 0: all of it learns
+
+
+@dataclasses.dataclass(frozen=True)
+class LiteRecipe:
+    """All of a training run of the lite base."""
+
+    data: LiteData = LiteData()
+    loss: DepthLossWeights = WEIGHTS
+    optim: LiteOptim = LiteOptim()
+    run: RunRecipe = RUN
+    encoder: Path | None = None  # EfficientNet-Lite0's .pth; None: of the installed package; "random": none
+    init: Path | None = None  # weights of the whole network to start from
+
+
+def check_lite(recipe: LiteRecipe, file: str) -> None:
+    """InputError for values that are possible each, but make no run."""
+    for side in recipe.data.size:
+        if side % STRIDE:
+            raise InputError(f"{file}: data.size {list(recipe.data.size)}: both sides must be multiples of {STRIDE}")
+
+
+LITE_RANGES: dict[str, tuple[float, float]] = {
+    "data.shares.made": (0, 1e6),
+    "data.made": (1, 1e6),  # six digits name a file
+    "data.size": (STRIDE, 2048),
+    "data.validation": (0, 0.9),
+    **{f"loss.{name}": (0, 1e6) for name in ("factor", "line", "steps")},
+    "optim.encoder_rate": (0, 10),
+    "optim.frozen": (0, len(STAGES)),
+}
