@@ -40,6 +40,7 @@ def test_the_three_lines_that_we_promise(tmp_path: Path, monkeypatch: pytest.Mon
     write_photo(tmp_path / "photo.jpg")
     write_depth(tmp_path / "depth.png")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))  # not by SHARP, wherever the test runs
     exec(code, {})
     with av.open("video.mp4") as container:
         frames = list(container.decode(video=0))

@@ -90,7 +90,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert names_in(folder.parent) == {"photo"}
     report = report_of(folder)
     base, merged = (read_ply(folder / name).count for name in ("base.ply", "scene.ply"))
-    assert report["base"] == {"name": "rgbd", "gaussians": base, "depth_filled": 0.0}
+    assert report["base"] == {"name": "rgbd", "chosen": "--depth", "gaussians": base, "depth_filled": 0.0}
     assert report["aux"]["gaussians"] == merged - base > 0
     assert report["aux"]["share"] == pytest.approx((merged - base) / base)
     assert report["merged"] == merged
@@ -667,7 +667,7 @@ def test_bad_options(tmp_path: Path, pair: tuple[Path, Path], options: tuple[str
 
 
 def test_no_depth(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    expect_refusal(tmp_path, "-i", pair[0], named="--depth")
+    expect_refusal(tmp_path, "-i", pair[0], "--base", "rgbd", named="--depth")
     (tmp_path / "depths").mkdir()
     expect_refusal(tmp_path, "-i", pair[0], "--depth", tmp_path / "depths", named=pair[0])
 

@@ -19,7 +19,8 @@ OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "sk
 OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # Rooms in the order in which the data flows; each may import itself and what is named here.
-SHELL = {"", "__main__", "cli", "cli_evaluate", "jobs", "scene"}  # thin, on top of everything; "" is the package itself
+# Thin, on top of everything; "" is the package itself.
+SHELL = {"", "__main__", "choose", "cli", "cli_dataset", "cli_evaluate", "cli_options", "cli_weights", "jobs", "scene"}
 ALLOWED = {
     "values": set(),
     "render": {"values"},

@@ -21,7 +21,7 @@ from spackle.bases.sharp.base import to_metric, to_square
 from spackle.bases.sharp.checkpoint import expected_shapes
 from spackle.bases.sharp.config import FULL, TINY
 from spackle.bases.sharp.decoder import GroupNorm
-from spackle.bases.sharp.device import enough_memory, own_arithmetic, pick_device
+from spackle.bases.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.pyramid import FULL_WINDOWS, HALF_WINDOWS, WINDOWS, cut, merge
@@ -300,7 +300,7 @@ def too_much(*arguments: object, **options: object) -> Tensor:
 def test_too_little_memory_to_predict_is_one_line(monkeypatch: pytest.MonkeyPatch, low_memory: bool) -> None:
     base = SharpBase(micro_network(), low_memory=low_memory)
     monkeypatch.setattr(base.network, "forward", too_much)
-    with pytest.raises(spackle.InputError, match="not enough memory for SHARP") as caught:
+    with pytest.raises(spackle.InputError, match="not enough memory for the network") as caught:
         base.predict(Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg")))
     assert ("--low-memory" in str(caught.value)) is not low_memory
 
@@ -319,13 +319,13 @@ def test_too_little_memory_to_load_is_one_line(
 ) -> None:
     path = write_tiny(tmp_path / "w.pt")
     monkeypatch.setattr(kind, method, failing)
-    with pytest.raises(spackle.InputError, match="not enough memory for SHARP: try --precision bf16, or close"):
+    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --precision bf16, or close"):
         SharpBase.load(path, precision="fp32", device="cpu")
 
 
 def test_too_little_memory_to_map_the_file_is_no_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "load", too_much)
-    with pytest.raises(spackle.InputError, match="not enough memory for SHARP"):
+    with pytest.raises(spackle.InputError, match="not enough memory for the network"):
         SharpBase.load(write_tiny(tmp_path / "w.pt"), device="cpu")
 
 

@@ -40,8 +40,8 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(tmp_path: Path, weig
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
     precision = "bf16" if native else "fp32"
-    expected = {"name": "sharp", "gaussians": gaussians_of(TINY), "precision": precision, "weights": "tiny.pt"}
-    assert report["base"] == expected
+    expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(TINY)}
+    assert report["base"] == expected | {"precision": precision, "weights": "tiny.pt"}
     assert report["photo"] == {"file": "photo.jpg", "width": 64, "height": 48}
     assert report["focal_source"] == "default 30 mm"
     assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == gaussians_of(TINY)

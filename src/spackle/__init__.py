@@ -1,7 +1,7 @@
 """Spackle: one photo in, a 3D Gaussian scene out that survives a large camera move.
 
 import spackle
-scene = spackle.predict("photo.jpg", depth="depth.png")
+scene = spackle.predict("photo.jpg")  # or depth="depth.png", or base=spackle.SharpBase.load("sharp.pt")
 scene.save_video("video.mp4")
 """
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from spackle.bases.depth_maps import DepthMap, load_depth
+    from spackle.bases.hf import HfBase
+    from spackle.bases.lite.base import LiteBase
     from spackle.bases.protocol import Base, BasePrediction
     from spackle.bases.sharp import SharpBase
     from spackle.camera import Camera
@@ -34,7 +36,9 @@ _HOMES = {
     "Completer": "spackle.residual",
     "DepthMap": "spackle.bases.depth_maps",
     "Gaussians": "spackle.gaussians",
+    "HfBase": "spackle.bases.hf",
     "InputError": "spackle.errors",
+    "LiteBase": "spackle.bases.lite.base",
     "Photo": "spackle.image",
     "Renderer": "spackle.render",
     "Rendering": "spackle.rendering",
@@ -59,7 +63,9 @@ __all__ = [
     "Completer",
     "DepthMap",
     "Gaussians",
+    "HfBase",
     "InputError",
+    "LiteBase",
     "Photo",
     "Renderer",
     "Rendering",

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from spackle.cli_options import INTERRUPTED
 from spackle.errors import InputError
 
 if TYPE_CHECKING:
     from spackle.jobs.options import PredictOptions
 
-STOPPED = 130  # what shells report of a command that Ctrl-C ended
 WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
 NUMBER = re.compile(r"[\d.,]+")
+UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
 
 # Options that both commands have.
 Dataset = Annotated[
@@ -23,7 +24,7 @@ Dataset = Annotated[
     typer.Option(metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."),
 ]
 Root = Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")]
-BaseName = Annotated[str, typer.Option(help="sharp, or rgbd with the dataset's own depth.")]
+BaseName = Annotated[str, typer.Option(help="sharp, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 LowMemory = Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")]
 Residual = Annotated[
@@ -101,7 +102,7 @@ def evaluate(
     )
     folder = output or Path(f"evaluation-{dataset}-{protocol}")
     if run(options, folder, Reporter(verbose), html) == "stopped":
-        raise typer.Exit(STOPPED)
+        raise typer.Exit(INTERRUPTED)
 
 
 def tables(
@@ -155,8 +156,9 @@ def bench(
         runs=runs,
         base_runs=base_runs,
     )
-    if run(options, output or Path(f"bench-{dataset}-{base}"), Reporter(verbose)) == "stopped":
-        raise typer.Exit(STOPPED)
+    folder = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
+    if run(options, folder, Reporter(verbose)) == "stopped":
+        raise typer.Exit(INTERRUPTED)
 
 
 def _base_options(

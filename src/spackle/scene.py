@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Literal
@@ -13,6 +14,7 @@ from spackle.bases.depth_maps import DepthMap, load_depth
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
+from spackle.choose import auto_here
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
@@ -23,6 +25,7 @@ from spackle.residual.weights import shipped_network
 from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 PATH_FRAMES = 60
+LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
 
 
@@ -83,12 +86,15 @@ def predict(
     network: ResidualNet | Shipped | None = "shipped",
     renderer: Renderer | None = None,
 ) -> Scene:
-    """A photo to a scene without holes along a camera path, by its depth or by a base that needs none.
+    """A photo to a scene without holes along a camera path.
 
     Args:
         photo: a file, or a loaded photo.
-        depth: a file, or a loaded depth map; None where `base` is given.
-        base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`.
+        depth: of the photo, a file or a loaded depth map.
+        base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`. Where neither it nor the depth
+            is given, the best that there is: the depth in the photo's file, else SHARP where its weights have been
+            downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
+            what could not be used. A network is then loaded for this photo alone: for many, load a base once.
         kind: the path that the scene is completed for.
         disparity: how far the path goes, see `spackle.trajectory.max_offset`.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
@@ -96,17 +102,23 @@ def predict(
 
     Raises:
         InputError: a photo or a depth map that cannot be used.
-        ValueError: depth and base both given, or neither.
+        ValueError: depth and base both given.
     """
-    if (depth is None) == (base is None):
-        raise ValueError("predict takes either the photo's depth, or a base that needs none")
+    if depth is not None and base is not None:
+        raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
     loaded = photo if isinstance(photo, Photo) else load_photo(photo)
     if depth is not None:
         base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
-    assert base is not None
-    prediction = base.predict(loaded)
+    prediction = _by_the_best_base(loaded) if base is None else base.predict(loaded)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
     return complete(prediction, cameras, network=network, renderer=renderer)
+
+
+def _by_the_best_base(photo: Photo) -> BasePrediction:
+    """The photo's Gaussians by the best base that this machine has for it."""
+    prediction, choice = auto_here().search(photo, LOG.warning).predict()
+    LOG.info("%s: %s", photo.path.name, choice.line)
+    return prediction
 
 
 def complete(

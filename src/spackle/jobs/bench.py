@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets import get_dataset
@@ -18,6 +19,7 @@ from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import Bill, ImageCost
 from spackle.evaluation.efficiency_tables import efficiency_tables
 from spackle.evaluation.table import to_latex, to_markdown
+from spackle.jobs.bases import kind_of
 from spackle.jobs.bench_image import time_image
 from spackle.jobs.bench_options import BenchOptions, check_bench_options
 from spackle.jobs.evaluate import inputs_digest, problem_of, spread
@@ -27,7 +29,6 @@ from spackle.jobs.evaluate_store import IMAGES, begin, stem_of, write_json, writ
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
-from spackle.jobs.setup import BaseError
 from spackle.jobs.stopping import asked_to_stop
 
 RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
@@ -57,7 +58,8 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> str:
     whole = configuration(options.evaluation, dataset, cases, tools)
     config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
     config |= {"view": SIDE, "runs": options.runs, "base_runs": options.base_times}
-    device = torch.device("cpu" if options.base.base == "rgbd" else metrics_device(options.evaluation))
+    network = kind_of(options.base.base).network
+    device = torch.device(metrics_device(options.evaluation) if network else "cpu")
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
     with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output, "benchmark"):

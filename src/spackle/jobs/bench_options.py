@@ -8,7 +8,8 @@ from pathlib import Path
 
 from spackle.errors import InputError
 from spackle.evaluation.paper import DISPARITIES
-from spackle.jobs.evaluate_options import EvaluateOptions, check_evaluate_options
+from spackle.jobs.bases import kind_of
+from spackle.jobs.evaluate_options import BASE, EvaluateOptions, check_evaluate_options
 from spackle.jobs.options import PredictOptions
 
 MAX_RUNS = 1000
@@ -21,7 +22,7 @@ class BenchOptions:
     dataset: str
     root: Path
     disparities: Sequence[float] = DISPARITIES
-    base: PredictOptions = dataclasses.field(default_factory=PredictOptions)  # base, weights, residual, device
+    base: PredictOptions = BASE
     limit: int | None = None  # so many images, spread over the dataset
     runs: int = 5  # of what comes after the base
     base_runs: int | None = None  # predictions of an image; None: one of SHARP, which takes long, else `runs`
@@ -29,7 +30,7 @@ class BenchOptions:
     @property
     def base_times(self) -> int:
         """How often the base of an image is timed."""
-        return self.base_runs or (1 if self.base.base == "sharp" else self.runs)
+        return self.base_runs or (1 if kind_of(self.base.base).slow else self.runs)
 
     @property
     def evaluation(self) -> EvaluateOptions:

@@ -12,8 +12,9 @@ from spackle.downloads import read_record
 from spackle.downloads.partial import digest
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE
+from spackle.jobs.bases import kind_of, public_name
 from spackle.jobs.inputs import find_depth
-from spackle.jobs.options import PredictOptions, check_options
+from spackle.jobs.options import PredictOptions, check_has_depth, check_options
 from spackle.jobs.request import digest_of, fingerprint
 from spackle.precision import Precision
 from spackle.pseudo.build import ViewChoices
@@ -68,7 +69,9 @@ def view_choices(seed: int, views: int, trajectory: str | None, disparity: tuple
 
 def check_dataset_options(options: DatasetOptions) -> None:
     """InputError for an option that cannot be used, whatever the photos."""
+    kind_of(options.base.base)  # a dataset says of which base it is, so no `auto`
     check_options(options.base)
+    check_has_depth(options.base)
     depth = options.base.depth
     if depth is not None and not depth.is_dir():  # one map for all photos would be wrong for all but one
         raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
@@ -108,8 +111,8 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
         "spackle": spackle.__version__,
         "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
         "base": {
-            "name": base.base,
-            "weights": None if base.base_weights is None else weights_digest(base.base_weights),
+            "name": public_name(base.base),
+            "weights": base_digest(base),
             "precision": base.precision,
             "device": base.device,
         },
@@ -135,6 +138,12 @@ def depth_of(photo: PhotoFile, depth: Path) -> Path:
     """
     beside = depth / Path(photo.name).parent
     return find_depth(beside if depth.is_dir() and beside.is_dir() else depth, photo.path)
+
+
+def base_digest(base: PredictOptions) -> str | dict[str, str] | None:
+    """SHA-256 of the base's weights, of each file where there are several; None where none are known."""
+    digests = {name: weights_digest(file) for name, file in base.base_files.items()}
+    return digests if len(digests) > 1 else next(iter(digests.values()), None)
 
 
 def weights_digest(path: Path) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError, reason_in_a_line
+from spackle.jobs.bases import kind_of
 from spackle.jobs.dataset_crew import Crew
 from spackle.jobs.dataset_options import DatasetOptions
 from spackle.jobs.dataset_worker import Job, Made
@@ -126,6 +127,6 @@ def _check_room(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> 
 
 def gpus_of(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> int:
     """GPUs of a worker: one where a network would use it and any node has one, so all workers are alike."""
-    network = options.base.base == "sharp" or options.inpainter == "propainter"
+    network = kind_of(options.base.base).network or options.inpainter == "propainter"
     there = any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes)
     return int(network and there and options.base.device != "cpu")

@@ -18,12 +18,14 @@ from pathlib import Path
 
 import torch
 
+from spackle.bases.device import MemoryShort
 from spackle.bases.protocol import BasePrediction
+from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import Photo
 from spackle.jobs.dataset_options import DatasetOptions, depth_of
-from spackle.jobs.setup import BaseError, Tools, make_base, set_up
+from spackle.jobs.setup import Tools, make_base, set_up
 from spackle.pseudo.build import Seconds, key_of, make_sample, timed
 from spackle.pseudo.inpainters import Inpainter, get_inpainter
 from spackle.pseudo.photos import PhotoFile
@@ -95,7 +97,7 @@ class Maker:
         if options.depth is None:
             try:
                 return make_base(photo, options, self.tools).predict(photo)
-            except InputError as error:  # a photo alone suits it always: it is the machine
+            except MemoryShort as error:  # no fault of the photo's
                 raise BaseError(str(error)) from error
         depth = depth_of(file, options.depth)
         return make_base(photo, dataclasses.replace(options, depth=depth), self.tools).predict(photo)

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.cells import NOT_RUN
@@ -40,7 +41,6 @@ from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.request import digest_of, fingerprint
-from spackle.jobs.setup import BaseError
 from spackle.jobs.stopping import asked_to_stop
 
 

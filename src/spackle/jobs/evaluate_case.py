@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
+from spackle.choose import BaseError, Load
 from spackle.errors import InputError
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case
@@ -20,11 +21,8 @@ from spackle.evaluation.protocols import NEAR, Gauges, Wanted, large_views, meas
 from spackle.evaluation.results import Record
 from spackle.evaluation.sheets import TRUTH
 from spackle.jobs.evaluate_options import EvaluateOptions
-from spackle.jobs.setup import BaseError
 from spackle.render import Renderer
 from spackle.residual import ResidualNet, hole_mask
-
-Load = Callable[[], Base]
 
 
 @dataclasses.dataclass(frozen=True)

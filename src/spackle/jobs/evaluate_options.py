@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from spackle.errors import InputError
@@ -13,10 +12,13 @@ from spackle.evaluation.datasets import DATASETS
 from spackle.evaluation.figures import DEFAULT_METRICS, METRICS, PROTOCOLS
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.paper import DISPARITIES
-from spackle.jobs.options import BASES, PredictOptions, check_options
+from spackle.jobs.bases import kind_of
+from spackle.jobs.names import check_name
+from spackle.jobs.options import PredictOptions, check_base_options
 from spackle.precision import PRECISIONS
 from spackle.trajectory import MAX_DISPARITY
 
+BASE = PredictOptions(base="sharp")  # the paper's
 DEFAULT_METHODS = ("base", "spackle")
 MAX_LIMIT = 1_000_000
 MAX_DISPARITIES = 6  # columns of a table
@@ -32,7 +34,7 @@ class EvaluateOptions:
     methods: Sequence[str] = DEFAULT_METHODS
     disparities: Sequence[float] = DISPARITIES  # of the large views
     metrics: Sequence[str] | None = None  # the protocol's where None
-    base: PredictOptions = dataclasses.field(default_factory=PredictOptions)  # base, weights, residual, device
+    base: PredictOptions = BASE  # base, weights, residual, device
     direct_ft: Path | None = None  # weights of the method direct-ft
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
     limit: int | None = None  # so many images, spread over the dataset
@@ -62,16 +64,6 @@ def parse_disparities(text: str) -> tuple[float, ...]:
         raise InputError(f"--disparity {text}: not numbers: give them with commas, such as 0.3,0.4,0.5") from error
 
 
-def check_name(option: str, name: str, known: Iterable[str]) -> None:
-    """InputError for a name that there is not, with the nearest one."""
-    names = list(known)
-    if name in names:
-        return
-    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    advice = f"did you mean {near[0]}? There" if near else "there"
-    raise InputError(f"{option} {name}: unknown: {advice} are {', '.join(names)}")
-
-
 def check_evaluate_options(options: EvaluateOptions) -> None:
     """InputError for an option that cannot be used, whatever the images."""
     check_name("--dataset", options.dataset, DATASETS)
@@ -93,13 +85,10 @@ def check_evaluate_options(options: EvaluateOptions) -> None:
 def _check_base(options: EvaluateOptions) -> None:
     """The base's own options, and what the method direct-ft takes."""
     base = options.base
-    check_name("--base", base.base, BASES)
-    if base.base == "sharp":
-        check_options(base)
-    elif base.checkpoint is not None:
-        raise InputError(f"-c {base.checkpoint}: the rgbd base has no checkpoint: leave the option out")
+    kind_of(base.base)
     if base.precision not in PRECISIONS:
         raise InputError(f"--precision {base.precision}: unknown: there are {', '.join(PRECISIONS)}")
+    check_base_options(for_base(base))
     if base.residual == "none":
         raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
     if "direct-ft" in options.methods:
@@ -111,6 +100,11 @@ def _check_base(options: EvaluateOptions) -> None:
             )
     elif options.direct_ft is not None:
         raise InputError(f"--direct-ft {options.direct_ft}: no method takes it: add direct-ft to --methods")
+
+
+def for_base(base: PredictOptions) -> PredictOptions:
+    """The options without those that a base refuses for itself, and the residual's network takes here."""
+    return dataclasses.replace(base, precision="auto") if "--precision" in kind_of(base.base).refuses else base
 
 
 def _check_disparities(options: EvaluateOptions) -> None:

@@ -11,27 +11,25 @@ import torch
 
 import spackle
 from spackle.bases.sharp import SharpBase
+from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, EvalDataset
 from spackle.evaluation.figures import OWN
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import Gauges
 from spackle.evaluation.pyiqa_metrics import DEFINITIONS, open_metrics
-from spackle.jobs.dataset_options import weights_digest
+from spackle.jobs.bases import NETWORKS, kind_of, public_name, title_of
+from spackle.jobs.dataset_options import base_digest, weights_digest
 from spackle.jobs.evaluate_case import Bench
-from spackle.jobs.evaluate_options import EvaluateOptions
+from spackle.jobs.evaluate_options import EvaluateOptions, for_base
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import digest_of
-from spackle.jobs.setup import BaseError, set_up
+from spackle.jobs.setup import set_up
 from spackle.precision import pick_dtype
 from spackle.render import get_renderer
 from spackle.residual.weights import load_residual
 from spackle.training.features import FeatureNet, load_features
 
-BASES = {
-    "sharp": ("SHARP", "Apple's network, from the photo alone"),
-    "rgbd": ("rgbd", "the dataset's own depth, map or points, lifted; not SHARP, so not the paper's base"),
-}
 NO_FEATURES = "not run: weights: give SqueezeNet's with --features FILE"
 
 
@@ -62,7 +60,7 @@ def open_bench(options: EvaluateOptions) -> Bench:
     return Bench(
         options,
         get_renderer(base.device),
-        set_up(base).base if base.base == "sharp" else None,
+        set_up(for_base(base)).base if kind_of(base.base).network else None,
         network,
         direct,
         Gauges(wanted, published.metrics, features),
@@ -75,10 +73,9 @@ def configuration(
 ) -> dict[str, Any]:
     """Everything that decides the figures, ready for JSON; nothing of where files lie."""
     base = options.base
-    title, says = BASES[base.base]
     names = digest_of([case.name for case in cases])
-    weights = None if base.base_weights is None else weights_digest(base.base_weights)
-    about = {"name": base.base, "title": title, "says": says, "weights": weights, "precision": base.precision}
+    about = {"name": public_name(base.base), "title": title_of(base.base), "says": kind_of(base.base).says}
+    weights = {"weights": base_digest(base), "precision": base.precision}
     residual = base.residual_file and weights_digest(base.residual_file)
     return {
         "spackle": spackle.__version__,
@@ -88,7 +85,7 @@ def configuration(
         "images": {"count": len(cases), "limit": options.limit, "names": names},
         "protocol": options.protocol,
         "disparities": None if options.near else list(options.disparities),
-        "base": about | {"device": metrics_device(options)},
+        "base": about | weights | {"device": metrics_device(options)},
         "methods": list(options.methods),
         "residual": {"weights": "given" if base.residual not in (None, "seeds") else base.residual_weights}
         | {"sha256": residual, "precision": _residual_precision(base)},
@@ -114,8 +111,8 @@ def check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
         return  # each is named in its turn
     if options.near and not any(case.seconds for case in cases):
         raise InputError(f"{where}: has no second photos: take --protocol large-view")
-    if options.base.base == "rgbd" and not any(case.depth or case.points for case in cases):
-        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take --base sharp")
+    if not kind_of(options.base.base).network and not any(case.depth or case.points for case in cases):
+        raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take {', '.join(NETWORKS)}")
 
 
 def _features(options: EvaluateOptions) -> FeatureNet | None:

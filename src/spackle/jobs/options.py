@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Literal
 
 from spackle.camera import Camera
-from spackle.downloads import installed
 from spackle.errors import InputError
+from spackle.jobs.bases import AUTO, HF, KINDS, NETWORKS, base_files, kind_of
+from spackle.jobs.names import check_name
 from spackle.precision import PRECISIONS, Precision
 from spackle.residual.weights import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]
-BASES = ("rgbd", "sharp")
 MAX_FRAMES = 10_000
 MAX_VIDEO_SIDE = 8192
 
@@ -25,7 +25,7 @@ MAX_VIDEO_SIDE = 8192
 class PredictOptions:
     """The choices of `spackle predict`."""
 
-    base: str = "rgbd"
+    base: str = AUTO  # or as `kind_of` has it
     depth: Path | None = None  # a depth map, or a folder of depth maps named as the photos
     calib: Path | None = None  # calibration of a disparity map
     checkpoint: Path | None = None  # weights of the base
@@ -61,46 +61,59 @@ class PredictOptions:
         return SHIPPED if named == "shipped" else None if named in ("seeds", "none") else Path(named)
 
     @property
-    def base_weights(self) -> Path | None:
-        """The base's weights: those that were given, else those that were downloaded, if any."""
-        return self.checkpoint or (installed("sharp") if self.base == "sharp" else None)
+    def named(self) -> str:
+        """The base that is named: with --depth `auto` is `rgbd`."""
+        return "rgbd" if self.base == AUTO and self.depth is not None else self.base
+
+    @property
+    def base_files(self) -> dict[str, Path]:
+        """As `spackle.jobs.bases.base_files` has it."""
+        return base_files(self.named, self.checkpoint)
 
 
 def check_options(options: PredictOptions) -> None:
     """InputError for an option that cannot be used, whatever the photo."""
-    if options.base not in BASES:
-        raise InputError(f"--base {options.base}: unknown base; this version has: {', '.join(BASES)}")
-    if options.precision not in PRECISIONS:
-        raise InputError(f"--precision {options.precision}: unknown; there are {', '.join(PRECISIONS)}")
-    (_check_sharp if options.base == "sharp" else _check_rgbd)(options)
+    if not options.base.startswith(HF):
+        check_name("--base", options.base, (AUTO, *KINDS))
+    check_base_options(options)
     check_path_options(options.disparity, options.frames)
 
 
-def _check_sharp(options: PredictOptions) -> None:
-    for name, value in (("--depth", options.depth), ("--calib", options.calib)):
-        if value is not None:
-            raise InputError(f"{name} {value}: the sharp base finds depth itself; leave the option out")
-    if options.base_weights is None:
+def check_base_options(options: PredictOptions) -> None:
+    """InputError for a base that there is not, or that has no use for an option that is given."""
+    if options.precision not in PRECISIONS:
+        raise InputError(f"--precision {options.precision}: unknown: there are {', '.join(PRECISIONS)}")
+    refuses = {} if options.named == AUTO else kind_of(options.named).refuses
+    for option, value in _given(options).items():
+        if option in refuses:
+            who = options.named.partition(":")[0]
+            raise InputError(f"{option}{value}: the {who} base {refuses[option]}; leave the option out")
+    if options.calib is not None and options.depth is None:
+        raise InputError(f"--calib {options.calib}: is for a disparity map: give that with --depth")
+    if options.named == "sharp" and not options.base_files:
         raise InputError(
             "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
             "(2.8 GB, for research only), -c FILE takes a local copy"
         )
 
 
-def _check_rgbd(options: PredictOptions) -> None:
-    if options.depth is None:
+def check_has_depth(options: PredictOptions) -> None:
+    """InputError where the base takes depth and none is given."""
+    if not kind_of(options.named).network and options.depth is None:
         raise InputError(
-            "--base rgbd needs the photo's depth: give --depth FILE, or --depth FOLDER for many photos; "
-            "--base sharp needs none"
+            f"--base {options.base} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
         )
-    if options.checkpoint is not None:
-        raise InputError(f"-c {options.checkpoint}: the rgbd base has no checkpoint; leave the option out")
-    for name, given in (
-        (f"--precision {options.precision}", options.precision != "auto"),
-        ("--low-memory", options.low_memory),
-    ):
-        if given:
-            raise InputError(f"{name}: the rgbd base has no network; leave the option out")
+
+
+def _given(options: PredictOptions) -> dict[str, str]:
+    """What was given of the options that not every base has a use for, by their names."""
+    values = {"--depth": options.depth, "--calib": options.calib, "-c": options.checkpoint}
+    given = {name: f" {value}" for name, value in values.items() if value is not None}
+    if options.precision != "auto":
+        given["--precision"] = f" {options.precision}"
+    if options.low_memory:
+        given["--low-memory"] = ""
+    return given
 
 
 def check_path_options(disparity: float, frames: int) -> None:

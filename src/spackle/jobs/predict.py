@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-import torch
-
+from spackle.choose import BaseError, all_finite
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.gaussians import Gaussians
@@ -16,7 +15,7 @@ from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.request import request_of
-from spackle.jobs.setup import BaseError, Tools, make_base, set_up
+from spackle.jobs.setup import Tools, search_base, set_up
 from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
 
 FILES_WITHOUT_VIDEO = ("base.ply", "scene.ply", "report.json")
@@ -81,26 +80,25 @@ def _predict_loaded(
     """The stages after loading; nothing is written before all is computed."""
     name = photo.path.name
     with reporter.stage("prepare", seconds):
-        base = make_base(photo, options, tools)
+        search = search_base(photo, options, tools, reporter.say)
+        search.load()
     with reporter.stage("base", seconds) as step:
-        prediction = base.predict(photo, step)
-        if not _finite(prediction.gaussians):
-            raise InputError(
-                f"{photo.path}: the base's Gaussians leave the range of float32: check depth and focal length"
-            )
+        prediction, choice = search.predict(step)
     photo = resize_photo(photo)
+    if tools.auto is not None and (news := tools.auto.news(choice)):
+        reporter.say(f"{name}: {news}")
     reporter.say(
-        f"{name}: {len(prediction.gaussians):,} Gaussians from {base.name}, "
+        f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
         f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source(photo, prediction)})"
     )
     if missing := float(prediction.notes.get("depth_filled", 0)):
         reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
-    if size := prediction.notes.get("depth_resampled_from"):
+    if options.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
         reporter.say(f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}")
     plan = make_plan(photo.path, prediction, options, tools.views)
     with reporter.stage("complete", seconds) as step:
         completed = complete(prediction, plan, options, tools, step)
-        if not _finite(completed.aux):
+        if not all_finite(completed.aux):
             raise InputError(f"{options.cameras or photo.path}: views too extreme to complete: check their K")
     with reporter.stage("write", seconds):
         (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
@@ -116,7 +114,7 @@ def _predict_loaded(
             save_views(folder / "views", plan, completed, tools.renderer, step)
     with reporter.stage("measure", seconds):
         holes = measure_holes(plan, completed, tools.renderer)
-    report = make_report(photo, prediction, base.name, completed, options, tools, holes, request, seconds)
+    report = make_report(photo, prediction, choice, completed, options, tools, holes, request, seconds)
     write_report(report, folder / "report.json")
     reporter.say(f"{name}: {summary(report)} -> {folder}")
 
@@ -125,7 +123,3 @@ def _results(options: PredictOptions, tools: Tools) -> list[str]:
     """All files that a prediction writes."""
     views = [f"views/{name}" for name in view_files(len(tools.views or []))]
     return [*(FILES if options.render else FILES_WITHOUT_VIDEO), *views]
-
-
-def _finite(gaussians: Gaussians) -> bool:
-    return all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors)

@@ -9,6 +9,7 @@ from typing import Any
 
 import spackle
 from spackle.bases.protocol import BasePrediction
+from spackle.choose import Choice
 from spackle.formats import atomic_path
 from spackle.image import Photo
 from spackle.jobs.options import PredictOptions
@@ -26,7 +27,7 @@ def focal_source(photo: Photo, prediction: BasePrediction) -> str:
 def make_report(
     photo: Photo,
     prediction: BasePrediction,
-    base_name: str,
+    choice: Choice,
     completed: Completed,
     options: PredictOptions,
     tools: Tools,
@@ -41,7 +42,7 @@ def make_report(
         "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
         "focal_px": round(prediction.camera.focal[0], 3),
         "focal_source": focal_source(photo, prediction),
-        "base": {"name": base_name, "gaussians": base, **prediction.notes},
+        "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
         "residual": {"weights": tools.residual},
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
@@ -49,9 +50,11 @@ def make_report(
         "views": options.cameras.name if options.cameras else options.trajectory,
         "disparity": None if options.cameras else options.disparity,
         "hole_area_ratio": holes,
-        "request": request,
+        "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
+    if choice.passed_over:
+        report["base"]["passed_over"] = list(choice.passed_over)
     if tools.residual == "seeds":
         report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
     if completed.saved_view is not None:

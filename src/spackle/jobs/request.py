@@ -10,6 +10,7 @@ from pathlib import Path
 import spackle
 from spackle.bases.depth_maps import calibrations_beside
 from spackle.image import check_file
+from spackle.jobs.bases import hf_folder
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions
 
@@ -23,13 +24,14 @@ def shared_digest(options: PredictOptions) -> str:
     Raises:
         InputError: one of the files is missing.
     """
-    files = {"calibration": options.calib, "camera file": options.cameras, "checkpoint": options.base_weights}
-    files["weights"] = options.residual_file
+    files = {"calibration": options.calib, "camera file": options.cameras, "weights": options.residual_file}
     choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
     for name in IRRELEVANT:
         del choices[name]
-    choices |= {"spackle": spackle.__version__, "residual": options.residual_weights}
-    return digest_of([choices, *(file and fingerprint(file, kind) for kind, file in files.items())])
+    base = options.named if hf_folder(options.named) is None else "hf"  # its files tell, wherever they lie
+    choices |= {"spackle": spackle.__version__, "residual": options.residual_weights, "base": base}
+    weights = {name: fingerprint(file, name) for name, file in options.base_files.items()}
+    return digest_of([choices, weights, *(file and fingerprint(file, kind) for kind, file in files.items())])
 
 
 def request_of(photo: Path, options: PredictOptions, shared: str) -> str:

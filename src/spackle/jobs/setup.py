@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 from spackle.bases.depth_maps import load_depth
+from spackle.bases.hf import HfBase
+from spackle.bases.lite.base import LiteBase
 from spackle.bases.protocol import Base
 from spackle.bases.rgbd import RgbdBase
-from spackle.bases.sharp import SharpBase
 from spackle.camera import Camera
-from spackle.downloads import check_recorded
+from spackle.choose import Auto, BaseError, Load, Say, Search, Way, by_own_depth, load_sharp
 from spackle.errors import InputError
 from spackle.formats import load_cameras
 from spackle.image import Photo
+from spackle.jobs.bases import AUTO, HF, NETWORKS, kind_of
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options, video_problem
 from spackle.jobs.request import shared_digest
@@ -23,16 +24,13 @@ from spackle.residual import ResidualNet
 from spackle.residual.weights import load_residual
 
 
-class BaseError(InputError):
-    """The base of all photos cannot be used, so there is no point in trying the next photo."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Tools:
     """What is set up once for all photos."""
 
     renderer: Renderer
-    base: Callable[[], Base] | None  # loads one that needs nothing beside the photo, the first time it is asked for
+    base: Load | None  # of a network, which is loaded the first time it is asked for
+    auto: Auto | None  # finds a base for each photo, where none is named
     network: ResidualNet | None
     residual: str  # for the report: "shipped", a path, "seeds" or "none"
     views: list[Camera] | None  # of --cameras
@@ -52,29 +50,58 @@ def set_up(options: PredictOptions) -> Tools:
     if views and options.render and (problem := video_problem(views)):
         raise InputError(f"{options.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     digest = shared_digest(options)
-    # SHARP takes seconds to load: not before a photo is known to need it.
-    base = functools.cache(lambda: _load_sharp(options, digest)) if options.base == "sharp" else None
-    return Tools(get_renderer(options.device), base, network, options.residual_weights, views, digest)
+    base, auto = _bases(options, digest)
+    return Tools(get_renderer(options.device), base, auto, network, options.residual_weights, views, digest)
 
 
-def _load_sharp(options: PredictOptions, digest: str) -> SharpBase:
-    """SHARP with the weights that were given or downloaded; a download is held to its record first."""
-    path = options.base_weights
-    device = None if options.device == "auto" else options.device
+def _bases(options: PredictOptions, digest: str) -> tuple[Load | None, Auto | None]:
+    """A network, or the search for a base, or neither; nothing is loaded yet, for that takes seconds."""
+    name = options.named
+    if name == AUTO:
+        there = "checkpoint" in options.base_files
+        sharp, lite = (functools.partial(_load, kind, options, digest) for kind in ("sharp", "lite"))
+        return None, Auto(sharp if there else None, lite)
+    if not kind_of(name).network:
+        return None, None
+    return functools.cache(functools.partial(_load_for_all, options, digest)), None
+
+
+def _load_for_all(options: PredictOptions, digest: str) -> Base:
+    """The network that --base names; BaseError where it cannot be loaded."""
     try:
-        if path is None:  # there were some when the options were checked
-            raise InputError("SHARP's weights have gone while this was running: start again")
-        check_recorded(path)  # where there is a record
-        base = SharpBase.load(path, precision=options.precision, low_memory=options.low_memory, device=device)
-        if shared_digest(options) != digest:
-            raise InputError(f"{path}: changed while this was running: start again")
+        return _load(options.named, options, digest)
     except InputError as error:
         raise BaseError(str(error)) from error
+
+
+def _load(name: str, options: PredictOptions, digest: str) -> Base:
+    """A network, by files that have not changed since the options were checked.
+
+    Raises:
+        InputError: it cannot be loaded.
+        BaseError: its files are others now.
+    """
+    base = _network(name, options)
+    if shared_digest(options) != digest:
+        files = ", ".join(str(file) for file in options.base_files.values())
+        raise BaseError(f"{files}: changed while this was running: start again")
     return base
 
 
+def _network(name: str, options: PredictOptions) -> Base:
+    device = None if options.device == "auto" else options.device
+    if name == "lite":
+        return LiteBase.load(options.checkpoint if options.named == name else None, device=device)
+    if name.startswith(HF):
+        return HfBase.load(name.removeprefix(HF), device=device, precision=options.precision)
+    path = options.base_files.get("checkpoint")
+    if path is None:  # there were some when the options were checked
+        raise InputError("SHARP's weights have gone while this was running: start again")
+    return load_sharp(path, precision=options.precision, low_memory=options.low_memory, device=device)
+
+
 def make_base(photo: Photo, options: PredictOptions, tools: Tools) -> Base:
-    """The base for one photo, given at its full size.
+    """The base that is named, for one photo, given at its full size.
 
     Raises:
         BaseError: no photo can be worked on.
@@ -82,7 +109,8 @@ def make_base(photo: Photo, options: PredictOptions, tools: Tools) -> Base:
     """
     if tools.base is not None:
         return tools.base()
-    assert options.depth is not None  # set_up has refused it
+    if options.depth is None:
+        return _by_own_depth(photo)
     path = find_depth(options.depth, photo.path)
     depth = load_depth(path, calib=options.calib)
     depth.check_shape(photo.height, photo.width, photo.path)
@@ -90,3 +118,22 @@ def make_base(photo: Photo, options: PredictOptions, tools: Tools) -> Base:
         scale = depth.depth.shape[1] / photo.width
         depth = load_depth(path, calib=options.calib, focal_px=photo.focal_px * scale)
     return RgbdBase(depth)
+
+
+def search_base(photo: Photo, options: PredictOptions, tools: Tools, say: Say) -> Search:
+    """The base for one photo, named or not; `say` is told what is passed over."""
+    if tools.auto is not None:
+        return tools.auto.search(photo, say)
+    why = f"--base {options.base}" if options.depth is None else "--depth"
+    return Search(photo, [Way(why, lambda photo: make_base(photo, options, tools))], say)
+
+
+def _by_own_depth(photo: Photo) -> RgbdBase:
+    """By the depth in the photo's file; InputError where there is none."""
+    base = by_own_depth(photo)
+    if base is None:
+        raise InputError(
+            f"{photo.path}: --base rgbd needs depth, and there is none in the photo: give --depth FILE, or --depth "
+            f"FOLDER for many photos; {', '.join(NETWORKS)} need none"
+        )
+    return base

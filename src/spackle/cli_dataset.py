@@ -1,0 +1,124 @@
+"""`spackle dataset`: build, info, verify, preview."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.cli_options import INTERRUPTED, Device, DeviceOption, PrecisionChoice, Trajectory, VerboseOption
+
+dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
+
+
+class InpainterChoice(str, Enum):
+    """What completes the views of a dataset."""
+
+    geometry = "geometry"
+    opencv = "opencv"
+    propainter = "propainter"
+    none = "none"
+
+
+DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")]
+
+
+@dataset.command("build")
+def dataset_build(
+    photos: Annotated[
+        Path, typer.Option(metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a build in it goes on.")],
+    images: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
+    ] = None,
+    sample: Annotated[int | None, typer.Option(help="So many photos, chosen at random; default: all.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the choice and of the paths.")] = 0,
+    base: Annotated[
+        str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, lite or hf:NAME.")
+    ] = "sharp",
+    depth: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Depth maps named as the photos, for --base rgbd.")
+    ] = None,
+    checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
+    precision: Annotated[PrecisionChoice, typer.Option(help="Of the base's network.")] = PrecisionChoice.auto,
+    views: Annotated[int, typer.Option(help="Views of a photo, its own among them.")] = 20,
+    trajectory: Annotated[Trajectory | None, typer.Option(help="Camera path; default: drawn for each photo.")] = None,
+    disparity: Annotated[
+        tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
+    ] = (0.1, 0.6),
+    inpainter: Annotated[
+        InpainterChoice, typer.Option(help="What completes the views; none leaves the holes.")
+    ] = InpainterChoice.geometry,
+    inpainter_weights: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Weights of propainter: three .pth files.")
+    ] = None,
+    inpainter_side: Annotated[
+        int | None, typer.Option(help="Long side in pixels at which propainter works; default: 640.")
+    ] = None,
+    workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
+    ray: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
+    ] = None,
+    threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
+    shard_size: Annotated[int, typer.Option(help="Photos of a tar file.")] = 50,
+    device: DeviceOption = Device.auto,
+    verbose: VerboseOption = False,
+) -> None:
+    """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
+    from spackle.jobs.dataset_build import build_dataset
+    from spackle.jobs.dataset_options import DatasetOptions, base_options, view_choices
+    from spackle.jobs.progress import Reporter
+
+    options = DatasetOptions(
+        base=base_options(base, depth, checkpoint, precision.value, device.value),
+        choices=view_choices(seed, views, trajectory and trajectory.name, disparity),
+        images=images,
+        sample=sample,
+        inpainter=inpainter.value,
+        inpainter_weights=inpainter_weights,
+        inpainter_side=inpainter_side,
+        workers=workers,
+        ray=ray,
+        threads=threads,
+        shard_size=shard_size,
+    )
+    if build_dataset(photos, output, options, Reporter(verbose)) == "stopped":
+        raise typer.Exit(INTERRUPTED)
+
+
+@dataset.command("info")
+def dataset_info(location: DatasetArgument) -> None:
+    """Say what a dataset holds: counts, sizes, holes of each view, configuration."""
+    from rich.console import Console
+
+    from spackle.jobs.dataset_look import show_info
+
+    show_info(location, Console(highlight=False))
+
+
+@dataset.command("verify")
+def dataset_verify(location: DatasetArgument) -> None:
+    """Read every byte and name each damaged sample; exit code 1 where there is one."""
+    from spackle.jobs.dataset_look import verify_dataset
+    from spackle.jobs.progress import Reporter
+
+    if verify_dataset(location, Reporter()):
+        raise typer.Exit(1)
+
+
+@dataset.command("preview")
+def dataset_preview(
+    location: DatasetArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder for the two files.")],
+    photos: Annotated[int, typer.Option(help="How many photos.")] = 3,
+    views: Annotated[int, typer.Option(help="How many views of each.")] = 6,
+) -> None:
+    """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
+    from spackle.jobs.dataset_look import preview_dataset
+    from spackle.jobs.progress import Reporter
+
+    preview_dataset(location, output, photos, views, Reporter())

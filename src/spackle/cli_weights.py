@@ -1,0 +1,57 @@
+"""`spackle weights`: get, make, list."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
+
+
+class NetworkSize(str, Enum):
+    """Sizes of SHARP's network."""
+
+    full = "full"
+    tiny = "tiny"
+
+
+@weights.command("get")
+def weights_get(
+    name: Annotated[str, typer.Argument(help="Which weights: sharp.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
+    ] = None,
+    url: Annotated[str | None, typer.Option(help="Download from this mirror.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Download what is there already.")] = False,
+) -> None:
+    """Download weights and record their SHA-256; a broken download goes on where it stopped."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.weights import get_weights
+
+    get_weights(name, output, Reporter(), url=url, force=force)
+
+
+@weights.command("make")
+def weights_make(
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
+    size: Annotated[NetworkSize, typer.Option(help="The published size, or one for tests.")] = NetworkSize.full,
+) -> None:
+    """Make random weights of SHARP's shape, the same each time, to try everything without Apple's."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.weights import make_weights
+
+    make_weights(output, size.value, Reporter())
+
+
+@weights.command("list")
+def weights_list() -> None:
+    """Say which weights are known, and which of them are here."""
+    from rich.console import Console
+
+    from spackle.jobs.weights import list_weights
+
+    list_weights(Console(highlight=False))

@@ -1,0 +1,32 @@
+"""A little of everything that the lite base learns from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from photos import metres, picture, write_depth, write_photo
+from PIL import Image
+
+
+def write_data(place: Path) -> None:
+    """Photos, one of them broken; kitchen/ with six frames of a depth camera; pairs/ and others/ with a stereo pair."""
+    write_photo(place / "photos" / "sub" / "a.png", 120, 90)
+    Image.fromarray(255 - picture(90, 120)).save(place / "photos" / "b.png")
+    (place / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
+    for number in range(6):
+        write_photo(place / "kitchen" / f"{number}.color.jpg")
+        write_depth(place / "kitchen" / f"{number}.depth.png", metres(near=1.0 + number))
+    _write_stereo(place / "pairs" / "one", 3.0)
+    _write_stereo(place / "others" / "two", 2.0)
+
+
+def _write_stereo(folder: Path, near: float) -> None:
+    """Two photos, and the left one's disparity: depth = 0.1 · 60 / d."""
+    for name in ("left", "right"):
+        write_photo(folder / f"{name}.png")
+    np.save(folder / "disparity.npy", 6.0 / metres(near=near))
+    names = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
+    lens = {"focal_px": 60, "cx": 32, "cy": 24, "doffs_px": 0, "baseline_m": 0.1}
+    (folder / "scene.json").write_text(json.dumps({**names, **lens}))

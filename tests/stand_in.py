@@ -1,0 +1,59 @@
+"""Bases in no time, whose depth is known beforehand; random weights of lite; `spackle predict` with either."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from command import Run, report_of, run
+from photos import box
+from safetensors.torch import save_file
+
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.lite.network import LiteNet
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.rgbd import lift
+from spackle.image import Photo, resize_photo
+
+QUICK = ("--no-render", "--residual", "none")
+
+
+class StandIn:
+    """A base that knows where the box is."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        photo = resize_photo(photo)
+        depth = torch.from_numpy(np.where(box(photo.width, photo.height), 2.0, 6.0).astype(np.float32))
+        map_ = DepthMap(depth, depth > 0, None, None, "depth", photo.path)
+        return lift(photo.rgb, map_, photo.camera)
+
+
+def write_lite(path: Path) -> Path:
+    """Random weights of the lite network."""
+    torch.manual_seed(0)
+    save_file(LiteNet().state_dict(), path)
+    return path
+
+
+def predict(tmp_path: Path, *options: object) -> Run:
+    """`spackle predict` into `out`, without completion."""
+    return run("predict", "-o", tmp_path / "out", *QUICK, *options)
+
+
+def base_of(tmp_path: Path, *options: object) -> tuple[dict[str, Any], Run]:
+    """What the report says of the base of a single photo."""
+    result = predict(tmp_path, *options)
+    assert result.code == 0, result.err
+    return report_of(tmp_path / "out" / Path(str(options[options.index("-i") + 1])).stem)["base"], result
+
+
+def refuses(result: Run, *named: object) -> None:
+    """One line that names the culprit."""
+    assert (result.code, len(result.lines)) == (2, 1), result.err
+    for name in named:
+        assert str(name) in result.err
