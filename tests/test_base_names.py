@@ -16,9 +16,9 @@ from safetensors.torch import load_file, save_file
 from sharp_weights import write_tiny
 from stand_in import StandIn, base_of, predict, refuses, write_lite
 
+from spackle.bases.device import MemoryShort
 from spackle.bases.hf import HfBase
 from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.device import MemoryShort
 from spackle.errors import InputError
 from spackle.image import Photo
 from spackle.jobs.bases import base_files, public_name

@@ -16,12 +16,12 @@ from sharp_weights import DATA, MICRO, gaussians_of, micro_network, tiny_weights
 from torch import Tensor, nn
 
 import spackle
+from spackle.bases.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_square
 from spackle.bases.sharp.checkpoint import expected_shapes
 from spackle.bases.sharp.config import FULL, TINY
 from spackle.bases.sharp.decoder import GroupNorm
-from spackle.bases.device import enough_memory, own_arithmetic, pick_device
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.bases.sharp.precision import set_precision
 from spackle.bases.sharp.pyramid import FULL_WINDOWS, HALF_WINDOWS, WINDOWS, cut, merge
