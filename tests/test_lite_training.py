@@ -21,6 +21,7 @@ from training_runs import killed_at, started, state
 from spackle.bases.lite.network import LiteNet
 from spackle.network_file import read_network
 from spackle.training.depth.mixture import DepthBatch, Mixture
+from spackle.training.depth.recipe import LiteRecipe
 from spackle.training.recipe_file import load_lite_recipe
 
 pytest.importorskip("yaml")
@@ -126,7 +127,8 @@ def test_the_encoders_first_stages_stay_and_the_others_learn_at_a_rate_of_their_
     assert learned >= {name for name in after if not name.startswith("encoder.")}
     assert "encoder.stages.6.0.project.weight" in learned
     encoder, decoder = (group["lr"] for group in state(whole[0]).optimizer["param_groups"])
-    assert encoder == pytest.approx(0.1 * decoder)
+    assert encoder == pytest.approx(LiteRecipe().optim.encoder_rate * decoder)
+    assert not {name for name in learned if ".depthwise." in name and name.startswith("encoder.")}
     done = train(place, tmp_path / "out", "optim.frozen=0", "optim.encoder_rate=1", "optim.steps=1")
     assert done.code == 0, done.err
     one = state(tmp_path / "out")

@@ -86,7 +86,7 @@ def test_a_sky_that_melts_into_the_sea_is_left_alone() -> None:
 
 def test_nothing_is_behind_the_sky_not_even_what_was() -> None:
     found = outdoors()
-    hills = (torch.arange(96)[:, None] > 40) & found.sky
+    hills = (torch.arange(96)[:, None] > 46) & found.sky
     rgb = torch.where(hills[..., None], torch.tensor([0.2, 0.3, 0.15]), found.scene.rgb)
     z = (
         dataclasses.replace(found.scene, rgb=rgb, depth=torch.where(hills, 1e6, found.scene.depth))

@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
-from spackle.surface import EDGE
 
 NEAR_QUANTILE = 0.9  # of the inverse depth: what counts as the scene's near side
 FAR_QUANTILE = 0.05  # and as its far side
@@ -26,6 +25,7 @@ SMOOTH = 0.12  # largest change between neighbouring pixels of the sky, sum of t
 LEAST_SHARE = 0.01  # of the photo
 MOST_NEAR = 0.25  # of a sky may be nearer than at the border: a floor that runs to the horizon comes nearer steadily
 MOST_LEAKS = 0.1  # of a sky's outline: where it goes on nearer in the same colours, it is a floor or a ceiling
+LEAP = 1.5  # more than this factor between the inverse depths of neighbours: there the sky ends
 CLOSING_PX = 2  # specks in the sky that are as far as it is, belong to it
 BEYOND = 0.1  # the sky's inverse depth, in units of the far side of all else
 CLEAR = 1.1  # and all else is at least by this factor nearer
@@ -136,7 +136,7 @@ def _leaks(sky: Tensor, inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> bo
             )
             rim = inside[0] & ~outside[0]
             alike = ((inside[2] - outside[2]).abs().sum(-1) <= SMOOTH) & outside[4] & outside[3]
-            continues = ~inside[3] | (outside[1] - inside[1] <= EDGE * outside[1])
+            continues = ~inside[3] | (outside[1] <= LEAP * inside[1])
             outline += int(rim.sum())
             leaks += int((rim & alike & continues).sum())
     return leaks > MOST_LEAKS * outline

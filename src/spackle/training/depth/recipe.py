@@ -18,8 +18,8 @@ WEIGHTS, RUN = DepthLossWeights(), RunRecipe()
 class LiteShares:
     """How often a picture comes from each source; they need not add up to 1. One without data counts as 0."""
 
-    made: float = 0.5
-    stereo: float = 0.28
+    made: float = 0.45
+    stereo: float = 0.33
     rgbd: float = 0.22
 
 
@@ -30,7 +30,7 @@ class LiteData:
     photos: Path | None = None  # a folder, with its subfolders: the surfaces of made scenes are cut from them
     rgbd: tuple[RgbdFolder, ...] = ()  # of these the focal length is not asked for
     stereo: Path | None = None  # a folder of scenes, each with a scene.json
-    made: int = 4000  # made scenes
+    made: int = 2000  # made scenes
     shares: LiteShares = LiteShares()
     size: tuple[int, int] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
     cache: Path | None = None  # a folder for the made scenes; inside the output where None
@@ -43,7 +43,7 @@ class LiteData:
 class LiteOptim(OptimRecipe):
     """As for the other methods, and what the encoder, which comes with weights of its own, does otherwise."""
 
-    encoder_rate: float = 0.1  # factor on the encoder's learning rate
+    encoder_rate: float = 0.2  # factor on the encoder's learning rate
     frozen: int = 2  # the encoder's first stages stay as they are, and its stem with them; 0: all of it learns
 
 
