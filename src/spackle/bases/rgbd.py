@@ -70,7 +70,8 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         depth: any size of the same aspect ratio.
         camera: the photo's camera, at the world's origin.
     """
-    sky = push_sky(*_inverse_depth(depth, rgb, camera))
+    inverse_depth, known = _inverse_depth(depth, rgb, camera)
+    sky = push_sky(inverse_depth, rgb, known)
     missing = 1.0 - float(sky.known.float().mean())
     inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
@@ -87,8 +88,8 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     return BasePrediction(gaussians, camera, notes)
 
 
-def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Inverse depth on the photo's grid [H, W], the photo, and where the depth is known [H, W].
+def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Inverse depth on the photo's grid and where it is known, [H, W] each.
 
     Noise is evened out in the map as it came; then every smeared or resampled edge is moved to where
     the photo has it. A clean map of the photo's size stays as it is.
@@ -103,7 +104,7 @@ def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor
     edges = find_edges(smooth, known, (fx * columns / camera.width, fy * rows / camera.height))
     sampled = sample(smooth, known, edges, camera.height, camera.width)
     settled, found = settle(sampled, rgb.contiguous().numpy())
-    return torch.from_numpy(settled), rgb, torch.from_numpy(found)
+    return torch.from_numpy(settled), torch.from_numpy(found)
 
 
 def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
