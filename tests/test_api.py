@@ -134,6 +134,11 @@ def test_complete_visits_what_it_is_given(scene: spackle.Scene, tmp_path: Path) 
     assert all(spackle.hole_area_ratio(made.render(camera).alpha) < 1e-3 for camera in cameras)
 
 
+def test_a_bases_name_is_no_base(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"base='lite': give a base that is loaded"):
+        spackle.predict(write_photo(tmp_path / "photo.jpg"), base="lite")  # type: ignore[arg-type]
+
+
 def test_bad_input_is_a_value_error_that_names_the_file(scene: spackle.Scene, tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path)
     for arguments, culprit in (((tmp_path / "no.png", depth), "no.png"), ((photo, photo), "photo.png")):

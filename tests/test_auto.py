@@ -133,6 +133,14 @@ def test_or_if_they_are_given(tmp_path: Path, sharp: Path, quick: list[dict[str,
     assert [asked["path"] for asked in quick] == [given, given]
 
 
+def test_weights_that_a_person_gave_are_taken_or_refused(tmp_path: Path, sharp: Path) -> None:
+    photo, given = write_photo(tmp_path / "photo.jpg"), tmp_path / "mine.pt"
+    refuses(predict(tmp_path, "-i", photo, "-c", given), "mine.pt")
+    for damage in (garbage, of_another_network):
+        said = damage(given)
+        refuses(predict(tmp_path, "-i", photo, "-c", given), said)
+
+
 def test_a_machine_without_a_home_has_no_sharp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def homeless() -> Path:
         raise RuntimeError("no home")

@@ -179,7 +179,9 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
     except Image.DecompressionBombError:
         raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
     except UnidentifiedImageError:
-        raise InputError(f"{path}: not an image in any format that is known here: give a JPEG, PNG or HEIC") from None
+        raise InputError(
+            f"{path}: not an image in any format that is known here: give a JPEG, PNG, WebP, HEIC or TIFF"
+        ) from None
     except Exception as error:
         raise InputError(
             f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged or cut off"

@@ -15,6 +15,7 @@ from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
 from spackle.choose import auto_here
+from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
@@ -101,11 +102,13 @@ def predict(
         renderer: the CPU's where None.
 
     Raises:
-        InputError: a photo or a depth map that cannot be used.
+        InputError: a photo or a depth map that cannot be used, or a base's name in place of a base.
         ValueError: depth and base both given.
     """
     if depth is not None and base is not None:
         raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
+    if isinstance(base, str):
+        raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
     loaded = photo if isinstance(photo, Photo) else load_photo(photo)
     if depth is not None:
         base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))

@@ -67,7 +67,7 @@ def kind_of(name: str) -> BaseKind:
     if name == AUTO:
         raise InputError(f"--base {AUTO}: results must say what they are of: name one of {', '.join(KINDS)}")
     if name == HF:
-        raise InputError(f"--base {HF}: names no model: give owner/name of the hub, or a folder")
+        raise InputError(f"--base {HF} names no model: give owner/name of the hub, or a folder")
     key = ANY_HF if name.startswith(HF) else name
     check_name("--base", key, KINDS)
     return KINDS[key]
@@ -105,7 +105,7 @@ def base_files(name: str, checkpoint: Path | None) -> dict[str, Path]:
         return {file.name: file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()}
     found: dict[str, Path | None] = {}
     if name in ("sharp", AUTO):
-        found["checkpoint"] = checkpoint or (sharp_here() if name == AUTO else installed("sharp"))
+        found["checkpoint"] = sharp_here() if name == AUTO else checkpoint or installed("sharp")
     if name in ("lite", AUTO):
         found["lite weights"] = (checkpoint if name == "lite" else None) or shipped_lite()
     return {title: file for title, file in found.items() if file is not None}

@@ -62,8 +62,10 @@ class PredictOptions:
 
     @property
     def named(self) -> str:
-        """The base that is named: with --depth `auto` is `rgbd`."""
-        return "rgbd" if self.base == AUTO and self.depth is not None else self.base
+        """The base that is named: with --depth `auto` is `rgbd`, and with -c it is `sharp`."""
+        if self.base != AUTO:
+            return self.base
+        return "rgbd" if self.depth is not None else AUTO if self.checkpoint is None else "sharp"
 
     @property
     def base_files(self) -> dict[str, Path]:

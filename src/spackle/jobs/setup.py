@@ -124,7 +124,8 @@ def search_base(photo: Photo, options: PredictOptions, tools: Tools, say: Say) -
     """The base for one photo, named or not; `say` is told what is passed over."""
     if tools.auto is not None:
         return tools.auto.search(photo, say)
-    why = f"--base {options.base}" if options.depth is None else "--depth"
+    named = options.base != AUTO
+    why = "--depth" if options.depth is not None else f"--base {options.base}" if named else "-c"
     return Search(photo, [Way(why, lambda photo: make_base(photo, options, tools))], say)
 
 
