@@ -89,12 +89,16 @@ def plain_sample(inverse: Floats, known: Bools, found: Edges, height: int, width
         weight = {(r, c): max(1 - abs(v - r), 0) * max(1 - abs(u - c), 0) for r, c in corners}
         seen = [corner for corner in corners if known[corner]]
         mass = sum(weight[corner] for corner in seen)
-        if mass < 0.5 * sum(weight.values()):
-            continue
         plane = {
             (r, c): max(inverse[r, c] + slopes[0][r, c] * (u - c) + slopes[1][r, c] * (v - r), inverse[r, c] / 2)
             for r, c in seen
         }
+        away = {(r, c): max(abs(u - c) * width / columns, abs(v - r) * height / rows) for r, c in seen if sound[r, c]}
+        covered = bool(away) and min(away.values()) < 0.5 + 1e-6
+        if mass < 0.5 * sum(weight.values()):
+            if covered:
+                state[y, x], values[y, x] = upsample.SETTLED, plane[min(away, key=away.__getitem__)]
+            continue
         split = any(found.across[r, c] for r, c in corners if c == x0 < columns - 1)
         split |= any(found.down[r, c] for r, c in corners if r == y0 < rows - 1)
         state[y, x] = upsample.SETTLED
@@ -105,8 +109,7 @@ def plain_sample(inverse: Floats, known: Bools, found: Edges, height: int, width
             else:
                 values[y, x] = sum(weight[c] * plane[c] for c in seen) / mass
             continue
-        away = {(r, c): max(abs(u - c) * width / columns, abs(v - r) * height / rows) for r, c in seen if sound[r, c]}
-        if away and min(away.values()) < 0.5 + 1e-6:
+        if covered:
             values[y, x] = plane[min(away, key=away.__getitem__)]
         else:
             state[y, x], values[y, x] = upsample.OPEN, sum(weight[c] * inverse[c] for c in seen) / mass

@@ -282,6 +282,25 @@ def test_numbers_that_are_none_count_as_a_failure(
     assert "range of float32" in result.lines[0]
 
 
+def test_one_photos_failure_takes_sharp_from_no_other(
+    tmp_path: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict_box = StandIn.predict
+
+    def picky(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        if photo.path.stem == "b":
+            raise InputError(f"{photo.path}: not this one")
+        return predict_box(self, photo, progress)
+
+    monkeypatch.setattr(StandIn, "predict", picky)
+    for name in "abc":
+        write_photo(tmp_path / "photos" / f"{name}.png")
+    assert predict(tmp_path, "-i", tmp_path / "photos").code == 0
+    names = [report_of(tmp_path / "out" / name)["base"]["name"] for name in "abc"]
+    assert names == ["sharp", "lite", "sharp"]
+    assert len(quick) == 1  # loaded once
+
+
 def test_everything_may_fail_one_after_the_other(tmp_path: Path, sharp: Path, shipped: Path) -> None:
     photo = broken_portrait(tmp_path / "photo.jpg")
     garbage(sharp)

@@ -23,6 +23,7 @@ from spackle.bases.rgbd import lift
 from spackle.bases.sharpen import settle
 from spackle.bases.upsample import HOLE, OPEN, SETTLED, Sampled, sample
 from spackle.camera import Camera
+from spackle.errors import InputError
 from spackle.render import CpuRenderer
 from spackle.residual import hole_mask
 from spackle.trajectory import DepthRange, extremes
@@ -398,3 +399,37 @@ def test_a_noisy_slanted_plane_is_not_perforated(axis: int) -> None:
         inside = max_pool2d((alpha < 0.5).float()[None, None], 17, 1, 8)[0, 0] == 0  # nothing but surface all around
         assert int(inside.sum()) > 3000
         assert int(hole_mask(alpha)[inside].sum()) <= 4
+
+
+def test_fine_clean_structure_is_no_noise() -> None:
+    """A mesh before a wall: its second differences are large everywhere, but nothing of it is to move."""
+    inverse = torch.full((60, 80), 0.2)
+    inverse[::5] = inverse[1::5] = 1.0
+    inverse[:, ::5] = inverse[:, 1::5] = 1.0
+    known = np.ones(inverse.shape, bool)
+    assert np.array_equal(smooth_noise(inverse.numpy(), known), inverse.numpy())
+
+
+def test_what_a_map_calls_valid_but_is_no_depth_is_filled_and_never_lifted() -> None:
+    scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
+    depth = scene.depth.clone()
+    for place, value in enumerate((math.nan, math.inf, 0.0, -1.0)):
+        depth[10, 10 + 4 * place] = value
+    every = torch.ones(36, 48, dtype=torch.bool)
+    found = lift(scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera)
+    assert bool(torch.isfinite(found.gaussians.means).all())
+    assert found.notes["depth_filled"] == round(4 / (36 * 48), 4)
+
+
+def test_a_map_without_any_depth_is_refused() -> None:
+    scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
+    with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):
+        lift(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)
+
+
+def test_a_sparse_map_keeps_what_a_smaller_photo_covers() -> None:
+    known = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) < 0.05
+    found = find_edges(np.ones((48, 64), np.float32), known.numpy(), FOCAL)
+    sampled = sample(np.ones((48, 64), np.float32), known.numpy(), found, 24, 32)
+    kept = int((sampled.state != HOLE).sum())
+    assert kept > 0.9 * int((max_pool2d(known[None, None].float(), 2) > 0).sum())

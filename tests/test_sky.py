@@ -136,3 +136,15 @@ def test_the_flood_matches_growing_by_rings(seed: int) -> None:
     found = sky._flood(rgb, first, candidates)
     assert found[5:].any()
     assert np.array_equal(found, plain_flood(rgb, first, candidates))
+
+
+def test_indoors_there_is_no_sky() -> None:
+    """A bright backdrop ten times as far away as what stands before it, at eight metres."""
+    y = torch.arange(96)[:, None].expand(96, 128)
+    rgb = torch.where((y < 48)[..., None], torch.tensor(0.85), torch.tensor(0.2)).expand(96, 128, 3)
+    inverse = torch.where(y < 48, 1 / 8.0, 1 / 0.5)
+    pushed = push_sky(inverse, rgb.contiguous(), torch.ones(96, 128, dtype=torch.bool))
+    assert pushed.share == 0
+    assert torch.equal(pushed.inverse_depth, inverse)
+    outside = push_sky(inverse / 4, rgb.contiguous(), torch.ones(96, 128, dtype=torch.bool))
+    assert outside.share > 0.4  # the same, four times as large

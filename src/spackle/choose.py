@@ -93,7 +93,7 @@ class Search:
             try:
                 self._base = way.find(self._photo)
             except InputError as error:
-                self._pass_over(error)
+                self._pass_over(error, for_good=True)
                 continue
             if self._base is None:
                 self._next(way.lack, way.short)
@@ -110,17 +110,19 @@ class Search:
             try:
                 prediction = finite_prediction(base, self._photo, progress)
             except InputError as error:
-                self._pass_over(error)
+                # What is wrong with one photo need not be so with another.
+                self._pass_over(error, for_good=isinstance(error, MemoryShort))
                 continue
             why = ", ".join(self._lacks) or self._ways[0].what
             return prediction, Choice(base.name, why, tuple(self._passed), not self._short)
 
-    def _pass_over(self, error: InputError) -> None:
-        """Go on with the next way; raise the error where there is none."""
+    def _pass_over(self, error: InputError, *, for_good: bool) -> None:
+        """Go on with the next way, for other photos too where it is for good; raise the error where there is none."""
         if isinstance(error, BaseError) or len(self._ways) == 1:
             raise error
         way = self._ways[0]
-        way.give_up(error)
+        if for_good:
+            way.give_up(error)
         self._say(f"{self._photo.path.name}: going on without {way.what}: {error}")
         self._passed.append(f"{way.what}: {error}")
         self._next(f"{way.what} cannot be used", isinstance(error, MemoryShort))

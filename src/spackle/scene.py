@@ -14,7 +14,7 @@ from spackle.bases.depth_maps import DepthMap, load_depth
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
-from spackle.choose import auto_here
+from spackle.choose import auto_here, finite_prediction
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
@@ -112,7 +112,7 @@ def predict(
     loaded = photo if isinstance(photo, Photo) else load_photo(photo)
     if depth is not None:
         base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
-    prediction = _by_the_best_base(loaded) if base is None else base.predict(loaded)
+    prediction = _by_the_best_base(loaded) if base is None else finite_prediction(base, loaded)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
     return complete(prediction, cameras, network=network, renderer=renderer)
 

@@ -11,6 +11,7 @@ from spackle.bases.edges import Bools, Floats
 from spackle.surface import EDGE
 
 LEAST_NOISE = 5e-4  # of the inverse depth; less leaves no gaps between the Gaussians
+MOST_NOISE = 0.03  # more is no noise but what the photo shows: leaves, meshes
 RADIUS = 2  # pixels to each side that a plane is fitted to
 FITS = 2
 OUTLIERS = 4.0  # standard deviations of the noise from the plane to what belongs to another surface
@@ -50,7 +51,9 @@ def smooth_noise(inverse_depth: Floats, known: Bools) -> Floats:
         known: [h, w] bool; others neither count nor move.
     """
     noise = noise_level(inverse_depth, known)
-    return inverse_depth if noise < LEAST_NOISE else _on_planes(inverse_depth, known, OUTLIERS * noise)
+    if not LEAST_NOISE <= noise <= MOST_NOISE:
+        return inverse_depth
+    return _on_planes(inverse_depth, known, OUTLIERS * noise)
 
 
 @kernel

@@ -18,6 +18,7 @@ from spackle.bases.sky import push_sky
 from spackle.bases.upsample import sample
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
+from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, resize_photo
 from spackle.surface import surface_gaussians, surface_slope
@@ -69,10 +70,16 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         rgb: [H, W, 3] sRGB in 0..1.
         depth: any size of the same aspect ratio.
         camera: the photo's camera, at the world's origin.
+
+    Raises:
+        InputError: not one pixel has a depth.
     """
-    inverse_depth, known = _inverse_depth(depth, rgb, camera)
+    rgb = rgb.detach().float()
+    inverse_depth, known = _inverse_depth(_sound(depth), rgb, camera)
     sky = push_sky(inverse_depth, rgb, known)
     missing = 1.0 - float(sky.known.float().mean())
+    if missing == 1.0:
+        raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
     inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
@@ -86,6 +93,13 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     if depth.depth.shape != inverse_depth.shape:
         notes["depth_resampled_from"] = f"{depth.depth.shape[1]}×{depth.depth.shape[0]}"
     return BasePrediction(gaussians, camera, notes)
+
+
+def _sound(depth: DepthMap) -> DepthMap:
+    """The same map; what is no depth is not valid, whatever the map says."""
+    values = depth.depth.detach().float()
+    valid = depth.valid & torch.isfinite(values) & (values > 0)
+    return dataclasses.replace(depth, depth=values.where(valid, 0.0), valid=valid)
 
 
 def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ FAR_QUANTILE = 0.05  # and as its far side
 FAR = 0.1  # at the photo's border a sky is at least ten times as far away as the near side
 GETS_NEAR = 0.25  # and nowhere nearer than this: a predicted sky often sinks towards the horizon
 LEVEL = 0.02  # and no nearer than the far side of all else, by no more than this in units of the near side
-OUTDOORS_M = 10.0  # where the sky's own depth is unknown, what else is far must be farther than rooms are long
+OUTDOORS_M = 10.0  # farther than rooms are long: so is a sky, or where its depth is unknown what else is far
 BRIGHT = 0.6  # sRGB; a sky is that bright, or blue
 DIM = 0.35  # and may go on in clouds as dark as that
 BLUE, DARKEST_BLUE = 1.1, 0.25  # blue over red, and the least blue
@@ -117,11 +117,13 @@ def _flood(rgb: Any, first_row: Any, candidates: Any) -> Any:
 
 
 def _stands_behind(sky: Tensor, inverse_depth: Tensor, known: Tensor, near: float, horizon: float) -> bool:
-    """Whether the sky is about as far as the far side of all else; where it has no depth, whether that side is far."""
+    """Whether the sky is outdoors and about as far as the far side of all else; without depth, whether that is far."""
     depths = inverse_depth[sky & known]
     if 2 * len(depths) < int(sky.sum()):
         return horizon * OUTDOORS_M <= 1
     middle = float(depths.median())
+    if middle * OUTDOORS_M > 1:
+        return False
     return middle <= horizon + LEVEL * near and float((depths > FAR * near).float().mean()) <= MOST_NEAR
 
 

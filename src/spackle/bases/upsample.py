@@ -31,7 +31,8 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
     Between four pixels of one surface the inverse depth is bilinear, so a plane stays the plane it is.
     Where an edge runs between them, or one hangs in an edge, the photo's pixel stays open unless a
     sound pixel of the map is right there; what that one says is continued along its surface. Unknown
-    pixels never count; where they have more than half of the weight, the photo's pixel is a hole.
+    pixels never count; where they have more than half of the weight, the photo's pixel is a hole, unless it
+    covers one that is known.
 
     Args:
         inverse_depth: [h, w], positive where known.
@@ -115,6 +116,8 @@ def _sample(
                 if steps[r, c] == 0 and away < closest:
                     here, closest = np.float32(plane), away
             if mass < 0.5 * total:
+                if closest < 0.5 + 1e-6:  # the only one that is known of those that the photo's pixel covers
+                    values[y, x], state[y, x] = here, SETTLED
                 continue
             state[y, x] = SETTLED
             if not between and step == 0:

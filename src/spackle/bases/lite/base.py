@@ -77,7 +77,7 @@ class LiteBase:
         Returns:
             [h, w] float32 inverse depth up to a factor, on the processor; about 144×192, of the photo's shape.
         """
-        picture = rgb.permute(2, 0, 1)[None].to(self.device)
+        picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         height, width = rgb.shape[:2]
         sizes = [network_size(height, width, pixels) for pixels in INPUT_PIXELS]
         finest = tuple(side // 2 for side in sizes[-1])
