@@ -53,7 +53,8 @@ def smooth_noise(inverse_depth: Floats, known: Bools) -> Floats:
     noise = noise_level(inverse_depth, known)
     if not LEAST_NOISE <= noise <= MOST_NOISE:
         return inverse_depth
-    return _on_planes(inverse_depth, known, OUTLIERS * noise)
+    planes: Floats = _on_planes(inverse_depth, known, OUTLIERS * noise)
+    return planes
 
 
 @kernel
