@@ -8,7 +8,6 @@ import math
 import shutil
 import signal
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import torch
 from command import Run, names_in, run
 from lite_data import write_data
 from PIL import Image
-from training_runs import killed_at, started, state
+from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
 
 from spackle.bases.lite.network import LiteNet
 from spackle.network_file import read_network
@@ -41,13 +40,7 @@ encoder: random
 """
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in one order: what is compared here are bits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(scope="module", autouse=True)(one_thread_at_a_time)
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +65,6 @@ def arguments(place: Path, output: Path, *more: object) -> list[str]:
 
 def train(place: Path, output: Path, *more: object) -> Run:
     return run(*arguments(place, output, *more))
-
-
-def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
-    a, b = state(one), state(other)
-    assert a.progress.step == b.progress.step
-    for mine, yours in ((a.network, b.network), (a.average, b.average)):
-        assert max(float((mine[name] - yours[name]).abs().max()) for name in yours) <= tolerance
 
 
 # A run and what comes out -------------------------------------------------------------------------

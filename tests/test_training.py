@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from command import Run, names_in, run
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from training_runs import killed_at, started, state
+from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
 
 from spackle.downloads.locks import hold
 from spackle.gaussians import Gaussians
@@ -50,13 +49,7 @@ run: {validate_every: 6, save_every: 3, log_every: 1}
 """
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in one order: what is compared here are bits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(autouse=True)(one_thread_at_a_time)
 
 
 @pytest.fixture(scope="module")
@@ -91,13 +84,6 @@ def arguments(place: Path, output: Path, *more: str) -> list[str]:
 
 def train(place: Path, output: Path, *more: str) -> Run:
     return run(*arguments(place, output, *more))
-
-
-def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
-    a, b = state(one), state(other)
-    assert a.progress.step == b.progress.step
-    for mine, yours in ((a.network, b.network), (a.average, b.average)):
-        assert max(float((mine[name] - yours[name]).abs().max()) for name in yours) <= tolerance
 
 
 def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:

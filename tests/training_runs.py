@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import torch
 
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
 
@@ -15,6 +17,21 @@ def state(folder: Path) -> Checkpoint:
     checkpoint, _ = load_checkpoint(folder)
     assert checkpoint is not None
     return checkpoint
+
+
+def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
+    a, b = state(one), state(other)
+    assert a.progress.step == b.progress.step
+    for mine, yours in ((a.network, b.network), (a.average, b.average)):
+        assert max(float((mine[name] - yours[name]).abs().max()) for name in yours) <= tolerance
+
+
+def one_thread_at_a_time() -> Iterator[None]:
+    """Sums in one order: what is compared here are bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
