@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from spackle.bases.depth_maps import DepthMap
+from spackle.bases.relative import NEAREST_M, nearest
 from spackle.errors import InputError
 
 Meaning = Literal["metres", "relative disparity", "canonical disparity"]
@@ -33,8 +34,7 @@ UNFIT = {
 # trajectories move by the nearest depth: 20 gives a clear parallax, and what is far stays in the range where one
 # step of the network's noise is not yet a depth edge. The smallest value is not stretched to FARTHEST_M: a wall
 # photographed from the front would become a valley. Both ends are linear in disparity, so planes stay planes.
-NEAREST_M, FARTHEST_M = 1.5, 30.0
-NEAREST_QUANTILE = 0.999  # trajectories take the 0.1 % nearest for the nearest depth; beyond are specks
+FARTHEST_M = 30.0
 CANONICAL_LIMITS = (1e-4, 1e4)  # in 1/m: Depth Pro's own
 FLAT = 1e-5  # relative spread below which all pixels say the same
 
@@ -107,6 +107,6 @@ def _scaled(disparity: Tensor, known: Tensor, high: float, who: str) -> Tensor:
     if high <= 0:
         raise InputError(f"{who} predicts no disparity above zero: its weights are broken, or not for photos")
     values = disparity[known]
-    near = float(values.kthvalue(1 + round(NEAREST_QUANTILE * (len(values) - 1))).values)
+    near = float(nearest(values))
     share = (disparity / (near if near > 0 else high)).clamp(0, 1)
     return (1 - share) / FARTHEST_M + share / NEAREST_M

@@ -78,7 +78,7 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     inverse_depth, known = _inverse_depth(_sound(depth), rgb, camera)
     sky = push_sky(inverse_depth, rgb, known)
     missing = 1.0 - float(sky.known.float().mean())
-    if missing == 1.0:
+    if not sky.known.any():
         raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
     inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)

@@ -14,6 +14,7 @@ from spackle.bases.depth_maps import DepthMap
 from spackle.bases.device import own_arithmetic, pick_device
 from spackle.bases.lite.network import STRIDE, LiteNet
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.relative import NEAREST_M, nearest
 from spackle.bases.rgbd import lift
 from spackle.image import Photo, resize_photo
 from spackle.network_file import read_network
@@ -22,11 +23,7 @@ SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
 # What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
 # thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
 INPUT_PIXELS = (192 * 256, 256 * 320, 288 * 384)
-# The network knows inverse depth up to a factor. The nearest things are put at an arm's length and a half; what is
-# farther than that by this ratio is sky to it.
-NEAREST_M = 1.5
-NEAREST_QUANTILE = 0.999  # trajectories take the 0.1 % nearest for the nearest depth; beyond are specks
-FARTHEST = 60.0
+FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
 
 class LiteBase:
@@ -56,8 +53,7 @@ class LiteBase:
         """Gaussians of the pixels of the photo at its working size, as `rgbd.lift` makes them."""
         photo = resize_photo(photo)
         inverse_depth = self.inverse_depth(photo.rgb)
-        near = inverse_depth.flatten().kthvalue(1 + round(NEAREST_QUANTILE * (inverse_depth.numel() - 1))).values
-        depth = NEAREST_M / (inverse_depth / near).clamp(1 / FARTHEST, 1)
+        depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
         known = torch.ones_like(depth, dtype=torch.bool)
         if progress:
             progress(1, 2)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases.lite.network import STRIDE
+from spackle.bases.lite.base import network_size
 from spackle.training.depth.augment import Frame
 from spackle.training.depth.losses import DepthLossWeights, depth_loss
 from spackle.training.depth.mixture import COARSER, DepthBatch
@@ -60,8 +59,7 @@ class DepthJudge:
     def _batch(self, frame: Frame) -> DepthBatch:
         """A frame at the size that the network sees."""
         height, width = frame.inverse_depth.shape
-        scale = math.sqrt(self.pixels / (height * width))
-        tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
+        tall, wide = network_size(height, width, self.pixels)
         rgb = interpolate(frame.rgb[None], size=(tall, wide), mode="bicubic", antialias=True).clamp(0, 1)
         known = torch.stack([frame.inverse_depth, frame.valid.float()])[None]
         inverse_depth, valid = interpolate(known, size=(tall // COARSER, wide // COARSER), mode="nearest-exact")[0]
