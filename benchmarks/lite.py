@@ -86,10 +86,15 @@ def main() -> None:
     rows = []
     for name, frames in frames_of(arguments):
         found: dict[str, list[DepthScore]] = {guess: [] for guess in GUESSES}
-        for frame in frames:
+        shown = range(0, len(frames), max(1, len(frames) // 3))[:3]
+        for number, frame in enumerate(frames):
             each = guesses(base, frame)
             for guess in GUESSES:
                 found[guess].append(score(frame, each[guess]))
+            if number in shown:
+                seen, true = each["lite"], frame.inverse_depth
+                known = colored(true, *ends(true[frame.valid]), frame.valid)
+                rows.append([frame.rgb.permute(1, 2, 0), colored(seen, *ends(seen[frame.valid])), known])
         errors = [statistics.mean(s.abs_rel for s in found[guess]) for guess in GUESSES]
         deltas = [statistics.mean(s.delta for s in found[guess]) for guess in GUESSES]
         cells = [
@@ -98,10 +103,6 @@ def main() -> None:
             *(f"{d:.1%}" for d in deltas),
         ]
         print(f"| {name} | {len(frames)} | {' | '.join(cells)} |", flush=True)
-        for frame in frames[:: max(1, len(frames) // 3)][:3]:
-            seen, true = guesses(base, frame)["lite"], frame.inverse_depth
-            known = colored(true, *ends(true[frame.valid]), frame.valid)
-            rows.append([frame.rgb.permute(1, 2, 0), colored(seen, *ends(seen[frame.valid])), known])
     print(f"\n640×480: {seconds(base):.3f} s on {torch.get_num_threads()} threads")
     if arguments.pictures:
         save_png(sheet(rows, 320), arguments.pictures)
