@@ -206,11 +206,9 @@ def test_a_tiles_mask_of_the_wrong_shape_is_refused():
 
 
 def test_get_renderer_knows_its_devices():
-    assert isinstance(get_renderer(), CpuRenderer)
     assert isinstance(get_renderer("cpu"), CpuRenderer)
-    for device in ("cuda", "abacus"):
-        with pytest.raises(InputError, match=device):
-            get_renderer(device)
+    with pytest.raises(InputError, match="abacus"):
+        get_renderer("abacus")
 
 
 # Against the twin ----------------------------------------------------------------------------------

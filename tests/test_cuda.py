@@ -1,0 +1,166 @@
+"""The GPU renderer: its own arithmetic over a stand-in for gsplat, and over gsplat itself where there is a GPU."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from types import ModuleType
+
+import gsplat_stand_in
+import pytest
+import torch
+from scenes import box_before_wall, same_bits, shifted
+
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.render import CpuRenderer, get_renderer
+from spackle.render.cuda import GsplatRenderer, load_gsplat
+from spackle.rendering import Rendering
+
+CPU = CpuRenderer()
+SCENE = box_before_wall(width=45, height=35, focal=40)
+BASE = SCENE.base()
+SIDE = shifted(SCENE.camera, 0.4)
+REAL = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+
+
+@pytest.fixture(params=["stand-in", pytest.param("gsplat", marks=pytest.mark.skipif(not REAL, reason="no GPU"))])
+def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> GsplatRenderer:
+    if request.param == "gsplat":
+        return GsplatRenderer()
+    monkeypatch.setattr("spackle.render.cuda.load_gsplat", lambda device: gsplat_stand_in)
+    return GsplatRenderer("cpu")
+
+
+def agree(one: Rendering, other: Rendering) -> None:
+    """Equal but at the thresholds, where a difference of the last digit means one splat more or less."""
+    same = ((one.rgb - other.rgb).abs().amax(-1) < 2e-4) & ((one.alpha - other.alpha).abs() < 1e-4)
+    assert float(same.float().mean()) > 0.97
+    torch.testing.assert_close(one.rgb, other.rgb, atol=2e-2, rtol=0)
+    torch.testing.assert_close(one.depth[same], other.depth[same], rtol=2e-3, atol=0)
+
+
+def test_it_draws_what_the_processors_renderer_draws(gpu: GsplatRenderer) -> None:
+    for camera in (SCENE.camera, SIDE):
+        for eps2d in (0.0, 0.3):
+            found = gpu.render(BASE, camera, eps2d=eps2d)
+            assert found.rgb.dtype == torch.float32
+            assert found.rgb.device == BASE.means.device
+            agree(found, CPU.render(BASE, camera, eps2d=eps2d))
+
+
+def test_sets_are_drawn_as_one_and_none_is_black(gpu: GsplatRenderer) -> None:
+    halves = [BASE.select(slice(0, 100)), BASE.select(slice(100, None))]
+    assert same_bits(gpu.render(halves, SIDE), gpu.render(BASE, SIDE))
+    nothing = gpu.render([], SIDE)
+    assert nothing.rgb.shape == (35, 45, 3)
+    assert not any(bool(image.any()) for image in (nothing.rgb, nothing.depth, nothing.alpha))
+
+
+def test_what_is_not_finite_is_left_out(gpu: GsplatRenderer) -> None:
+    broken = dataclasses.replace(BASE, means=BASE.means.clone())
+    broken.means[7, 1] = torch.nan
+    kept = torch.arange(len(BASE)) != 7
+    assert same_bits(gpu.render(broken, SIDE), gpu.render(BASE.select(kept), SIDE))
+
+
+def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> None:
+    weights = torch.rand(35, 45, generator=torch.Generator().manual_seed(0))
+    found = []
+    for renderer in (gpu, CPU):
+        asking = Gaussians(*(t.clone().requires_grad_() for t in BASE.tensors))
+        view = renderer.render(asking, SIDE)
+        ((view.rgb.mean(-1) + 0.1 * view.depth + view.alpha) * weights).sum().backward()
+        found.append([t.grad for t in asking.tensors])
+    for one, other in zip(*found, strict=True):
+        assert one is not None
+        assert other is not None
+        assert float((one - other).norm() / other.norm()) < 0.02
+
+
+def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRenderer) -> None:
+    whole, under = gpu.render(BASE, SIDE), CPU.render(BASE, SCENE.camera)
+    tiles = torch.zeros(3, 3, dtype=torch.bool)
+    tiles[1, 2] = tiles[0, 0] = True
+    mask = tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
+    for onto in (under, None):
+        found = gpu.render(BASE, SIDE, tiles=tiles, onto=onto)
+        for name in ("rgb", "depth", "alpha"):
+            image, kept = getattr(found, name), getattr(onto, name) if onto else torch.zeros_like(getattr(whole, name))
+            assert torch.equal(image[~mask], kept[~mask]), name
+            torch.testing.assert_close(image[mask], getattr(whole, name)[mask], rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="expected"):
+        gpu.render(BASE, SIDE, tiles=tiles[:2])
+
+
+def test_many_cameras_in_one_call_are_the_same_as_one_by_one(gpu: GsplatRenderer) -> None:
+    cameras = [SCENE.camera, SIDE, shifted(SCENE.camera, -0.2)]
+    views = gpu.render_batch(BASE, cameras)
+    for view, camera in zip(views, cameras, strict=True):
+        agree(view, gpu.render(BASE, camera))
+    assert gpu.render_batch(BASE, []) == []
+    with pytest.raises(ValueError, match="one size"):
+        gpu.render_batch(BASE, [SIDE, SIDE.resized(30, 20)])
+
+
+def test_a_scene_travels_once(gpu: GsplatRenderer) -> None:
+    if gpu.device.type == "cpu":
+        gpu.device = torch.device("meta")  # anywhere else
+    first = [gpu._on_device(tensor) for tensor in BASE.tensors]
+    assert all(gpu._on_device(tensor) is there for tensor, there in zip(BASE.tensors, first, strict=True))
+    asking = BASE.colors.clone().requires_grad_()
+    assert gpu._on_device(asking) is not gpu._on_device(asking)  # it changes at every step of a training
+
+
+def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match=r"sees no NVIDIA GPU.*--device cpu"):
+        get_renderer("cuda")
+    assert isinstance(get_renderer("auto"), CpuRenderer)
+
+
+def fake_package(monkeypatch: pytest.MonkeyPatch, kernels: object) -> None:
+    """A gsplat that can be imported, with or without its kernels."""
+    gsplat, cuda, backend = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
+    backend._C = kernels  # type: ignore[attr-defined]
+    gsplat.cuda, cuda._backend = cuda, backend  # type: ignore[attr-defined]
+    for module in (gsplat, cuda, backend):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+
+def test_a_gsplat_without_kernels_is_told_so_and_auto_falls_back(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fake_package(monkeypatch, None)
+    with pytest.raises(InputError, match=r"no kernels here.*CUDA toolkit"):
+        get_renderer("cuda")
+    assert isinstance(get_renderer("auto"), CpuRenderer)
+    assert "no kernels" in caplog.text
+    fake_package(monkeypatch, object())
+    assert load_gsplat(torch.device("cuda")).__name__ == "gsplat"
+    assert isinstance(get_renderer("auto"), GsplatRenderer)
+
+
+def test_a_missing_gsplat_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match=r"spackle-nvs\[cuda\]"):
+        get_renderer("cuda")
+
+
+def test_a_failed_build_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+    class Broken:
+        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+            if name == "gsplat":
+                raise RuntimeError("Error building extension 'gsplat_cuda': ninja\nmany lines")
+
+    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
+    with pytest.raises(InputError, match=r"cannot be built here: Error building.*ninja") as caught:
+        importlib.import_module("spackle.render").get_renderer("cuda")
+    assert "\n" not in str(caught.value)
