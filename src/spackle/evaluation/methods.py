@@ -132,7 +132,7 @@ class Dense:
         deltas = None
         if self.network is not None:
             rim = Rim.of(cues, seeds, camera, photo_camera)
-            deltas = predict_deltas(self.network, cues, seeds, rim, self.precision).flatten(0, 1)
+            deltas = predict_deltas(self.network, cues, seeds, rim, self.precision, dense=True).flatten(0, 1)
         return compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
 
 

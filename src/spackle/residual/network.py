@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from spackle.precision import Precision, pick_dtype
-from spackle.residual.compose import COLOR, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
+from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
+from spackle.residual.crops import crops_around
 from spackle.residual.cues import Cues
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds
@@ -95,19 +96,28 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 
 
 @torch.no_grad()
-def predict_deltas(network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto") -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's cells.
+def predict_deltas(
+    network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto", *, dense: bool = False
+) -> Tensor:
+    """Deltas [h, w, 14] float32 of a view's masked cells; nothing of use at the others.
+
+    The network looks only around the masked cells, see `spackle.residual.crops`.
 
     Args:
         network: a `ResidualNet`.
         cues, seeds, rim: of the same view.
         precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
+        dense: deltas of all cells.
     """
     features = network_input(cues, seeds, rim).contiguous(memory_format=torch.channels_last)
     dtype = pick_dtype(precision, features.device)
-    with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
-        field: Tensor = network(features)
-    return field[0].permute(1, 2, 0).float()
+    field = features.new_zeros(*features.shape[-2:], DELTA_CHANNELS)
+    for inner, outer in crops_around(torch.ones_like(cues.mask) if dense else cues.mask, STRIDE):
+        rows, columns = outer.slices
+        with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
+            seen: Tensor = network(features[..., rows, columns])[0].permute(1, 2, 0)
+        field[inner.slices] = seen[inner.within(outer).slices].float()
+    return field
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
