@@ -10,13 +10,24 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.autograd import draw_differentiably
+from spackle.render.kept import Memory
 from spackle.render.pipeline import draw, wanted_tiles
 from spackle.render.project import View
 from spackle.rendering import Rendering
 
 
 class CpuRenderer:
-    """Classic 3D Gaussian splatting on the CPU; a `Renderer`."""
+    """Classic 3D Gaussian splatting on the CPU; a `Renderer`.
+
+    The last whole drawing is remembered: more sets on top of it, in some tiles, cost those tiles only.
+    """
+
+    def __init__(self) -> None:
+        self._memory = Memory()
+
+    def __reduce__(self) -> tuple[type[CpuRenderer], tuple[()]]:
+        """Copies, as other processes get them, remember nothing."""
+        return CpuRenderer, ()
 
     def render(
         self,
@@ -35,4 +46,9 @@ class CpuRenderer:
         inputs = [t for part in sets for t in part.tensors] + ([onto.rgb, onto.depth, onto.alpha] if onto else [])
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return draw_differentiably(sets, view, wanted, onto)
-        return draw(sets, view, wanted, onto).canvas.rendering()
+        if tiles is not None:
+            redrawn = self._memory.redraw(sets, view, wanted, onto)
+            return (redrawn or draw(sets, view, wanted, onto)).canvas.rendering()
+        drawing = draw(sets, view, wanted, None)
+        self._memory.keep(sets, drawing)
+        return drawing.canvas.rendering()

@@ -105,16 +105,24 @@ def touched_tiles(gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> T
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
 
 
-def project(sets: Sequence[Gaussians], view: View, wanted: Array) -> tuple[Splats, Array]:
+def project(
+    sets: Sequence[Gaussians], view: View, wanted: Array, splats: Splats | None = None, first: int = 0
+) -> tuple[Splats, Array]:
     """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
+
+    Args:
+        sets: any number of sets.
+        view: the camera.
+        wanted: [rows, columns] bool, see `wanted_tiles`.
+        splats: where they go, from number `first` on; new ones where None.
+        first: how many are there already.
 
     Returns:
         The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
     """
-    splats = Splats.allocate(sum(len(part) for part in sets))
+    splats = splats or Splats.allocate(sum(len(part) for part in sets))
     before = count_before(wanted)
     spans: list[tuple[int, int]] = []
-    first = 0
     for part in sets:
         arrays = [as_array(tensor) for tensor in part.tensors]
 

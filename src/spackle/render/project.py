@@ -21,6 +21,7 @@ Array = npt.NDArray[Any]
 X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(11)
 RECORD = 12  # floats in a record, the last one unused
 
+SPARE = 1 << 16  # Gaussians
 LOG2_E = math.log2(math.e)
 LOG_FAINT = math.log(ALPHA_MIN)
 BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place
@@ -49,6 +50,14 @@ class View:
         lens = np.array([fx, fy, cx, cy, left, right, top, bottom])
         return View(lens, pose, camera.width, camera.height, eps2d)
 
+    def same_as(self, other: View) -> bool:
+        """Whether both show the same."""
+        return (
+            (self.width, self.height, self.eps2d) == (other.width, other.height, other.eps2d)
+            and np.array_equal(self.lens, other.lens)
+            and np.array_equal(self.pose, other.pose)
+        )
+
     @property
     def tiles(self) -> tuple[int, int]:
         """Rows and columns of tiles."""
@@ -66,7 +75,8 @@ class Splats:
 
     @staticmethod
     def allocate(n: int) -> Splats:
-        """Room for n Gaussians."""
+        """Room for n Gaussians, and for some more that may come later; what is not written to takes no memory."""
+        n += n // 4 + SPARE
         return Splats(
             np.empty((n, RECORD), np.float32),
             np.empty((n, 4), np.uint16),

@@ -1,0 +1,136 @@
+"""What a whole drawing leaves behind: to draw a few more Gaussians into some of its tiles then costs only those."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from spackle._numba import kernel
+from spackle.gaussians import Gaussians
+from spackle.render.pipeline import Canvas, Drawing, blend, project
+from spackle.render.project import DEPTH, Splats, View
+from spackle.render.sort import sort_by_depth
+from spackle.render.tiles import TileLists, list_tiles
+from spackle.rendering import Rendering
+from spackle.threads import run_chunks
+
+Array = npt.NDArray[Any]
+
+MERGE_GRAIN = 64  # tiles a thread merges at a time
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """What was projected and dealt out to tiles, and the tensors that it came from as they were then."""
+
+    view: View
+    splats: Splats  # with room for more
+    lists: TileLists
+    tensors: list[tuple[weakref.ref[Tensor], int]]  # and their versions, which count changes in place
+    sets: int
+    count: int  # Gaussians in those sets
+
+    def shows(self, sets: Sequence[Gaussians], view: View) -> bool:
+        """Whether these sets begin with those that were drawn, unchanged, and are seen from the same camera."""
+        flat = [tensor for part in sets[: self.sets] for tensor in part.tensors]
+        return (
+            len(flat) == len(self.tensors)
+            and self.view.same_as(view)
+            and all(ref() is t and version == t._version for (ref, version), t in zip(self.tensors, flat, strict=True))
+        )
+
+
+class Memory:
+    """The last whole drawing of a renderer; one thread at a time may draw onto it."""
+
+    def __init__(self) -> None:
+        self._kept: Kept | None = None
+        self._lock = threading.Lock()
+
+    def keep(self, sets: Sequence[Gaussians], drawing: Drawing) -> None:
+        """Remember a drawing of all tiles."""
+        flat = [tensor for part in sets for tensor in part.tensors]
+        self._kept = None
+        if not any(tensor.is_inference() for tensor in flat):  # such tensors do not count their changes
+            refs = [(weakref.ref(tensor), tensor._version) for tensor in flat]
+            count = sum(len(part) for part in sets)
+            self._kept = Kept(drawing.view, drawing.splats, drawing.lists, refs, len(sets), count)
+
+    def redraw(self, sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None) -> Drawing | None:
+        """What `draw` would give, bit for bit, or None where the last whole drawing is of no help."""
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
+            kept = self._kept
+            if kept is None or not kept.shows(sets, view):
+                return None
+            more = sets[kept.sets :]
+            if kept.count + sum(len(part) for part in more) > len(kept.splats.records):
+                return None
+            return _add(kept, more, wanted, onto)
+        finally:
+            self._lock.release()
+
+
+def _add(kept: Kept, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:
+    """Draw more sets together with those that are there, in the wanted tiles."""
+    splats, view = kept.splats, kept.view
+    _, spans = project(more, view, wanted, splats, kept.count)
+    order = sort_by_depth(splats.keys, splats.ids, spans)
+    lists = merged(kept.lists, list_tiles(order, splats.boxes, wanted), wanted, splats.records)
+    canvas = Canvas.prepare(view, onto, False)
+    blend(splats, lists, wanted, canvas)
+    return Drawing(view, wanted, splats, lists, canvas)
+
+
+def merged(there: TileLists, more: TileLists, wanted: Array, records: Array) -> TileLists:
+    """The lists of the wanted tiles, front to back; of equal depths those that are there come first."""
+    lengths = np.where(wanted.ravel(), np.diff(there.starts) + np.diff(more.starts), 0)
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    ids = np.empty(starts[-1], np.int32)
+    tiles = np.flatnonzero(lengths)
+    run_chunks(
+        lambda a, b: merge_tiles(a, b, tiles, there.ids, there.starts, more.ids, more.starts, records, starts, ids),
+        len(tiles),
+        MERGE_GRAIN,
+    )
+    return TileLists(ids, starts)
+
+
+@kernel
+def merge_tiles(
+    first: int,
+    last: int,
+    tiles: Array,
+    there_ids: Array,
+    there_starts: Array,
+    more_ids: Array,
+    more_starts: Array,
+    records: Array,
+    starts: Array,
+    ids: Array,
+) -> None:
+    """Merge the two lists of tiles first..last of the list `tiles` [K] by depth."""
+    for k in range(first, last):
+        tile = tiles[k]
+        a, b, out = there_starts[tile], more_starts[tile], starts[tile]
+        a_end, b_end = there_starts[tile + 1], more_starts[tile + 1]
+        while a < a_end and b < b_end:
+            if records[there_ids[a], DEPTH] <= records[more_ids[b], DEPTH]:
+                ids[out] = there_ids[a]
+                a += 1
+            else:
+                ids[out] = more_ids[b]
+                b += 1
+            out += 1
+        for i in range(a, a_end):
+            ids[out + i - a] = there_ids[i]
+        for i in range(b, b_end):
+            ids[out + i - b] = more_ids[i]
