@@ -6,7 +6,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --quiet --constraint const
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
-.PHONY: demo test test-slow lint types check bench clean clean-cache
+.PHONY: demo test test-slow lint types check bench viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -40,6 +40,10 @@ check: lint types test
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/render_cpu.py
 	$(BIN)/python benchmarks/ply.py
+
+# The viewer's page: needs node, which nothing else does; what it builds is committed.
+viewer:
+	cd web && npm ci --no-audit --no-fund && node build.mjs
 
 clean-cache:
 	rm -rf .numba_cache

@@ -20,7 +20,14 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # Rooms in the order in which the data flows; each may import itself and what is named here.
 # Thin, on top of everything; "" is the package itself.
-SHELL = {"", "__main__", "choose", "cli", "cli_dataset", "cli_evaluate", "cli_options", "cli_weights", "jobs", "scene"}
+SHELL = {
+    "",
+    "__main__",
+    "choose",
+    "cli",
+    "jobs",
+    "scene",
+}
 ALLOWED = {
     "values": set(),
     "render": {"values"},

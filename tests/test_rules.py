@@ -173,6 +173,8 @@ TWINS = {
     "bases/sharpen.py": "test_cleanup.py",
     "bases/sky.py": "test_sky.py",
     "bases/upsample.py": "test_cleanup.py",
+    "evaluation/suite/counts.py": "test_suite.py",
+    "evaluation/suite/naive.py": "test_suite.py",
     "fill.py": "test_fill.py",
     "render": "test_render.py",
     "residual/carve.py": "test_residual.py",

@@ -98,6 +98,125 @@ def test_a_failed_video_leaves_the_old_file(tmp_path: Path) -> None:
     assert path.read_bytes() == b"old"
 
 
+def animation(path: Path) -> tuple[list[Tensor], list[int], int | None]:
+    """Frames, their milliseconds and the loop count of a GIF or WebP, by Pillow."""
+    shown, times = [], []
+    with Image.open(path) as image:
+        loop = image.info.get("loop")
+        for index in range(getattr(image, "n_frames", 1)):
+            image.seek(index)
+            rgba = torch.from_numpy(np.array(image.convert("RGBA"))).float() / 255
+            assert bool((rgba[..., 3] == 1).all())
+            shown.append(rgba[..., :3])
+            times.append(round(image.info["duration"]))
+    return shown, times, loop
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
+@pytest.mark.parametrize(("name", "least"), [("a.gif", 22), ("a.webp", 33)])
+def test_animations_decode_to_what_went_in(tmp_path: Path, name: str, least: float, height: int, width: int) -> None:
+    given = frames(6, height, width)
+    save_video(iter(given), tmp_path / name, fps=12)
+    shown, times, loop = animation(tmp_path / name)
+    assert loop == 0
+    if height > 1:  # a picture that stays the same is stored once
+        assert len(shown) == 6
+        assert sum(times) == pytest.approx(500, abs=10)
+        assert max(times) - min(times) <= 10
+    for sent, got in zip(given, shown, strict=False):
+        assert got.shape == (height, width, 3)
+        assert psnr(got, sent) > least
+    assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.webp"])
+def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None:
+    # GIF counts repetitions, and says nothing where there is none; WebP counts showings.
+    expected = {0: 0, 1: None, 3: 2} if name == "a.gif" else {0: 0, 1: 1, 3: 3}
+    for plays, stored in expected.items():
+        save_video(frames(2, 8, 8), tmp_path / name, loop=plays)
+        assert animation(tmp_path / name)[2] == stored
+
+
+def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None:
+    """One palette for all frames: a small orange lamp stays orange, and grey steps are not seen as bands."""
+    ramp = torch.linspace(0.1, 0.6, 160).expand(90, 160)[..., None].repeat(1, 1, 3)
+    pictures = [ramp.clone() for _ in range(3)]
+    for k, picture in enumerate(pictures):
+        picture[40:46, 20 * k : 20 * k + 6] = torch.tensor([1.0, 0.5, 0.1])
+    save_video(pictures, tmp_path / "a.gif", fps=10)
+    for k, got in enumerate(animation(tmp_path / "a.gif")[0]):
+        lamp = got[41:45, 20 * k + 1 : 20 * k + 5].mean(dim=(0, 1))
+        torch.testing.assert_close(lamp, torch.tensor([1.0, 0.5, 0.1]), atol=0.03, rtol=0)
+        columns = got[:30].mean(dim=(0, 2))
+        assert float((columns - ramp[0, :, 0]).abs().max()) < 0.01
+
+
+def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
+    still = torch.zeros(20, 60, 3)
+    pictures = [still.clone() for _ in range(5)]
+    for k, picture in enumerate(pictures):
+        picture[5:15, 10 * k : 10 * k + 10] = 1.0
+    save_video(pictures, tmp_path / "a.gif")
+    for sent, got in zip(pictures, animation(tmp_path / "a.gif")[0], strict=True):
+        assert torch.equal(got, sent)
+
+
+def test_webm_is_vp9_in_bt709_and_plays_while_it_loads(tmp_path: Path) -> None:
+    given, path = frames(8, 47, 65), tmp_path / "a.webm"
+    save_video(given, path, fps=25)
+    content = path.read_bytes()
+    assert 0 < content.index(b"\x1c\x53\xbb\x6b") < content.index(b"\x1f\x43\xb6\x75")  # cues before clusters
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "vp9"
+        decoded = list(container.decode(video=0))
+    assert [round(frame.time * 25) for frame in decoded] == list(range(8))
+    for sent, got in zip(given, decoded, strict=True):
+        assert (got.height, got.width) == (48, 66)
+        assert (got.colorspace, got.color_primaries, got.color_trc, got.color_range) == (1, 1, 1, 1)
+        assert psnr(torch.from_numpy(got.to_ndarray(format="rgb24")).float()[:47, :65] / 255, sent) > 33
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm"])
+def test_a_video_without_a_count_holds_every_repetition(tmp_path: Path, name: str) -> None:
+    given = frames(7, 32, 32)
+    save_video(given, tmp_path / name, fps=30, loop=3)
+    with av.open(str(tmp_path / name)) as container:
+        decoded = list(container.decode(video=0))
+    assert len(decoded) == 21
+    assert [frame.time for frame in decoded] == pytest.approx([k / 30 for k in range(21)], abs=0.002)
+    for k, got in enumerate(decoded):
+        assert psnr(torch.from_numpy(got.to_ndarray(format="rgb24")).float() / 255, given[k % 7]) > 30
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.webp", "a.webm"])
+def test_no_failed_video_of_any_kind_leaves_a_file(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RuntimeError, match="renderer"):
+        save_video(failing(), tmp_path / name)
+    with pytest.raises(ValueError, match="at least one frame"):
+        save_video([], tmp_path / name)
+    assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "loop", "said"),
+    [
+        ("a.gif", 51, None, "0.01 to 50"),
+        ("a.webp", 91, None, "0.01 to 90"),
+        ("a.gif", 30, -1, "loop count"),
+        ("a.webp", 30, 65_536, "loop count"),
+        ("a.mp4", 30, 0, "play for ever"),
+        ("a.webm", 30, 1001, "from 1 to 1000"),
+    ],
+)
+def test_what_a_format_does_not_know_is_refused(tmp_path: Path, name: str, fps: float, loop: int, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        VideoWriter(tmp_path / name, fps, loop)
+    with pytest.raises(InputError, match="too large"), VideoWriter(tmp_path / "b.webp") as writer:
+        writer.add(torch.zeros(1, 16_384, 3))
+    assert not os.listdir(tmp_path)
+
+
 @pytest.mark.parametrize(("name", "fps"), [("a.avi", 30), ("a", 30), ("none/a.mp4", 30), ("a.mp4", 0)])
 def test_bad_requests_fail_before_any_frame(tmp_path: Path, name: str, fps: float) -> None:
     with pytest.raises(InputError):

@@ -90,6 +90,26 @@ def load_photo(
 
     rgb, exif = read_image(path, read)
     height, width = rgb.shape[:2]
+    focal, source = focal_length(path, width, height, exif, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
+    return Photo(rgb, focal, source, Path(path))
+
+
+def focal_length(
+    path: str | os.PathLike[str],
+    width: int,
+    height: int,
+    exif: dict[int, object],
+    *,
+    focal_px: float | None,
+    focal_mm: float | None,
+    fov: float | None,
+) -> tuple[float, str]:
+    """In pixels, and who said so: a person as `load_photo` has it, else the EXIF tags, else nobody.
+
+    Raises:
+        InputError: a senseless one; `path` names the photo in the message.
+    """
+    _check_focal(focal_px, focal_mm, fov)
     if focal_px is not None:
         focal, source = focal_px, "--focal-px"
     elif focal_mm is not None:
@@ -106,7 +126,7 @@ def load_photo(
             f"{path}: {source} gives a focal length of {focal:g} px, "
             f"but it must lie between {shortest:g} and {longest:g} px: check the value"
         )
-    return Photo(rgb, float(focal), source, Path(path))
+    return float(focal), source
 
 
 def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:

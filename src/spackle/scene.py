@@ -17,8 +17,10 @@ from spackle.camera import Camera
 from spackle.choose import auto_here, finite_prediction
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
+from spackle.formats.video import check_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
+from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet
@@ -49,6 +51,15 @@ class Scene:
         """Cameras of a video around the photo's eye, both sides of the picture even."""
         return scene_path(self.base, self.camera, kind, disparity, frames)
 
+    def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
+        """Cameras through keyframes, see `spackle.formats.load_path`; without a number as many as they take at `fps`.
+
+        Raises:
+            ValueError: the path leads through a view that cannot be.
+        """
+        count = frames or keyframes.frame_count(fps)
+        return keyframes.cameras(even_camera(self.camera), count, DepthRange.of(self.base))
+
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
         """One view of the whole scene."""
         with torch.no_grad():
@@ -71,10 +82,12 @@ class Scene:
         disparity: float = 0.3,
         frames: int = PATH_FRAMES,
         fps: float = 30,
+        loop: int | None = None,
     ) -> None:
-        """Write an mp4 of a camera path."""
-        cameras = self.path(kind, disparity, frames)
-        save_video((view.rgb for view in self.frames(cameras)), path, fps=fps)
+        """Write a video of a camera path: .mp4, .webm, .gif or .webp; `loop` as in `spackle.formats.VideoWriter`."""
+        plays = check_video(path, fps, loop).loop if loop is None else loop
+        cameras = scene_path(self.base, self.camera, kind, disparity, frames, looped=plays != 1)
+        save_video((view.rgb for view in self.frames(cameras)), path, fps, loop)
 
 
 def predict(
@@ -141,10 +154,21 @@ def complete(
 
 
 def scene_path(
-    base: Gaussians, camera: Camera, kind: TrajectoryKind, disparity: float, frames: int = PATH_FRAMES
+    base: Gaussians,
+    camera: Camera,
+    kind: TrajectoryKind,
+    disparity: float,
+    frames: int = PATH_FRAMES,
+    looped: bool = False,
 ) -> list[Camera]:
-    """Cameras around the photo's eye at the photo's size, both sides made even."""
-    return trajectory(kind, even_camera(camera), disparity, DepthRange.of(base), frames)
+    """Cameras around the photo's eye at the photo's size, both sides made even.
+
+    A path ends where it began, but for `swipe`. `looped` leaves out that last camera, which would be shown twice
+    in a row by a video that starts again.
+    """
+    once = looped and kind != "swipe"
+    path = trajectory(kind, even_camera(camera), disparity, DepthRange.of(base), frames + once)
+    return path[:frames]
 
 
 def even_camera(camera: Camera) -> Camera:

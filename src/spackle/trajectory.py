@@ -40,6 +40,11 @@ class DepthRange:
         near, focus = np.quantile(z, [NEAR_QUANTILE, FOCUS_QUANTILE])  # torch's stops at 16 M values
         return DepthRange(float(near), max(MIN_FOCUS_M, float(focus)))
 
+    def towards(self, other: DepthRange, part: float) -> DepthRange:
+        """A part of the way to another range, on a logarithmic scale."""
+        near, focus = (a * (b / a) ** part for a, b in ((self.near, other.near), (self.focus, other.focus)))
+        return DepthRange(near, focus)
+
 
 def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
     """How far the eye moves sideways for a disparity m: m · ‖(W/f, H/f)‖ · z_near."""
@@ -63,6 +68,22 @@ def trajectory(
     Raises:
         ValueError: an unknown path, a disparity out of 0..2, or no frame.
     """
+    eyes, target = _flight(kind, camera, disparity, depth_range, frames)
+    return [camera.looking(eye, target) for eye in eyes]
+
+
+def view_at(
+    kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, index: int, frames: int
+) -> Camera:
+    """One camera of `trajectory`, the rest of which is not made."""
+    eyes, target = _flight(kind, camera, disparity, depth_range, frames)
+    return camera.looking(eyes[index], target)
+
+
+def _flight(
+    kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, frames: int
+) -> tuple[Tensor, Tensor]:
+    """Eye positions [frames, 3] and what they look at, [3]."""
     if kind not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {kind!r}: choose one of {', '.join(TRAJECTORIES)}")
     if not 0 <= disparity <= MAX_DISPARITY:
@@ -71,7 +92,7 @@ def trajectory(
         raise ValueError(f"a trajectory needs at least one frame, got {frames}")
     offset = max_offset(camera, disparity, depth_range)
     target = torch.tensor([0.0, 0.0, depth_range.focus], dtype=torch.float64)
-    return [camera.looking(eye, target) for eye in _eyes(kind, offset, MAX_ZOOM * depth_range.near, frames)]
+    return _eyes(kind, offset, MAX_ZOOM * depth_range.near, frames), target
 
 
 def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:

@@ -2,7 +2,8 @@
 
 from spackle.formats.atomic import atomic_path, check_writable
 from spackle.formats.cameras import load_cameras, save_cameras
-from spackle.formats.ply import load_ply, load_ply_camera, save_ply
+from spackle.formats.keyframes import load_path
+from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, save_ply
 from spackle.formats.png import save_depth_png, save_gray_png, save_png
 from spackle.formats.video import VideoWriter, save_video
 
@@ -11,7 +12,9 @@ __all__ = [
     "atomic_path",
     "check_writable",
     "load_cameras",
+    "load_path",
     "load_ply",
+    "load_ply_base_count",
     "load_ply_camera",
     "save_cameras",
     "save_depth_png",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from typing import IO
 
@@ -64,12 +65,7 @@ def save_ply(
         ValueError: where a Gaussian is not finite.
     """
     count = len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0"]
-    if camera is not None:
-        numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
-        lines.append(" ".join(["comment", CAMERA_COMMENT, *(repr(number) for number in numbers)]))
-    if base_count is not None:
-        lines.append(f"comment {BASE_COMMENT} {base_count}")
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count)]
     lines.append(f"element vertex {count}")
     lines += [*(f"property float {name}" for name in _WRITTEN), "end_header", ""]
     columns = [t.detach().to("cpu", torch.float32).contiguous() for t in gaussians.tensors]
@@ -143,6 +139,35 @@ def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
     width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
     where = f"{path}: the stored camera"
     return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
+
+
+def load_ply_base_count(path: str | os.PathLike[str]) -> int | None:
+    """How many of the first Gaussians `save_ply` was told are the base's; None in other files.
+
+    Raises:
+        InputError: a broken file, or a number that makes no sense.
+    """
+    size = check_file(path, "PLY file")
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+    header.check_size(size)
+    if BASE_COMMENT not in header.comments:
+        return None
+    words, (vertex, _) = header.comments[BASE_COMMENT], _vertex(header)
+    if len(words) != 1 or not re.fullmatch(r"[0-9]{1,12}", words[0]) or int(words[0]) > vertex.count:
+        raise InputError(f"{path}: the stored number of base Gaussians makes no sense: {' '.join(words)[:80]}")
+    return int(words[0])
+
+
+def header_comments(camera: Camera | None, base_count: int | None) -> list[str]:
+    """Header lines that keep the photo's camera, which stands at the world's origin, and the base's number."""
+    lines = []
+    if camera is not None:
+        numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
+        lines.append(" ".join(["comment", CAMERA_COMMENT, *(repr(number) for number in numbers)]))
+    if base_count is not None:
+        lines.append(f"comment {BASE_COMMENT} {base_count}")
+    return lines
 
 
 def _commented_camera(header: Header) -> Camera:

@@ -129,6 +129,7 @@ class _Benchmark:
             f"{setting}: {100 * bill.spread(setting, 'overhead').median:.2f} %" for setting in bill.settings
         )
         self.reporter.say(f"{title}: {n} of {len(bill.images)} images, overhead {overheads} -> {self.output}")
+        self.reporter.result({"folder": self.output, "images": len(bill.images), "measured": n})
 
 
 def _load(path: Path, inputs: str) -> ImageCost | None:

@@ -130,6 +130,7 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
         f"{holes['before']:.1%} -> {holes['after']:.2%}; {time.perf_counter() - start:.0f} s"
     )
     reporter.say(f"Look at {output / 'comparison.png'} and {output / 'video.mp4'}")
+    reporter.result({"folder": output, **report})
     return report
 
 

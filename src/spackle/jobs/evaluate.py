@@ -167,6 +167,7 @@ class _Evaluation:
         more = f", {passed} passed over" if passed else ""
         counted = f"{len(run.measured)} image{'s' if len(run.measured) > 1 else ''}"
         self.reporter.say(f"{run.title}: {counted}{more} -> {self.output}")
+        self.reporter.result({"folder": self.output, "images": len(run.records), "measured": len(run.measured)})
 
     def _write_sheets(self, run: Run) -> None:
         """worst.png begins with the worst image, best.png with the best."""

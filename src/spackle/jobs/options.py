@@ -12,13 +12,13 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.jobs.bases import AUTO, HF, KINDS, NETWORKS, base_files, kind_of
 from spackle.jobs.names import check_name
+from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions, check_video_options
 from spackle.precision import PRECISIONS, Precision
 from spackle.residual.weights import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]
 MAX_FRAMES = 10_000
-MAX_VIDEO_SIDE = 8192
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,9 @@ class PredictOptions:
     trajectory: TrajectoryKind = "rotate_forward"
     disparity: float = 0.3
     cameras: Path | None = None  # exactly these views in place of a trajectory
-    frames: int = 60
+    path: Path | None = None  # keyframes in place of a trajectory
+    frames: int | None = None  # 60, or as many as the keyframes take
+    video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
     mode: Mode = "scene"
     device: str = "auto"
     focal_px: float | None = None
@@ -79,6 +81,7 @@ def check_options(options: PredictOptions) -> None:
         check_name("--base", options.base, (AUTO, *KINDS))
     check_base_options(options)
     check_path_options(options.disparity, options.frames)
+    check_view_options(options.cameras, options.path, options.video)
 
 
 def check_base_options(options: PredictOptions) -> None:
@@ -118,12 +121,21 @@ def _given(options: PredictOptions) -> dict[str, str]:
     return given
 
 
-def check_path_options(disparity: float, frames: int) -> None:
+def check_path_options(disparity: float, frames: int | None) -> None:
     """InputError for a path that cannot be flown."""
     if not (math.isfinite(disparity) and 0 <= disparity <= MAX_DISPARITY):
         raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
-    if not 1 <= frames <= MAX_FRAMES:
+    if frames is not None and not 1 <= frames <= MAX_FRAMES:
         raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {frames}")
+
+
+def check_view_options(cameras: Path | None, path: Path | None, video: VideoOptions) -> None:
+    """InputError for views that are given twice, or a video that cannot be."""
+    if cameras is not None and path is not None:
+        raise InputError(f"--path {path}: --cameras gives the views already: leave one of them out")
+    if cameras is not None and video.size is not None:
+        raise InputError(f"--size: the views of --cameras {cameras} have a size of their own: leave it out")
+    check_video_options(video)
 
 
 def video_problem(cameras: Sequence[Camera]) -> str | None:

@@ -3,32 +3,61 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from pathlib import Path
 
-from spackle.choose import BaseError, all_finite
+from spackle.bases.protocol import BasePrediction
+from spackle.choose import BaseError, Choice, all_finite
 from spackle.errors import InputError
 from spackle.formats import save_ply
+from spackle.formats.clip import is_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo, resize_photo
+from spackle.jobs.clip import check_clip_options, predict_clip
 from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.request import request_of
 from spackle.jobs.setup import Tools, search_base, set_up
-from spackle.jobs.views import complete, make_plan, measure_holes, save_plan_video, save_views, view_files
+from spackle.jobs.views import (
+    Completed,
+    Plan,
+    complete,
+    describe_video,
+    make_plan,
+    measure_holes,
+    save_plan_video,
+    save_views,
+    view_files,
+)
 
-FILES_WITHOUT_VIDEO = ("base.ply", "scene.ply", "report.json")
-FILES = (*FILES_WITHOUT_VIDEO, "video.mp4")
+FILES = ("base.ply", "scene.ply", "report.json")  # and the video
+
+
+@dataclasses.dataclass(frozen=True)
+class Done:
+    """What became of a photo."""
+
+    photo: Photo  # at its working size
+    prediction: BasePrediction
+    choice: Choice
+    plan: Plan
+    completed: Completed
 
 
 def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
-    """Work through a photo or a folder; returns the number of photos that failed.
+    """Work through a photo, a clip or a folder of photos; returns the number of photos that failed.
 
     Raises:
-        InputError: a single photo, or an option, that cannot be used.
+        InputError: a single photo, a clip, or an option, that cannot be used.
     """
     found = find_photos(photos)
+    if is_clip(photos):
+        check_clip_options(options)
+        with results_folder(output):
+            predict_clip(photos, output / found[0][1], options, set_up(options), reporter)
+        return 0
     tools = set_up(options)
     files = _results(options, tools)
     failed = 0
@@ -38,6 +67,7 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
                 request = request_of(path, options, tools.digest)
                 if path != photos and not options.overwrite and is_done(output / name, files, request):
                     reporter.say(f"{path.name}: done already (--overwrite does it again)")
+                    reporter.result({"folder": output / name, "done_already": True})
                     continue
                 predict_one(path, output / name, options, tools, reporter, request)
             except InputError as error:
@@ -45,6 +75,7 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
                     raise
                 failed += 1
                 reporter.say(f"error: {error}")
+                reporter.result({"folder": output / name, "error": str(error)})
     if failed:
         reporter.say(f"{failed} of {len(found)} photos failed")
     return failed
@@ -53,7 +84,7 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
 def predict_one(
     path: Path, folder: Path, options: PredictOptions, tools: Tools, reporter: Reporter, request: str
 ) -> None:
-    """One photo to `folder`: base.ply, scene.ply, video.mp4, report.json, and views/ with --cameras.
+    """One photo to `folder`: base.ply, scene.ply, a video, report.json, and views/ with --cameras.
 
     Raises:
         InputError: a photo or depth map that cannot be used, or a folder that cannot be written to.
@@ -62,7 +93,7 @@ def predict_one(
     with reporter.stage("load", seconds):
         full = load_photo(path, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
     with contextlib.ExitStack() as folders:
-        folders.enter_context(results_folder(folder, FILES if options.render else FILES_WITHOUT_VIDEO))
+        folders.enter_context(results_folder(folder, _files(options)))
         if tools.views:
             folders.enter_context(results_folder(folder / "views", view_files(len(tools.views))))
         _predict_loaded(full, folder, options, tools, reporter, request, seconds)
@@ -79,6 +110,38 @@ def _predict_loaded(
 ) -> None:
     """The stages after loading; nothing is written before all is computed."""
     name = photo.path.name
+    done = complete_photo(photo, name, options, tools, reporter, seconds)
+    photo, prediction, choice, plan, completed = done.photo, done.prediction, done.choice, done.plan, done.completed
+    with reporter.stage("write", seconds):
+        (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
+        count = len(completed.base)
+        save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
+        merged = Gaussians.cat([completed.base, completed.aux])
+        save_ply(merged, folder / "scene.ply", camera=prediction.camera, base_count=count)
+    video = None
+    if options.render:
+        video = describe_video(plan, _video(options))
+        with reporter.stage("video", seconds) as step:
+            save_plan_video(folder / _video(options), plan, completed, tools.renderer, step)
+    if tools.views:
+        with reporter.stage("views", seconds) as step:
+            save_views(folder / "views", plan, completed, tools.renderer, step)
+    with reporter.stage("measure", seconds):
+        holes = measure_holes(plan, completed, tools.renderer)
+    report = make_report(photo, prediction, choice, completed, options, tools, holes, video, request, seconds)
+    write_report(report, folder / "report.json")
+    reporter.say(f"{name}: {summary(report)} -> {folder}")
+    reporter.result({"folder": folder, **report})
+
+
+def complete_photo(
+    photo: Photo, name: str, options: PredictOptions, tools: Tools, reporter: Reporter, seconds: dict[str, float]
+) -> Done:
+    """A photo, given at its full size, to a completed scene in memory; `name` is what the lines call it.
+
+    Raises:
+        InputError: a photo or depth map that cannot be used.
+    """
     with reporter.stage("prepare", seconds):
         search = search_base(photo, options, tools, reporter.say)
         search.load()
@@ -95,31 +158,23 @@ def _predict_loaded(
         reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
     if options.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
         reporter.say(f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}")
-    plan = make_plan(photo.path, prediction, options, tools.views)
+    plan = make_plan(photo.path, prediction, options, tools)
     with reporter.stage("complete", seconds) as step:
         completed = complete(prediction, plan, options, tools, step)
         if not all_finite(completed.aux):
             raise InputError(f"{options.cameras or photo.path}: views too extreme to complete: check their K")
-    with reporter.stage("write", seconds):
-        (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
-        count = len(completed.base)
-        save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
-        merged = Gaussians.cat([completed.base, completed.aux])
-        save_ply(merged, folder / "scene.ply", camera=prediction.camera, base_count=count)
-    if options.render:
-        with reporter.stage("video", seconds) as step:
-            save_plan_video(folder / "video.mp4", plan, completed, tools.renderer, step)
-    if tools.views:
-        with reporter.stage("views", seconds) as step:
-            save_views(folder / "views", plan, completed, tools.renderer, step)
-    with reporter.stage("measure", seconds):
-        holes = measure_holes(plan, completed, tools.renderer)
-    report = make_report(photo, prediction, choice, completed, options, tools, holes, request, seconds)
-    write_report(report, folder / "report.json")
-    reporter.say(f"{name}: {summary(report)} -> {folder}")
+    return Done(photo, prediction, choice, plan, completed)
 
 
 def _results(options: PredictOptions, tools: Tools) -> list[str]:
     """All files that a prediction writes."""
     views = [f"views/{name}" for name in view_files(len(tools.views or []))]
-    return [*(FILES if options.render else FILES_WITHOUT_VIDEO), *views]
+    return [*_files(options), *views]
+
+
+def _files(options: PredictOptions) -> tuple[str, ...]:
+    return (*FILES, _video(options)) if options.render else FILES
+
+
+def _video(options: PredictOptions) -> str:
+    return f"video{options.video.suffix}"

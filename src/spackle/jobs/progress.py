@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
 
 from rich.console import Console
@@ -25,11 +26,23 @@ Step = Callable[[int, int], None]  # (done, of how many)
 
 
 class Reporter:
-    """Says what is going on, and how long each stage took."""
+    """Says what is going on, and how long each stage took; people read it from the standard error.
 
-    def __init__(self, verbose: bool = False, console: Console | None = None) -> None:
+    Args:
+        verbose: say the details too.
+        console: where to say it.
+        as_json: print each result for scripts, a line of JSON on the standard output.
+    """
+
+    def __init__(self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False) -> None:
         self.console = console or Console(stderr=True, highlight=False)
         self.verbose = verbose
+        self.as_json = as_json
+
+    def result(self, values: Mapping[str, object]) -> None:
+        """What has come out, for scripts that asked for it."""
+        if self.as_json:
+            print(json.dumps(values, allow_nan=False, default=str), flush=True)  # paths are given as text
 
     def say(self, line: str) -> None:
         """One line for everybody."""

@@ -32,11 +32,13 @@ def make_report(
     options: PredictOptions,
     tools: Tools,
     holes: list[dict[str, float | str]],
+    video: dict[str, object] | None,
     request: str,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """Counts, holes, times and sources of one photo, ready for JSON."""
     base, aux = len(completed.base), len(completed.aux)
+    given = options.cameras or options.path
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
         "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
@@ -47,8 +49,9 @@ def make_report(
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
         "mode": options.mode,
-        "views": options.cameras.name if options.cameras else options.trajectory,
-        "disparity": None if options.cameras else options.disparity,
+        "views": given.name if given else options.trajectory,
+        "disparity": None if given else options.disparity,
+        "video": video,
         "hole_area_ratio": holes,
         "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},

@@ -24,7 +24,8 @@ def shared_digest(options: PredictOptions) -> str:
     Raises:
         InputError: one of the files is missing.
     """
-    files = {"calibration": options.calib, "camera file": options.cameras, "weights": options.residual_file}
+    files = {"calibration": options.calib, "camera file": options.cameras, "path file": options.path}
+    files["weights"] = options.residual_file
     choices = {name: value for name, value in dataclasses.asdict(options).items() if not isinstance(value, Path)}
     for name in IRRELEVANT:
         del choices[name]

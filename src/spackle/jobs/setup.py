@@ -13,12 +13,13 @@ from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
 from spackle.choose import Auto, BaseError, Load, Say, Search, Way, by_own_depth, load_sharp
 from spackle.errors import InputError
-from spackle.formats import load_cameras
+from spackle.formats import load_cameras, load_path
 from spackle.image import Photo
 from spackle.jobs.bases import AUTO, HF, NETWORKS, kind_of
 from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions, check_options, video_problem
 from spackle.jobs.request import shared_digest
+from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.weights import load_residual
@@ -35,6 +36,7 @@ class Tools:
     residual: str  # for the report: "shipped", a path, "seeds" or "none"
     views: list[Camera] | None  # of --cameras
     digest: str  # of the options, and of the files that all photos share
+    path: KeyframePath | None = None  # of --path
 
 
 def set_up(options: PredictOptions) -> Tools:
@@ -51,7 +53,8 @@ def set_up(options: PredictOptions) -> Tools:
         raise InputError(f"{options.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     digest = shared_digest(options)
     base, auto = _bases(options, digest)
-    return Tools(get_renderer(options.device), base, auto, network, options.residual_weights, views, digest)
+    path = load_path(options.path) if options.path else None
+    return Tools(get_renderer(options.device), base, auto, network, options.residual_weights, views, digest, path)
 
 
 def _bases(options: PredictOptions, digest: str) -> tuple[Load | None, Auto | None]:

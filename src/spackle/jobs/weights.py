@@ -83,8 +83,13 @@ def make_weights(output: Path, size: str, reporter: Reporter) -> None:
     )
 
 
-def list_weights(console: Console) -> None:
+def list_weights(reporter: Reporter, console: Console) -> None:
     """A table of the known weights; of those that are here the size alone is checked, which takes no time."""
+    if reporter.as_json:
+        for known in WEIGHTS.values():
+            file = weights_folder() / known.file
+            reporter.result({"name": known.name, "state": _state(file), "file": file, "licence": known.licence})
+        return
     table = Table(box=None, pad_edge=False)
     for header in ("name", "state", "file", "licence"):
         table.add_column(header, overflow="fold")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 
@@ -118,6 +119,21 @@ def predict_deltas(
             seen: Tensor = network(features[..., rows, columns])[0].permute(1, 2, 0)
         field[inner.slices] = seen[inner.within(outer).slices].float()
     return field
+
+
+def compile_network(network: ResidualNet, backend: str = "inductor") -> ResidualNet:
+    """The same network, sharing its weights, that `torch.compile` translates when it is first asked.
+
+    It takes a C++ compiler on a processor, and minutes rather than seconds, but not again for each size; a machine that
+    cannot do it says so by a RuntimeError at the first call. Values differ from the network's by rounding.
+
+    Args:
+        network: stays as it is.
+        backend: one of PyTorch's; "eager" translates nothing.
+    """
+    twin = copy.copy(network)
+    twin.compile(dynamic=True, backend=backend)
+    return twin
 
 
 def _head(width: int, channels: int) -> nn.Sequential:

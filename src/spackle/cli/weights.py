@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from spackle.cli.options import JsonOption
+
 weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
 
 
@@ -48,10 +50,16 @@ def weights_make(
 
 
 @weights.command("list")
-def weights_list() -> None:
+def weights_list(as_json: JsonOption = False) -> None:
     """Say which weights are known, and which of them are here."""
     from rich.console import Console
 
+    from spackle.jobs.progress import Reporter
     from spackle.jobs.weights import list_weights
 
-    list_weights(Console(highlight=False))
+    list_weights(Reporter(as_json=as_json), Console(highlight=False))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(weights, name="weights", short_help="Weights that others publish: fetch them, list them")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from spackle.cli_options import INTERRUPTED
+from spackle.cli.options import INTERRUPTED, JsonOption
 from spackle.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,11 +19,12 @@ NUMBER = re.compile(r"[\d.,]+")
 UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
 
 # Options that both commands have.
-Dataset = Annotated[
-    str,
-    typer.Option(metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."),
-]
-Root = Annotated[Path, typer.Option(metavar="DIR", help="Where the dataset was unpacked.")]
+_DATASET = typer.Option(
+    metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
+)
+_ROOT = typer.Option(metavar="DIR", help="Where the dataset was unpacked.")
+Dataset = Annotated[str, _DATASET]
+Root = Annotated[Path, _ROOT]
 BaseName = Annotated[str, typer.Option(help="sharp, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 LowMemory = Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")]
@@ -80,6 +81,7 @@ def evaluate(
         ),
     ] = None,
     html: Annotated[bool, typer.Option("--html", help="Write OUT/report.html too: one page with all of it.")] = False,
+    as_json: JsonOption = False,
     verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image takes.")] = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
@@ -101,7 +103,7 @@ def evaluate(
         download=download_metrics,
     )
     folder = output or Path(f"evaluation-{dataset}-{protocol}")
-    if run(options, folder, Reporter(verbose), html) == "stopped":
+    if run(options, folder, Reporter(verbose, as_json=as_json), html) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 
@@ -119,8 +121,20 @@ def tables(
 
 def bench(
     context: typer.Context,
-    dataset: Dataset,
-    root: Root,
+    dataset: Annotated[str | None, _DATASET] = None,
+    root: Annotated[Path | None, _ROOT] = None,
+    suite: Annotated[
+        bool, typer.Option("--suite", help="Time every stage on this machine instead, without a dataset.")
+    ] = False,
+    only: Annotated[
+        str | None, typer.Option(metavar="A,B,…", help="Of the suite's sections: an unknown one lists all.")
+    ] = None,
+    compiled: Annotated[
+        bool, typer.Option("--compile", help="In the suite: time the residual's network through torch.compile, too.")
+    ] = False,
+    side: Annotated[
+        int | None, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
+    ] = None,
     disparity: Annotated[
         str, typer.Option(metavar="A,B,…", help="Of the timed views, with commas or spaces; the paper's S1, S2, S3.")
     ] = "0.3,0.4,0.5",
@@ -137,28 +151,46 @@ def bench(
     device: Device = "auto",
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: bench-NAME-BASE."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help="A folder; a run in it goes on. Default: bench-NAME-BASE or bench-suite.",
+        ),
     ] = None,
+    as_json: JsonOption = False,
     verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say what each view takes.")] = False,
 ) -> None:
-    """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex."""
+    """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex.
+
+    With --suite: time every stage beside the least it could take, without a dataset: suite.json, suite.md, scaling.svg.
+    """
     from spackle.jobs.bench import bench as run
     from spackle.jobs.bench_options import BenchOptions
+    from spackle.jobs.bench_suite import bench_suite
+    from spackle.jobs.bench_suite_options import check_choice, suite_options
     from spackle.jobs.evaluate_options import parse_disparities
     from spackle.jobs.progress import Reporter
 
-    options = BenchOptions(
-        dataset=dataset,
-        root=root,
-        disparities=parse_disparities(_with_words(context, disparity)),
-        base=_base_options(base, checkpoint, precision, low_memory, residual, device),
-        limit=limit,
-        runs=runs,
-        base_runs=base_runs,
-    )
-    folder = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
-    if run(options, folder, Reporter(verbose)) == "stopped":
+    given = _given(context)
+    check_choice(suite, given)
+    disparities = parse_disparities(_with_words(context, disparity))
+    bases = _base_options(base, checkpoint, precision, low_memory, residual, device)
+    if dataset is None or root is None:
+        asked = suite_options(bases, given, only, runs, base_runs, compiled, side)
+        end = bench_suite(asked, output or Path("bench-suite"), Reporter(verbose, as_json=as_json))
+    else:
+        options = BenchOptions(dataset, root, disparities, bases, limit, runs, base_runs)
+        folder = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
+        end = run(options, folder, Reporter(verbose, as_json=as_json))
+    if end == "stopped":
         raise typer.Exit(INTERRUPTED)
+
+
+def _given(context: typer.Context) -> set[str]:
+    """The options that stand on the command line, by their long names."""
+    sources = {p.opts[-1]: context.get_parameter_source(p.name) for p in context.command.params if p.name}
+    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 def _base_options(
@@ -191,6 +223,6 @@ def _with_words(context: typer.Context, disparity: str) -> str:
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    app.command(context_settings=WORDS)(evaluate)
-    app.command()(tables)
-    app.command(context_settings=WORDS)(bench)
+    app.command(context_settings=WORDS, short_help="Measure on a dataset, in the paper's protocols")(evaluate)
+    app.command(short_help="Several evaluations in the same tables")(tables)
+    app.command(context_settings=WORDS, short_help="What Spackle costs, in Gaussians and in time")(bench)

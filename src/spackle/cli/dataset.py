@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from spackle.cli_options import INTERRUPTED, Device, DeviceOption, PrecisionChoice, Trajectory, VerboseOption
+from spackle.cli.options import INTERRUPTED, Device, DeviceOption, PrecisionChoice, Trajectory, VerboseOption
 
 dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
 
@@ -122,3 +122,8 @@ def dataset_preview(
     from spackle.jobs.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(dataset, name="dataset", short_help="Photos to views with holes and completed targets, to train on")

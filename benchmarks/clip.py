@@ -1,0 +1,239 @@
+"""How calm the holes of a clip are: `python benchmarks/clip.py [--side N] [--frames N]` (needs scikit-image).
+
+A camera moves through the Middlebury Motorcycle scene, before which a painted board stands or passes by. The scene's
+geometry is known, so each frame comes with its depth, and for each completed view there is the true view, with the
+true motion of all that the board hid. Followed by that motion into the view before, a hole's pixel should find its
+colour again: the mean absolute difference of sRGB is its flicker. "Alone" is each frame by itself, "carried" what
+`spackle predict` draws. "Seen" is the same figure for what the frame does show: the floor. All in units of 1/255.
+The method follows its own optical flow; the true motion and the truth only judge.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.rgbd import lift
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.formats import save_png
+from spackle.gaussians import Gaussians
+from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
+from spackle.opencv import OpenCV
+from spackle.render import get_renderer
+from spackle.rendering import Rendering
+from spackle.residual import Completer
+from spackle.residual.carry import flicker
+from spackle.residual.motion import pixel_grid, sample
+from spackle.residual.weights import shipped_network
+from spackle.surface import surface_gaussians
+
+BOARD_M, FOCUS_M = 1.5, 3.0
+PATH = 4  # the clip is the beginning of a path of this many times its length
+SAME_DEPTH = 0.02  # relative difference within which two views see the same thing
+# Of the simulated depth network, from frame to frame: scale, shift (of the median) and waves of inverse depth.
+SCALE_NOISE, SHIFT_NOISE, WAVE_NOISE = 0.05, 0.02, 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What the clip is taken of."""
+
+    still: Gaussians
+    board: Gaussians  # at its place in the first frame
+    camera: Camera
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """How the camera, and how the board moves."""
+
+    name: str
+    eye: tuple[float, float, float]  # where the camera gets to, in metres
+    board: float  # how far the board goes to the right, in metres
+
+
+CLIPS = (
+    Clip("pan past a board", (0.20, 0.0, 0.0), 0.0),
+    Clip("walk towards it", (0.0, 0.0, 0.25), 0.0),
+    Clip("a board passes", (0.0, 0.0, 0.0), 0.40),
+    Clip("both move", (-0.10, 0.03, 0.1), 0.25),
+)
+
+
+def load_world(side: int) -> World:
+    """Motorcycle's left photo, `side` pixels wide, completed so that it may be walked through; and the board."""
+    from skimage import data, transform
+
+    left, _, disparity = data.stereo_motorcycle()
+    step = left.shape[1] / side
+    height = round(left.shape[0] / step)
+    rgb = torch.from_numpy(transform.resize(left, (height, side), anti_aliasing=True).astype(np.float32))
+    rows, columns = (((np.arange(n) + 0.5) * step).astype(int) for n in (height, side))
+    picked = disparity[rows][:, columns]
+    depth = np.where(np.isfinite(picked), 994.978 * 0.193001 / (picked + 31.086), 0).astype(np.float32)
+    camera = Camera.from_focal(994.978 / step, side, height)
+    depths = torch.from_numpy(depth)
+    still = lift(rgb, DepthMap(depths, depths > 0, None, None, "depth", Path("motorcycle")), camera).gaussians
+    around = [moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)]
+    aux = Completer(still, camera, get_renderer()).complete_scene(around, exact=True)
+    return World(Gaussians.cat([still, aux]), board(camera), camera)
+
+
+def board(camera: Camera) -> Gaussians:
+    """A board in the left half of the picture, painted with stripes."""
+    height, width = camera.height, camera.width
+    uv = camera.pixel_centers()[height // 4 : height * 3 // 4, width // 5 : width * 2 // 5].reshape(-1, 2)
+    x, y = (uv / width).unbind(-1)
+    paint = [0.7 + 0.2 * torch.sin(90 * x), 0.35 + 0.2 * torch.sin(60 * y), 0.25 + 0.1 * torch.sin(70 * (x + y))]
+    flat = torch.full((len(uv),), 1 / BOARD_M)
+    colors = srgb_to_linear(torch.stack(paint, -1))
+    return surface_gaussians(camera, uv, flat, torch.zeros(len(uv), 2), 0.7, colors, torch.full((len(uv),), 0.99))
+
+
+def moved(camera: Camera, eye: tuple[float, float, float]) -> Camera:
+    """The camera at another place, looking at what it looked at."""
+    return camera.looking(torch.tensor(eye), torch.tensor([0.0, 0.0, FOCUS_M]))
+
+
+def at(world: World, clip: Clip, part: float) -> tuple[list[Gaussians], Camera]:
+    """The scene and the camera that takes it, `part` of the way through the clip."""
+    shift = torch.eye(4)
+    shift[0, 3] = clip.board * part
+    x, y, z = (part * goal for goal in clip.eye)
+    return [world.still, world.board.transform(shift)], moved(world.camera, (x, y, z))
+
+
+def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
+    """True depth [H, W] as a network might say it: with another scale, shift and dents in each frame."""
+    rolls = torch.randn(2, generator=dice)
+    waves = torch.randn(1, 1, 4, 6, generator=dice)
+    waves = torch.nn.functional.interpolate(waves, size=depth.shape, mode="bicubic")[0, 0]
+    inverse = (1 / depth) * (SCALE_NOISE * rolls[0] + WAVE_NOISE * waves).exp()
+    return 1 / (inverse + SHIFT_NOISE * float(inverse.median()) * rolls[1]).clamp_min(0.1 * float(inverse.median()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """The true view."""
+
+    camera: Camera
+    view: Rendering
+
+
+def play(
+    world: World, clip: Clip, frames: int, disparity: float, noisy: bool, steady: bool
+) -> Iterator[tuple[Drawn, Truth]]:
+    """Each frame's completed view, and the truth."""
+    renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
+    choices = ClipChoices("rotate", disparity, PATH * frames, steady=steady, network=shipped_network())
+    completer = ClipCompleter(choices, renderer, OpenCV("this").flow)
+    for index in range(frames):
+        scene, camera = at(world, clip, index / max(1, frames - 1))
+        taken = renderer.render(scene, camera)
+        depth = said_depth(taken.depth, dice) if noisy else taken.depth
+        own = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+        known = DepthMap(depth, depth > 0, None, None, "depth", Path(clip.name))
+        drawn = completer.add(taken.rgb, lift(taken.rgb, known, own))
+        pose = drawn.camera.world_to_camera @ camera.world_to_camera
+        truth = dataclasses.replace(drawn.camera, world_to_camera=pose)
+        yield drawn, Truth(truth, renderer.render(scene, truth))
+
+
+def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
+    """Of what stands still, from a true view into the one before: [H, W, 2], and where both see the same, [H, W]."""
+    grid = pixel_grid(now.view.depth)
+    points = now.camera.unproject(grid, now.view.depth)
+    uv, z = was.camera.project(points)
+    seen = sample(was.view.depth[..., None], uv)[..., 0]
+    return uv - grid, ((seen / z - 1).abs() < SAME_DEPTH) & (now.view.alpha > 0.99)
+
+
+class Sums:
+    """Means over the pixels of many frames."""
+
+    def __init__(self) -> None:
+        self.sums: dict[str, float] = {}
+        self.counts: dict[str, int] = {}
+
+    def add(self, name: str, values: Tensor) -> None:
+        self.sums[name] = self.sums.get(name, 0.0) + float(values.double().sum())
+        self.counts[name] = self.counts.get(name, 0) + values.numel()
+
+    def mean(self, name: str) -> float:
+        return self.sums[name] / max(1, self.counts[name])
+
+    def psnr(self, name: str) -> float:
+        return -10 * math.log10(self.mean(name))
+
+
+def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool, folder: Path | None) -> Sums:
+    """Both ways through the same clip, side by side."""
+    sums, past = Sums(), None
+    steadied = play(world, clip, frames, disparity, noisy, steady=noisy)
+    # Where the depth is exact there is nothing to hold still, so the same run has both.
+    raw = play(world, clip, frames, disparity, noisy, steady=False) if noisy else None
+    pairs = ((one, one) for one in steadied) if raw is None else zip(steadied, raw, strict=True)
+    for index, ((drawn, truth), (lone, lone_truth)) in enumerate(pairs):
+        sums.add("holes", drawn.hole.float())
+        for name, view, hole, exact in (
+            ("carried", drawn.view.rgb, drawn.hole, truth),
+            ("alone", lone.alone.rgb, lone.hole, lone_truth),
+        ):
+            sums.add(f"{name} off", (view - exact.view.rgb)[hole & (exact.view.alpha > 0.99)].square())
+        if past is not None:
+            for name, now, was in (("carried", (drawn, truth), past[0]), ("alone", (lone, lone_truth), past[1])):
+                _compare(sums, name, now, was)
+        if folder is not None:
+            rows = [truth.view.rgb, lone.before.rgb, lone.alone.rgb, drawn.view.rgb]
+            save_png(torch.cat(rows, dim=1), folder / f"{clip.name.replace(' ', '_')}_{int(noisy)}_{index:03d}.png")
+        past = ((drawn, truth), (lone, lone_truth))
+    return sums
+
+
+def _compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, Truth]) -> None:
+    """Flicker of a view's holes, and of what is seen in it."""
+    (drawn, truth), (earlier, before) = now, was
+    flow, same = true_flow(truth, before)
+    held = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
+    view, view_before = (d.alone if name == "alone" else d.view for d in (drawn, earlier))
+    for kind, chosen in (("hole", drawn.hole & (held > 0.999)), ("seen", ~drawn.hole & (held < 0.001))):
+        value = flicker(view.rgb, view_before.rgb, flow, chosen & same)
+        if value is not None:
+            count = int((chosen & same).sum())
+            sums.add(f"{name} {kind}", torch.full((count,), 255 * value))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--side", type=int, default=384, help="pixels along the frame's longer side")
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--disparity", type=float, default=0.3)
+    parser.add_argument("--save", type=Path, help="folder for pictures: truth, base, alone, carried")
+    parser.add_argument("--clip", type=int, help="only this clip, by its number")
+    options = parser.parse_args()
+    world = load_world(options.side)
+    if options.save:
+        options.save.mkdir(parents=True, exist_ok=True)
+    heads = ("depth", "holes", "seen", "alone", "carried", "ratio", "alone dB", "carried dB")  # PSNR in the holes
+    print(f"{'clip':18}", *(f"{head:>10}" for head in heads))
+    for noisy in (False, True):
+        for clip in CLIPS if options.clip is None else [CLIPS[options.clip]]:
+            sums = judge(world, clip, options.frames, options.disparity, noisy, options.save)
+            alone, carried = sums.mean("alone hole"), sums.mean("carried hole")
+            figures = (sums.mean("carried seen"), alone, carried, carried / alone)
+            figures += (sums.psnr("alone off"), sums.psnr("carried off"))
+            cells = ["noisy" if noisy else "exact", f"{sums.mean('holes'):.1%}", *(f"{value:.2f}" for value in figures)]
+            print(f"{clip.name:18}", *(f"{cell:>10}" for cell in cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()

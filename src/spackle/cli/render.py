@@ -1,0 +1,74 @@
+"""`spackle render`, as the command line has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.cli.options import (
+    CamerasOption,
+    ConvergenceOption,
+    Device,
+    DeviceOption,
+    DisparityOption,
+    FormatOption,
+    FpsOption,
+    FramesOption,
+    IpdOption,
+    JsonOption,
+    LoopOption,
+    PathOption,
+    ShowChoice,
+    ShowOption,
+    SizeOption,
+    StereoOption,
+    TrajectoryOption,
+    VerboseOption,
+    chosen_trajectory,
+    video_options,
+)
+
+
+def render(
+    scene: Annotated[Path, typer.Option("-i", "--input", metavar="SCENE.ply", help="A 3D Gaussian scene.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
+    trajectory: TrajectoryOption = None,
+    disparity: DisparityOption = 0.3,
+    path: PathOption = None,
+    cameras: CamerasOption = None,
+    frames: FramesOption = None,
+    video_format: FormatOption = None,
+    fps: FpsOption = 30,
+    loop: LoopOption = None,
+    size: SizeOption = None,
+    show: ShowOption = ShowChoice.color,
+    stereo: StereoOption = None,
+    ipd: IpdOption = None,
+    convergence: ConvergenceOption = None,
+    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
+    device: DeviceOption = Device.auto,
+    as_json: JsonOption = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Draw a saved scene along a camera path."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.render import RenderOptions, render_scene
+
+    options = RenderOptions(
+        trajectory=chosen_trajectory(trajectory, path).name,  # type: ignore[arg-type]
+        disparity=disparity,
+        cameras=cameras,
+        path=path,
+        frames=frames,
+        video=video_options(video_format, fps, loop, size, show, stereo, ipd, convergence),
+        focal_px=focal_px,
+        device=device.value,
+    )
+    render_scene(scene, output, options, Reporter(verbose, as_json=as_json))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(short_help="A saved scene to a video")(render)

@@ -1,0 +1,52 @@
+"""`spackle train`, as the command line has it."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from spackle.cli.options import INTERRUPTED, VerboseOption
+
+
+class MethodChoice(str, Enum):
+    """What learns."""
+
+    residual = "residual"
+    direct_ft = "direct-ft"
+    lite = "lite"
+
+
+def train(
+    recipe: Annotated[Path, typer.Option("--recipe", metavar="FILE.yaml", help="What to learn from, and how.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on.")],
+    overrides: Annotated[
+        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
+    ] = None,
+    method: Annotated[
+        MethodChoice,
+        typer.Option(help="What learns: the residual; direct-ft: SHARP's decoder, for comparison; lite: its network."),
+    ] = MethodChoice.residual,
+    checkpoint: Annotated[
+        Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where OUT holds a run.")] = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Train the residual, SHARP itself or lite: best.safetensors, last.safetensors, run.json, pictures and logs."""
+    from spackle.jobs.progress import Reporter
+    from spackle.jobs.train import train_recipe
+
+    speaker, choices = Reporter(verbose), overrides or []
+    ended = train_recipe(
+        recipe, choices, output, speaker, method=method.value, checkpoint=checkpoint, overwrite=overwrite
+    )
+    if ended == "stopped":
+        raise typer.Exit(INTERRUPTED)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command(short_help="Train the residual, SHARP's decoder, or lite")(train)

@@ -1,0 +1,161 @@
+"""What drawing a scene needs at least: operations and bytes of each stage, counted for the very scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from spackle._numba import kernel
+from spackle.evaluation.suite.arithmetic import operations_of
+from spackle.evaluation.suite.values import Need
+from spackle.gaussians import Gaussians
+from spackle.render import project as projection
+from spackle.render.approx import ONE, ZERO, alpha_of, encode_srgb, exp2
+from spackle.render.blend import (
+    CHECK_EVERY,
+    INVISIBLE,
+    PLANE,
+    STATE,
+    blend_row,
+    blend_splat,
+    is_full,
+    rows_of,
+)
+from spackle.render.pipeline import BLEND_GRAIN, Drawing, draw, wanted_tiles
+from spackle.render.project import FALL, HALF_HEIGHT, PEAK, View, Y
+from spackle.render.protocol import TILE
+from spackle.threads import run_chunks
+
+Array = npt.NDArray[Any]
+
+FLOAT = 4  # bytes
+GAUSSIAN = FLOAT * (3 + 4 + 3 + 1 + 3)  # the five tensors
+RECORD = FLOAT * projection.RECORD
+BOX, KEY, ID, START = 4 * 2, 4, 4, 8
+PIXEL = FLOAT * (3 + 1 + 1)  # colour, depth, alpha
+PASSES = 3  # of the radix sort
+
+INTEGERS = frozenset({"i", "first", "start", "found", "out", "row"})  # in the kernels' sources
+EDGES = frozenset({"left", "right", "top", "bottom"})  # in that of `cover`
+SPLAT_OPERATIONS = 4  # of a Gaussian in a tile: its centre, counted from the tile's corner
+DEPTH_OPERATIONS = 2  # of a pixel: depth over alpha, where that is more than zero
+DEPTH_TEST = 10  # of a Gaussian behind the camera: z in three products and three sums, and the four comparisons
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """How far blending goes before its tiles are full."""
+
+    splats: int  # Gaussians drawn into tiles, each as often as into tiles
+    rows: int  # rows of sixteen pixels that they are drawn into
+
+
+def drawing_needs(sets: Sequence[Gaussians], view: View, tiles: Array | None = None) -> dict[str, Need]:
+    """Needs of "project", "sort", "bin" and "blend" where sets are drawn, in some tiles or in all."""
+    wanted = wanted_tiles(view, None) if tiles is None else tiles
+    drawing = draw(sets, view, wanted, None)
+    counts = np.diff(drawing.lists.starts)
+    visible, entries = len(np.unique(drawing.lists.ids)), int(counts.sum())
+    return {
+        "project": project_need(sum(len(part) for part in sets), visible),
+        "sort": sort_need(visible),
+        "bin": bin_need(visible, entries, wanted.size),
+        "blend": blend_need(drawing, visible, entries),
+    }
+
+
+def project_need(gaussians: int, visible: int) -> Need:
+    """Read five tensors of each; write the record, the box, the key and the id of each visible one.
+
+    A visible one's operations are those written in `project_chunk`, `covariance`, `cover` and `touches`, in float64;
+    of any other it takes the depth to know that.
+    """
+    each = sum(operations_of(part, INTEGERS) for part in (projection.project_chunk, projection.covariance))
+    each += operations_of(projection.cover, EDGES)
+    operations = float(visible * each + (gaussians - visible) * DEPTH_TEST)
+    return Need(float(gaussians * GAUSSIAN + visible * (RECORD + BOX + KEY + ID)), {"fp64": operations})
+
+
+def sort_need(visible: int) -> Need:
+    """Three passes that read and write each key and id; no floating-point."""
+    return Need(float(PASSES * 2 * (KEY + ID) * visible))
+
+
+def bin_need(visible: int, entries: int, tiles: int) -> Need:
+    """Read the order and each one's box, write each tile's list and where it begins; no floating-point."""
+    return Need(float(visible * (ID + BOX) + entries * ID + tiles * START))
+
+
+def blend_need(drawing: Drawing, visible: int, entries: int) -> Need:
+    """Read the lists, and each visible record once (again it comes from the cache); write each pixel once.
+
+    Operations: those of `blend_row` for each of the sixteen pixels of each row that is drawn before its tile is full,
+    those of `blend_splat` for each such row, and what finishes each pixel.
+    """
+    walk, pixels = walked(drawing), int(drawing.wanted.sum()) * PLANE
+    operations = walk.rows * (TILE * pixel_operations() + row_operations()) + pixels * finish_operations()
+    traffic = entries * ID + visible * RECORD + pixels * PIXEL
+    return Need(float(traffic), {"fp32": float(operations)})
+
+
+def pixel_operations() -> int:
+    """Of one pixel of one row of one Gaussian."""
+    return sum(operations_of(part, INTEGERS) for part in (blend_row, alpha_of, exp2))
+
+
+def row_operations() -> int:
+    """Of one row of one Gaussian, besides its pixels: `blend_splat` but for its first two lines of arithmetic."""
+    return operations_of(blend_splat, INTEGERS) - SPLAT_OPERATIONS
+
+
+def finish_operations() -> int:
+    """Of one pixel, once: three channels to sRGB, depth over alpha."""
+    return 3 * operations_of(encode_srgb) + DEPTH_OPERATIONS
+
+
+def walked(drawing: Drawing) -> Walk:
+    """Blend a drawing's tiles once more, and count."""
+    tiles, lists, columns = np.flatnonzero(drawing.wanted), drawing.lists, drawing.wanted.shape[1]
+    counts = np.zeros((len(tiles), 2), np.int64)
+    run_chunks(
+        lambda a, b: count_walk(a, b, tiles, columns, lists.ids, lists.starts, drawing.splats.records, counts),
+        len(tiles),
+        BLEND_GRAIN,
+    )
+    splats, rows = counts.sum(axis=0)
+    return Walk(int(splats), int(rows))
+
+
+@kernel
+def count_walk(
+    first: int, last: int, tiles: Array, columns: int, ids: Array, starts: Array, records: Array, counts: Array
+) -> None:
+    """Go through tiles first..last as `blend_tiles` does; write Gaussians and rows of each to counts [K, 2]."""
+    state = np.empty(STATE, np.float32)
+    for k in range(first, last):
+        tile = tiles[k]
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        for i in range(STATE):
+            state[i] = ONE if i < PLANE else ZERO
+        for entry in range(starts[tile], starts[tile + 1]):
+            blend_splat(state, records, ids[entry], left, top)
+            counts[k, 0] += 1
+            counts[k, 1] += count_rows(records[ids[entry]], top)
+            if (entry - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_full(state):
+                break
+
+
+@kernel
+def count_rows(record: Array, top: int) -> int:
+    """The rows of a tile that a Gaussian is drawn into."""
+    y = record[Y] - np.float32(top) - np.float32(0.5)
+    first, last = rows_of(y, record[HALF_HEIGHT])
+    count = 0
+    for row in range(first, last):
+        dy = np.float32(row) - y
+        count += record[PEAK] - record[FALL] * dy * dy >= INVISIBLE
+    return count

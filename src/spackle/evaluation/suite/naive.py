@@ -1,0 +1,151 @@
+"""The renderer that one writes first, to hold ours against: tile by tile, Gaussian by Gaussian, pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.evaluation.suite.clock import Lap
+from spackle.gaussians import Gaussians
+from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
+from spackle.render.project import View, covariance
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
+from spackle.threads import run_chunks
+
+Array = npt.NDArray[Any]
+
+
+def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None) -> Tensor:
+    """RGB [H, W, 3] sRGB of Gaussians, with `eps2d` 0; depth and alpha are drawn, too, as ours are."""
+    means, quats, scales, opacities, colors = (t.numpy() for t in scene.tensors)
+    view = View.of(camera, 0.0)
+    splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
+    lens, size = (view.lens, view.pose), (view.width, view.height)
+    run_chunks(
+        lambda a, b: naive_project(a, b, means, quats, scales, opacities, *lens, *size, splats, boxes),
+        len(scene),
+        PROJECT_GRAIN,
+    )
+    lap("project")
+    order = np.argsort(splats[:, 2], kind="stable")
+    lap("sort")
+    starts, ids = naive_bin(order, boxes, *view.tiles)
+    lap("bin")
+    images = np.zeros((view.height, view.width, 5), np.float32)
+    run_chunks(
+        lambda a, b: naive_blend(a, b, splats, boxes, opacities, colors, starts, ids, images),
+        len(starts) - 1,
+        BLEND_GRAIN,
+    )
+    lap("blend")
+    return torch.from_numpy(images[..., :3])
+
+
+@numba.njit(nogil=True, cache=True)
+def naive_project(
+    first: int,
+    last: int,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    lens: Array,
+    pose: Array,
+    width: int,
+    height: int,
+    splats: Array,
+    boxes: Array,
+) -> None:
+    """Centre, depth and inverse covariance [N, 6], and boxes of pixels [N, 4], of Gaussians first..last."""
+    for i in range(first, last):
+        x, y, z = pose[:, 0] * means[i, 0] + pose[:, 1] * means[i, 1] + pose[:, 2] * means[i, 2] + pose[:, 3]
+        splats[i, 2] = z
+        if z < NEAR_PLANE or opacities[i] < ALPHA_MIN:
+            continue
+        xx, xy, yy, det = covariance(x / z, y / z, 1 / z, quats[i], scales[i], lens, pose, 0.0)
+        if det <= 0:
+            continue
+        u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+        splats[i, 0], splats[i, 1] = u, v
+        splats[i, 3], splats[i, 4], splats[i, 5] = yy / det, -xy / det, xx / det
+        reach = 2 * math.log(opacities[i] / ALPHA_MIN)
+        rx, ry = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        boxes[i, 0], boxes[i, 1] = max(0, math.floor(u - rx)), min(width, math.floor(u + rx) + 1)
+        boxes[i, 2], boxes[i, 3] = max(0, math.floor(v - ry)), min(height, math.floor(v + ry) + 1)
+
+
+@numba.njit(nogil=True, cache=True)
+def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Array, Array]:
+    """Lists of Gaussians per tile, front to back."""
+    starts = np.zeros(rows * columns + 1, np.int64)
+    for i in order:
+        for row in range(boxes[i, 2] // TILE, (boxes[i, 3] + TILE - 1) // TILE):
+            for column in range(boxes[i, 0] // TILE, (boxes[i, 1] + TILE - 1) // TILE):
+                starts[row * columns + column + 1] += 1
+    starts = np.cumsum(starts)
+    ends, ids = starts.copy(), np.empty(starts[-1], np.int32)
+    for i in order:
+        for row in range(boxes[i, 2] // TILE, (boxes[i, 3] + TILE - 1) // TILE):
+            for column in range(boxes[i, 0] // TILE, (boxes[i, 1] + TILE - 1) // TILE):
+                ids[ends[row * columns + column]] = i
+                ends[row * columns + column] += 1
+    return starts, ids
+
+
+@numba.njit(nogil=True, fastmath=True, cache=True)
+def naive_blend(
+    first: int,
+    last: int,
+    splats: Array,
+    boxes: Array,
+    opacities: Array,
+    colors: Array,
+    starts: Array,
+    ids: Array,
+    images: Array,
+) -> None:
+    """Blend tiles first..last into [H, W, 5], black before: sRGB, depth and alpha."""
+    height, width, _ = images.shape
+    columns = (width + TILE - 1) // TILE
+    for tile in range(first, last):
+        top, left = tile // columns * TILE, tile % columns * TILE
+        bottom, right = min(top + TILE, height), min(left + TILE, width)
+        full = np.zeros((TILE, TILE), np.bool_)
+        for k in range(starts[tile], starts[tile + 1]):
+            i = ids[k]
+            for py in range(max(top, boxes[i, 2]), min(bottom, boxes[i, 3])):
+                for px in range(max(left, boxes[i, 0]), min(right, boxes[i, 1])):
+                    if full[py - top, px - left]:
+                        continue
+                    dx, dy = np.float32(px + 0.5) - splats[i, 0], np.float32(py + 0.5) - splats[i, 1]
+                    square = splats[i, 3] * dx * dx + splats[i, 5] * dy * dy
+                    power = np.float32(-0.5) * square - splats[i, 4] * dx * dy
+                    alpha = min(np.float32(ALPHA_MAX), opacities[i] * np.exp(power))
+                    if alpha < np.float32(ALPHA_MIN):
+                        continue
+                    pixel = images[py, px]
+                    light = np.float32(1) - pixel[4]
+                    if light * (np.float32(1) - alpha) <= np.float32(TRANSMITTANCE_STOP):
+                        full[py - top, px - left] = True
+                        continue
+                    weight = alpha * light
+                    pixel[0] += weight * colors[i, 0]
+                    pixel[1] += weight * colors[i, 1]
+                    pixel[2] += weight * colors[i, 2]
+                    pixel[3] += weight * splats[i, 2]
+                    pixel[4] += weight
+        for py in range(top, bottom):
+            for px in range(left, right):
+                pixel = images[py, px]
+                pixel[3] = pixel[3] / pixel[4] if pixel[4] > 0 else np.float32(0)
+                for channel in range(3):
+                    value = min(max(pixel[channel], np.float32(0)), np.float32(1))
+                    power = np.float32(1.055) * value ** np.float32(1 / 2.4) - np.float32(0.055)
+                    pixel[channel] = np.float32(12.92) * value if value <= np.float32(0.0031308) else power

@@ -1,0 +1,118 @@
+"""A video's path completed as one scene, beside the same frames rendered and completed each by itself."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.evaluation.report.svg import spread
+from spackle.evaluation.suite.clock import TOTAL, Lap, measure
+from spackle.evaluation.suite.values import Found, Row, Target
+from spackle.formats import save_video
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer
+from spackle.residual import Completer, ResidualNet
+from spackle.trajectory import DepthRange, trajectory
+
+FRAMES, SAMPLE = 60, 6
+DISPARITY = 0.3
+RUNS = 3  # at most
+LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
+STAGES = (LIFT, COMPLETE, DRAW, ENCODE)
+SCENE, FRAME, SCRATCH = "one scene: photo to video", "one frame from scratch", "frame by frame: photo to video"
+RATIO = "frame by frame over one scene"
+FASTER = Target(3.0, at_most=False)
+
+
+def video_section(
+    runs: int,
+    lift: Callable[[], BasePrediction],
+    renderer: Renderer,
+    network: ResidualNet | None,
+    frames: int = FRAMES,
+    sample: int = SAMPLE,
+) -> Found:
+    """A photo to an MP4 along `rotate_forward`, in both ways.
+
+    From scratch each frame is rendered and completed with nothing but the photo's shield, which is made once, at hand.
+    Only a sample of the frames is, evenly spread; the mean of their times stands for each. Lifting and encoding are
+    the same in both ways, and counted in both.
+
+    Args:
+        runs: that count; more than three are not done.
+        lift: the photo to Gaussians.
+        renderer: draws everything.
+        network: None: the seeds alone fill the holes.
+        frames: of the video.
+        sample: of them that are completed from scratch.
+    """
+    runs = min(runs, RUNS)
+    prediction = lift()
+    path = _path(prediction, frames)
+    picked = [path[k] for k in spread(frames, sample)]
+    completer = Completer(prediction.gaussians, prediction.camera, renderer, network)
+    made: list[Gaussians] = []
+
+    def scene(lap: Lap) -> None:
+        base = lift()
+        lap(LIFT)
+        fresh = Completer(base.gaussians, base.camera, renderer, network)
+        made.append(fresh.complete_scene(path))
+        lap(COMPLETE)
+        pictures = _draw(base.gaussians, made[-1], path, renderer)
+        lap(DRAW)
+        _encode(pictures)
+        lap(ENCODE)
+
+    def scratch(lap: Lap) -> None:
+        shield = completer.photo_shield()
+        for number, camera in enumerate(picked):
+            completer.completed_view(camera, [shield])
+            lap(str(number))
+
+    times = measure(runs, {"scene": scene, "scratch": scratch})
+    each = [times["scratch", str(number)] for number in range(len(picked))]
+    one = tuple(statistics.mean(run) for run in zip(*each, strict=True))
+    shared = [times["scene", LIFT], times["scene", ENCODE]]
+    whole = tuple(lift + encode + frames * frame for lift, encode, frame in zip(*shared, one, strict=True))
+    rows = [Row(name, times["scene", name]) for name in STAGES]
+    rows += [Row(SCENE, times["scene", TOTAL]), Row(FRAME, one), Row(SCRATCH, whole)]
+    ratios = tuple(slow / fast for slow, fast in zip(whole, times["scene", TOTAL], strict=True))
+    rows.append(Row(RATIO, ratios, "×", target=FASTER))
+    facts = {
+        "gaussians": len(prediction.gaussians),
+        "added": len(made[-1]),
+        "width": path[0].width,
+        "height": path[0].height,
+        "frames": frames,
+        "sample": len(picked),
+        "disparity": DISPARITY,
+    }
+    note = (
+        f"Frame by frame is scaled: {len(picked)} of {frames} frames were done, and their mean counts {frames} times."
+    )
+    return Found(tuple(rows), facts, (note,))
+
+
+def _path(prediction: BasePrediction, frames: int) -> list[Camera]:
+    camera = prediction.camera
+    even = camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)
+    return trajectory("rotate_forward", even, DISPARITY, DepthRange.of(prediction.gaussians), frames)
+
+
+def _draw(base: Gaussians, aux: Gaussians, path: Sequence[Camera], renderer: Renderer) -> list[Tensor]:
+    """[H, W, 3] each; as bytes, so that all of them fit into memory."""
+    with torch.no_grad():
+        return [(renderer.render([base, aux], camera).rgb * 255).round().to(torch.uint8) for camera in path]
+
+
+def _encode(pictures: Sequence[Tensor]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        save_video((picture / 255 for picture in pictures), Path(folder) / "video.mp4")

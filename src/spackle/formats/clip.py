@@ -1,0 +1,205 @@
+"""Clips in: the frames of any video that FFmpeg decodes, upright, in sRGB, with their times."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import torch
+from av.container import InputContainer
+from av.stream import Disposition
+from av.video.stream import VideoStream
+from torch import Tensor
+
+from spackle.errors import InputError, reason_in_a_line
+from spackle.image import MAX_PIXELS, check_file
+
+SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
+    *(".wmv", ".flv", ".3gp", ".ogv"),
+)
+UNSPECIFIED, BT709, BT601 = 2, 1, 5  # FFmpeg's numbers of matrices
+HD_ROWS = 720  # a video that says nothing of its colours has BT.709's from this height on, as players take it
+HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
+DEFAULT_RATE = Fraction(25)
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """What is known of a clip once it has been read through."""
+
+    path: Path
+    width: int  # of an upright frame with square pixels
+    height: int
+    times: tuple[Fraction, ...]  # seconds of each frame, the first one's 0, rising
+    start: Fraction  # when the first frame is shown, by the file's clock
+    rate: Fraction  # frames a second, on the mean
+    audio: str | None  # the codec of its sound
+    hdr: str | None  # its transfer, where that is one for brighter screens
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def seconds(self) -> Fraction:
+        """How long it is: the last frame stays as long as the one before it."""
+        last = self.times[-1] - self.times[-2] if len(self) > 1 else 1 / self.rate
+        return self.times[-1] + last
+
+
+def is_clip(path: Path) -> bool:
+    """Whether a name is a video's; a GIF with a single picture is a photo."""
+    if path.suffix.lower() not in SUFFIXES or os.path.isdir(path):
+        return False
+    if path.suffix.lower() != ".gif":
+        return True
+    try:
+        with av.open(str(path)) as container:
+            pictures = (packet for packet in container.demux(video=0) if packet.size)
+            return next(pictures, None) is not None and next(pictures, None) is not None
+    except (av.FFmpegError, ValueError, IndexError):
+        return False  # what is wrong with it is said where photos are read
+
+
+def read_clip(
+    path: str | os.PathLike[str], first: int | None = None, progress: Callable[[int, int], None] | None = None
+) -> Clip:
+    """Decode a clip from beginning to end and keep nothing of it but its shape and its times.
+
+    That takes little beside what is done with each frame later, and what is wrong with the last frame is known at once.
+
+    Args:
+        path: the file.
+        first: how many frames count; all where None.
+        progress: called with (frames read, how many the file says there are).
+
+    Raises:
+        InputError: no clip, or one that is cut off, damaged, without a picture, or of unknown coding.
+    """
+    check_file(path, "clip")
+    ticks: list[Fraction | None] = []
+    frame = None
+    with _opened(path) as (container, stream):
+        aspect = stream.sample_aspect_ratio or Fraction(1)
+        rate = stream.average_rate or stream.guessed_rate or DEFAULT_RATE
+        sounds = container.streams.audio
+        audio = sounds[0].codec_context.name if sounds and sounds[0].codec_context else None
+        for frame in _decoded(path, container, stream, first):
+            ticks.append(None if frame.pts is None or frame.time_base is None else frame.pts * frame.time_base)
+            if progress:
+                progress(len(ticks), max(len(ticks), first or stream.frames))
+    if frame is None:
+        raise InputError(f"{path}: there is not one frame in it: give another clip")
+    width, height = _upright_size(frame, aspect)
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{path}: frames of {width}×{height} are too large: shrink the clip first")
+    times = _rising(ticks, Fraction(rate))
+    hdr = HDR.get(int(frame.color_trc))
+    return Clip(Path(path), width, height, times, ticks[0] or Fraction(0), Fraction(rate), audio, hdr)
+
+
+def clip_frames(clip: Clip) -> Iterator[Tensor]:
+    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1, one at a time.
+
+    Raises:
+        InputError: the file has changed since it was read.
+    """
+    with _opened(clip.path) as (container, stream):
+        aspect, count = stream.sample_aspect_ratio or Fraction(1), 0
+        for frame in _decoded(clip.path, container, stream, len(clip)):
+            count += 1
+            yield _picture(frame, aspect)
+    if count < len(clip):
+        raise InputError(f"{clip.path}: has become shorter while it was read: start again")
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """The file and its moving picture."""
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, ValueError) as error:
+        reason = reason_in_a_line(error)
+        raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
+    with container:
+        pictures = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+        if not pictures:
+            what = "has sound but no moving picture" if container.streams.audio else "has no moving picture"
+            raise InputError(f"{path}: {what}: give a video")
+        stream = pictures[0]
+        if stream.codec_context is None:
+            raise InputError(f"{path}: its codec is unknown to this FFmpeg: convert it to H.264 first")
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def _decoded(
+    path: str | os.PathLike[str], container: InputContainer, stream: VideoStream, first: int | None
+) -> Iterator[av.VideoFrame]:
+    """Frames of one size; an error names the frame."""
+    size, count, packets = None, 0, 0
+    try:
+        for packet in container.demux(stream):
+            packets += packet.size > 0
+            for frame in packet.decode():
+                shape = (frame.width, frame.height, frame.rotation)
+                if size not in (None, shape):
+                    raise InputError(f"{path}: frame {count} has another size than those before: cut the clip there")
+                size = shape
+                yield frame
+                count += 1
+                if count == first:
+                    return
+    except (av.FFmpegError, ValueError) as error:
+        raise InputError(
+            f"{path}: frame {count} cannot be decoded ({reason_in_a_line(error)}): the clip is damaged or cut off"
+            + (f"; --frames {count} takes what is before" if count else "")
+        ) from error
+    if packets < stream.frames:
+        raise InputError(
+            f"{path}: cut off after {packets} of {stream.frames} frames: give a whole clip, or --frames {max(1, count)}"
+        )
+
+
+def _picture(frame: av.VideoFrame, aspect: Fraction) -> Tensor:
+    """[H, W, 3] of a frame: FFmpeg converts from its matrix and range; then it is turned upright."""
+    width, height = _square_size(frame, aspect)
+    matrix = frame.colorspace
+    if matrix == UNSPECIFIED:
+        matrix = BT709 if frame.height >= HD_ROWS else BT601
+    rgb = frame.reformat(width=width, height=height, format="rgb24", src_colorspace=matrix).to_ndarray()
+    turned = np.ascontiguousarray(np.rot90(rgb, _quarters(frame)))
+    return torch.from_numpy(turned).float().div_(255)
+
+
+def _quarters(frame: av.VideoFrame) -> int:
+    """How many quarter turns, counter-clockwise, bring a frame upright."""
+    return round(frame.rotation / 90) % 4
+
+
+def _square_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
+    """Width and height with square pixels, of pixels that are `aspect` times as wide as high: a side grows."""
+    wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
+    return max(1, round(frame.width * wide)), max(1, round(frame.height * high))
+
+
+def _upright_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
+    width, height = _square_size(frame, aspect)
+    return (height, width) if _quarters(frame) % 2 else (width, height)
+
+
+def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:
+    """Times from zero on; where the file has none, or one that does not rise, a frame follows at the mean rate."""
+    times: list[Fraction] = []
+    start = ticks[0] or Fraction(0)
+    for tick in ticks:
+        at_rate = times[-1] + 1 / rate if times else Fraction(0)
+        time = at_rate if tick is None else tick - start
+        times.append(time if not times or time > times[-1] else at_rate)
+    return tuple(times)

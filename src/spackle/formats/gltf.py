@@ -1,0 +1,116 @@
+"""glTF's KHR_gaussian_splatting in one .glb file."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.errors import InputError
+from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, Columns
+from spackle.formats.ply import SH_C0
+from spackle.gaussians import Gaussians
+
+EXTENSION = "KHR_gaussian_splatting"
+LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
+ROW = 64  # bytes a Gaussian
+FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
+UNMOVED = np.eye(4).ravel().tolist()
+NEAR_PLANE = 0.01  # of the photo's camera; required, though nothing of ours depends on it
+
+
+def encode_glb(gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
+    """Gaussians, in their order, as binary glTF: y up, z backward, scales linear, colours sRGB as harmonics.
+
+    COLOR_0, linear as glTF's always is, lets viewers without the extension show points. The photo's camera becomes
+    a glTF camera; what that cannot say of it, and `base_count`, go into `extras`.
+
+    Raises:
+        InputError: no Gaussians, or more than 4 GiB of them.
+        ValueError: where a Gaussian is not finite.
+    """
+    count = len(gaussians)
+    if count == 0:
+        raise InputError("glTF cannot hold a scene without Gaussians: use another format")
+    if count * ROW + (1 << 16) > LARGEST_FILE:
+        raise InputError(f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format")
+    arrays = _attributes(Columns.of(gaussians))
+    parts = [array.tobytes() for array in arrays.values()]
+    text = json.dumps(_description(arrays, camera, base_count), separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(len(part) for part in parts)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + size)
+    return b"".join([head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", size, b"BIN\0"), *parts])
+
+
+def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
+    """What each Gaussian has, in the file's order; all are multiples of four bytes."""
+    linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
+    rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
+    return {
+        "POSITION": (columns.means * FLIPPED_MEANS).astype("<f4"),
+        f"{EXTENSION}:ROTATION": (columns.quats * FLIPPED_QUATS)[:, [1, 2, 3, 0]].astype("<f4"),
+        f"{EXTENSION}:SCALE": np.exp(columns.log_scales).astype("<f4"),
+        f"{EXTENSION}:OPACITY": columns.opacities.astype("<f4"),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": ((columns.srgb - np.float32(0.5)) / np.float32(SH_C0)).astype("<f4"),
+        "COLOR_0": np.round(rgba * 65535).astype("<u2"),
+    }
+
+
+def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_count: int | None) -> dict[str, Any]:
+    """The JSON part."""
+    views, accessors, offset = [], [], 0
+    for index, array in enumerate(arrays.values()):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        accessor: dict[str, Any] = {"bufferView": index, "componentType": FLOAT, "count": len(array), "type": kind}
+        if array.dtype == np.uint16:
+            accessor |= {"componentType": UNSIGNED_SHORT, "normalized": True}
+        accessors.append(accessor)
+        offset += array.nbytes
+    means = arrays["POSITION"]  # glTF wants the bounds of this one
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": POINTS, "attributes": {name: index for index, name in enumerate(arrays)}}
+    nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]
+    if base_count is not None:
+        nodes[0]["extras"] = {"spackle_base": base_count}
+    description: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "Spackle"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0] if camera is None else [0, 1]}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [primitive | {"extensions": {EXTENSION: kernel}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    if camera is not None:
+        pose = _pose(camera)
+        nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
+        description["cameras"] = [_camera(camera)]
+    return description
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    """The photo's camera as far as glTF has words for it; where its middle lies goes into `extras`."""
+    (fx, fy), (width, height) = camera.focal, (camera.width, camera.height)
+    lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
+    extras = {"K": camera.K.tolist(), "width": width, "height": height}
+    return {"type": "perspective", "perspective": lens, "extras": extras}
+
+
+def _pose(camera: Camera) -> list[float]:
+    """Camera to world, y up and z backward on both sides, column by column."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    matrix = flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
+    numbers: list[float] = (matrix.T.flatten() + 0.0).tolist()  # no -0
+    return numbers

@@ -1,0 +1,126 @@
+"""SOG 2, PlayCanvas's format: Gaussians as lossless WebP pictures, zipped into one file."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from spackle.errors import InputError
+from spackle.formats.columns import Columns, Floats
+from spackle.formats.ply import SH_C0
+from spackle.gaussians import Gaussians
+
+LARGEST_SIDE = 16_380  # of a WebP picture, in fours
+CODES = 256  # entries of a codebook
+BINS = 1 << 16  # values that building a codebook tells apart
+EVEN = 0.25  # of the codes lie at equal distances
+EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact: colours stay where opacity is 0
+EPOCH = (1980, 1, 1, 0, 0, 0)  # the archive's bytes do not depend on when it was made
+
+
+def encode_sog(gaussians: Gaussians) -> bytes:
+    """Gaussians, in their order and axes, as a bundled SOG file.
+
+    Positions have 16 bits on an axis, logarithmically spaced from 0; scales and colours are looked up in codebooks.
+
+    Raises:
+        InputError: no Gaussians, or more than pictures can hold.
+        ValueError: where a Gaussian is not finite.
+    """
+    count = len(gaussians)
+    if count == 0:
+        raise InputError("SOG cannot hold a scene without Gaussians: use another format")
+    width = math.ceil(math.sqrt(count) / 4) * 4
+    if width > LARGEST_SIDE:
+        raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
+    columns = Columns.of(gaussians)
+    means, low, high = _means(columns.means)
+    scale_book, scales = codebook(columns.log_scales)
+    color_book, colors = codebook((columns.srgb - np.float32(0.5)) / np.float32(SH_C0))
+    opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
+    opaque = np.full_like(opacities, 255)
+    pictures = {
+        "means_l.webp": [(means & 255).astype(np.uint8), opaque],
+        "means_u.webp": [(means >> 8).astype(np.uint8), opaque],
+        "scales.webp": [scales, opaque],
+        "quats.webp": [_quats(columns.quats)],
+        "sh0.webp": [colors, opacities],
+    }
+    meta = {
+        "version": 2,
+        "asset": {"generator": "Spackle"},
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scale_book.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
+    }
+    files = {name: _webp(np.concatenate(parts, axis=1), width) for name, parts in pictures.items()}
+    return _zipped({"meta.json": json.dumps(meta, allow_nan=False).encode(), **files})
+
+
+def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
+    """256 numbers [256] that stand for values [N, 3] with little square error, and which one each value takes.
+
+    Codes lie as close as the cube root of how many values are near, the best there is for many codes; a quarter of
+    them is spread evenly, for what is rare. Where values differ in 256 places at most, each place has its own.
+    """
+    low, high = float(values.min()), float(values.max())
+    bins = np.minimum((values - low) * (BINS / max(high - low, 1e-30)), BINS - 1).astype(np.int32)
+    flat = bins.ravel()
+    counts = np.bincount(flat, minlength=BINS)
+    different = np.count_nonzero(counts)
+    if different <= CODES:
+        code_of_bin = np.maximum(np.cumsum(counts > 0) - 1, 0).astype(np.uint8)
+    else:
+        roots = np.cbrt(counts)
+        share = (1 - EVEN) * roots / roots.sum() + EVEN / BINS
+        code_of_bin = ((np.cumsum(share) - share) * CODES).astype(np.uint8)
+    sums = np.bincount(code_of_bin, np.bincount(flat, values.ravel(), BINS), CODES)
+    totals = np.bincount(code_of_bin, counts, CODES)
+    book = np.where(totals > 0, sums / np.maximum(totals, 1), high).astype(np.float32)
+    return book, code_of_bin[bins]
+
+
+def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
+    """Positions [N, 3] as 0..65535 between their logarithms' bounds, and these bounds [3] each."""
+    logs = np.copysign(np.log1p(np.abs(means)), means)
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    span = np.maximum(high - low, np.float32(1e-30))
+    return np.round((logs - low) / span * np.float32(65535)).astype(np.uint16), low, high
+
+
+def _quats(quats: Floats) -> NDArray[np.uint8]:
+    """[N, 4] bytes of unit quaternions wxyz: the three smaller components, and 252 + which one is largest."""
+    largest = np.abs(quats).argmax(axis=1)
+    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
+    bytes_ = np.clip(np.round((quats * sign * np.float32(0.5**0.5) + np.float32(0.5)) * 255), 0, 255)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    smaller = np.take_along_axis(bytes_, others, axis=1)
+    return np.concatenate([smaller, largest[:, None] + 252], axis=1).astype(np.uint8)
+
+
+def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
+    """Pixels [N, 4], row by row, as a picture; the last row is filled up with black."""
+    height = math.ceil(len(rgba) / width / 4) * 4
+    pixels = np.zeros((height * width, 4), np.uint8)
+    pixels[:, 3] = 255
+    pixels[: len(rgba)] = rgba
+    buffer = io.BytesIO()
+    Image.fromarray(pixels.reshape(height, width, 4)).save(buffer, "WEBP", **EFFORT)
+    return buffer.getvalue()
+
+
+def _zipped(files: dict[str, bytes]) -> bytes:
+    """A zip archive that packs nothing twice."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
+    return buffer.getvalue()

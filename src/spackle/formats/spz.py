@@ -1,0 +1,216 @@
+"""SPZ 3, Niantic's compressed format: 20 bytes a Gaussian, deflated."""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import struct
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spackle.errors import InputError
+from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, Columns, Floats
+from spackle.formats.ply import SH_C0
+from spackle.gaussians import Gaussians
+
+MAGIC, VERSION = 0x5053474E, 3
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree of harmonics, fractional bits, flags, reserved
+ROW = 20  # bytes a Gaussian
+LARGEST = 2**23 - 1  # of a coordinate, which has 24 bits
+FEWEST_BITS, MOST_BITS = 1, 23  # of them behind the point
+NEAR_STEPS = 2048  # a near Gaussian's distance is at least so many steps of the grid
+NEAR_SHARE = 0.01  # of all Gaussians lie nearer than what counts as near
+COLOR_SCALE = 0.15  # colours are stored with room below 0 and above 1
+GZIP, WINDOW = 16, 15
+EFFORT = 5  # 6 takes twice the time for 1 % less
+MAX_COUNT = 10_000_000  # what the format's own library reads
+
+# What deflates well is what repeats. Bits that nobody sees are therefore rounded away, and the finest of these
+# degrees is taken with which a file keeps to 1/8 of the PLY.
+LIMIT = 8.5  # bytes a Gaussian; the PLY has 68
+SMALL = 1 << 14  # bytes, which are few enough for any scene
+SAMPLE, SAMPLES = 1 << 13, 8  # Gaussians in a row that are tried first, and at how many places
+SAMPLED_LIMIT = 8.7  # short pieces deflate a little worse than the whole
+
+
+@dataclasses.dataclass(frozen=True)
+class _Detail:
+    position: float  # a step, in standard deviations of the Gaussian's middle axis
+    quat_bits: int  # of each of the three smaller components, of 9
+    scale_step: int  # of the logarithm, in sixteenths
+    opacity_step: int  # in 255ths
+
+
+_DETAILS = (
+    _Detail(1 / 16, 9, 1, 1),
+    _Detail(1 / 8, 7, 1, 1),
+    _Detail(1 / 4, 6, 1, 2),
+    _Detail(1 / 4, 5, 2, 2),
+    _Detail(1 / 2, 5, 2, 4),
+    _Detail(1 / 2, 4, 2, 4),
+    _Detail(1 / 2, 4, 4, 8),
+)
+
+
+def encode_spz(gaussians: Gaussians) -> bytes:
+    """Gaussians, in their order, as an SPZ file of version 3: y up, z backward, as the format wants it.
+
+    Positions lie on a grid fine enough for what is near. What is then too far for it is drawn nearer and smaller
+    towards the origin, which from there looks the same; see `spz_grid`.
+
+    Raises:
+        InputError: more Gaussians than readers take.
+        ValueError: where a Gaussian is not finite.
+    """
+    count = len(gaussians)
+    if count > MAX_COUNT:
+        raise InputError(f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format")
+    columns = Columns.of(gaussians)
+    bits, _ = spz_grid(gaussians)
+    columns = _within(columns, bits)
+    header = HEADER.pack(MAGIC, VERSION, count, 0, bits, 0, 0)
+    data = b""
+    for detail in _DETAILS[_finest(columns, bits) :]:
+        data = _deflated(header + b"".join(_sections(columns, bits, detail)))
+        if len(data) <= max(LIMIT * count, SMALL):
+            break
+    return data
+
+
+def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
+    """Fractional bits of an SPZ file's positions, and how many Gaussians lie beyond what these can say."""
+    means = gaussians.means.detach().to("cpu").double().numpy()
+    if not len(means):
+        return 12, 0
+    reach, distance = np.abs(means).max(axis=1), np.sqrt((means * means).sum(axis=1))
+    near = float(np.partition(distance, int(NEAR_SHARE * len(distance)))[int(NEAR_SHARE * len(distance))])
+    holds_all = np.floor(np.log2(LARGEST / max(float(reach.max()), 1e-30)))
+    shows_near = np.ceil(np.log2(NEAR_STEPS / max(near, 1e-30)))
+    bits = int(np.clip(max(holds_all, shows_near), FEWEST_BITS, MOST_BITS))
+    return bits, int((reach * 2.0**bits > LARGEST).sum())
+
+
+def decode_spz(data: bytes) -> Gaussians:
+    """Gaussians of an SPZ file of version 2 or 3, x right, y down, z forward; harmonics above 0 are passed over.
+
+    Raises:
+        InputError: no such file, or a broken one.
+    """
+    try:
+        inflater = zlib.decompressobj(GZIP + WINDOW)
+        header = inflater.decompress(data, HEADER.size)
+        magic, version, count, _, bits, _, _ = HEADER.unpack(header)
+        if magic != MAGIC or version not in (2, 3) or not count <= MAX_COUNT or bits > 24:
+            raise ValueError("not SPZ of version 2 or 3")
+        widths = (9, 1, 3, 3, 4 if version == 3 else 3)
+        size = count * sum(widths)
+        body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
+        if len(body) < size:
+            raise ValueError("cut off")
+    except (zlib.error, struct.error, ValueError) as error:
+        raise InputError(f"not an SPZ scene that can be read: {error}") from error
+    ends = np.cumsum([count * width for width in widths])[:-1]
+    flat = np.split(np.frombuffer(body, np.uint8), ends)
+    parts = [part.reshape(count, width) for part, width in zip(flat, widths, strict=True)]
+    wide = np.zeros((count, 3, 4), np.uint8)
+    wide[:, :, 1:] = parts[0].reshape(count, 3, 3)
+    means = (wide.view("<i4")[..., 0] >> 8) * np.float32(2.0**-bits)
+    quats = _smallest_three_decoded(parts[4]) if version == 3 else _first_three_decoded(parts[4])
+    opacities = (parts[1][:, 0] / 255).astype(np.float32)
+    srgb = ((parts[2] / 255 - 0.5) * (SH_C0 / COLOR_SCALE) + 0.5).astype(np.float32)
+    log_scales = (parts[3] / 16 - 10).astype(np.float32)
+    columns = Columns(means * FLIPPED_MEANS, quats * FLIPPED_QUATS, log_scales, opacities, srgb)
+    return columns.gaussians()
+
+
+def _within(columns: Columns, bits: int) -> Columns:
+    """Far Gaussians drawn towards the origin, position and size alike, until the grid holds them."""
+    reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
+    factor = np.minimum(1, LARGEST / 2.0**bits / np.maximum(reach, 1e-30))[:, None]
+    means, log_scales = columns.means * factor, columns.log_scales + np.log(factor)
+    return dataclasses.replace(columns, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
+
+
+def _finest(columns: Columns, bits: int) -> int:
+    """Index of the finest detail with which samples of the scene, deflated, keep to the limit; else of the coarsest."""
+    count = len(columns.means)
+    starts = np.unique(np.linspace(0, max(0, count - SAMPLE), SAMPLES).astype(np.int64))
+    rows = np.concatenate([np.arange(start, min(start + SAMPLE, count)) for start in starts])
+    sample = columns.select(rows)
+
+    def fits(detail: _Detail) -> bool:
+        return len(_deflated(b"".join(_sections(sample, bits, detail)))) <= max(SAMPLED_LIMIT * len(rows), SMALL)
+
+    return bisect.bisect_left(_DETAILS[:-1], True, key=fits)
+
+
+def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
+    """Positions, opacities, colours, scales, rotations, in the file's order."""
+    scales = np.round((columns.log_scales + 10) * np.float32(16 / detail.scale_step)) * detail.scale_step
+    scales = np.clip(scales, 0, 255).astype(np.uint8)
+    colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
+    step = detail.opacity_step
+    quats = columns.quats * FLIPPED_QUATS
+    quats[(scales == scales[:, :1]).all(axis=1)] = [1, 0, 0, 0]  # a ball looks the same however it is turned
+    return [
+        _positions(columns, bits, detail.position).tobytes(),
+        np.minimum(255, np.round(columns.opacities * (255 / step)) * step).astype(np.uint8).tobytes(),
+        np.clip(np.round(colors), 0, 255).astype(np.uint8).tobytes(),
+        scales.tobytes(),
+        _smallest_three(quats, 2 ** (9 - detail.quat_bits)).tobytes(),
+    ]
+
+
+def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
+    """[N, 9] bytes: 24-bit fixed point, rounded to the power of two below `share` of the middle axis."""
+    a, b, c = columns.log_scales.T
+    middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
+    step = np.exp2(np.clip(exponent, 0, 20))[:, None]
+    fixed = np.round(columns.means * FLIPPED_MEANS * np.float64(2.0**bits) / step) * step
+    whole = np.clip(fixed, -LARGEST, LARGEST).astype("<i4")
+    return np.ascontiguousarray(whole.view(np.uint8).reshape(-1, 3, 4)[:, :, :3])
+
+
+def _smallest_three(quats: Floats, step: int) -> NDArray[np.uint32]:
+    """[N] words of unit quaternions wxyz: which of xyzw is largest, then sign and 9 bits of each other one."""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(axis=1)
+    negative = np.take_along_axis(xyzw, largest[:, None], axis=1)[:, 0] < 0
+    words: NDArray[np.uint32] = largest.astype("<u4")
+    for axis in range(4):
+        part = xyzw[:, axis]
+        size = np.minimum(511, np.round(np.abs(part) * np.float32(511 * 2**0.5 / step)) * step).astype("<u4")
+        sign = (((part < 0) ^ negative) & (size > 0)).astype("<u4")
+        words = np.where(largest == axis, words, words << 10 | sign << 9 | size)
+    return words
+
+
+def _smallest_three_decoded(rows: NDArray[np.uint8]) -> Floats:
+    """Quaternions wxyz [N, 4] of [N, 4] bytes."""
+    words = np.ascontiguousarray(rows).view("<u4")[:, 0]
+    largest = words >> 30
+    quats = np.zeros((len(words), 4), np.float32)
+    for axis in (3, 2, 1, 0):
+        size = (words & 511) * np.float32(0.5**0.5 / 511)
+        stored = largest != axis
+        quats[:, axis] = np.where(stored, np.where(words >> 9 & 1, -size, size), 0)
+        words = np.where(stored, words >> 10, words)
+    rest = np.sqrt(np.maximum(0, 1 - (quats * quats).sum(axis=1)))
+    np.put_along_axis(quats, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    return quats[:, [3, 0, 1, 2]]
+
+
+def _first_three_decoded(rows: NDArray[np.uint8]) -> Floats:
+    """Quaternions wxyz [N, 4] of [N, 3] bytes, as version 2 has them: x, y, z, and w ≥ 0 by its length."""
+    xyz = rows / np.float32(127.5) - np.float32(1)
+    w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1, keepdims=True)))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _deflated(data: bytes) -> bytes:
+    """One gzip member, always the same bytes for the same data."""
+    deflater = zlib.compressobj(EFFORT, zlib.DEFLATED, GZIP + WINDOW, 9)
+    return deflater.compress(data) + deflater.flush()

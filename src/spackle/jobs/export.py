@@ -1,0 +1,146 @@
+"""`spackle export`: a scene file to the formats that other viewers read."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from rich.filesize import decimal
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import atomic_path, check_writable, load_ply, load_ply_base_count, load_ply_camera, save_ply
+from spackle.formats.compressed_ply import encode_compressed_ply
+from spackle.formats.gltf import encode_glb
+from spackle.formats.sog import encode_sog
+from spackle.formats.splat import encode_splat
+from spackle.formats.spz import LARGEST, encode_spz, spz_grid
+from spackle.gaussians import Gaussians
+from spackle.jobs.progress import Reporter
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What a PLY holds."""
+
+    path: Path
+    gaussians: Gaussians
+    camera: Camera | None  # the photo's
+    base_count: int | None
+
+    @staticmethod
+    def load(path: Path) -> Scene:
+        """Read a PLY of ours, of INRIA's or of SHARP's.
+
+        Raises:
+            InputError: a file that is no scene.
+        """
+        return Scene(path, load_ply(path), load_ply_camera(path), load_ply_base_count(path))
+
+    @property
+    def untilted_camera(self) -> Camera | None:
+        """The camera where it stands at the world's origin, which is all that a comment of a PLY can say."""
+        camera = self.camera
+        still = camera is not None and torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera))
+        return camera if still else None
+
+
+def _ply(scene: Scene, path: Path) -> None:
+    save_ply(scene.gaussians, path, camera=scene.untilted_camera, base_count=scene.base_count)
+
+
+def _compressed_ply(scene: Scene, path: Path) -> None:
+    path.write_bytes(encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
+
+
+def _spz(scene: Scene, path: Path) -> None:
+    path.write_bytes(encode_spz(scene.gaussians))
+
+
+def _splat(scene: Scene, path: Path) -> None:
+    path.write_bytes(encode_splat(scene.gaussians))
+
+
+def _sog(scene: Scene, path: Path) -> None:
+    path.write_bytes(encode_sog(scene.gaussians))
+
+
+def _glb(scene: Scene, path: Path) -> None:
+    path.write_bytes(encode_glb(scene.gaussians, scene.camera, scene.base_count))
+
+
+def _html(scene: Scene, path: Path) -> None:
+    from spackle.jobs.options import PredictOptions
+    from spackle.jobs.view_scene import load_page_scene
+    from spackle.viewer.page import single_html
+
+    path.write_bytes(single_html(load_page_scene(scene.path, PredictOptions())))
+
+
+# By the end of a name; the first that fits counts.
+WRITERS: dict[str, Callable[[Scene, Path], None]] = {
+    ".compressed.ply": _compressed_ply,
+    ".ply": _ply,
+    ".spz": _spz,
+    ".splat": _splat,
+    ".sog": _sog,
+    ".glb": _glb,
+    ".html": _html,
+}
+
+
+def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
+    """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
+
+    Raises:
+        InputError: a scene that is none, a name that says no format or cannot be written, or a scene that is
+            too large for one of the formats.
+    """
+    writers = [writer_of(output) for output in outputs]
+    targets = [check_writable(output) for output in outputs]
+    twice = [output for output, target in zip(outputs, targets, strict=True) if targets.count(target) > 1]
+    if twice:
+        raise InputError(f"{twice[0]}: named twice: give each output once")
+    loaded = Scene.load(scene)
+    size = os.path.getsize(scene)  # an output may take its place
+    for output, writer in zip(outputs, writers, strict=True):
+        start = time.perf_counter()
+        try:
+            with atomic_path(output) as temporary:
+                writer(loaded, temporary)
+        except InputError as error:
+            raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
+        _say(reporter, loaded, output, size, time.perf_counter() - start)
+
+
+def writer_of(output: Path) -> Callable[[Scene, Path], None]:
+    """What writes a file of this name.
+
+    Raises:
+        InputError: a name that ends in none of the formats.
+    """
+    for suffix, writer in WRITERS.items():
+        if output.name.lower().endswith(suffix):
+            return writer
+    raise InputError(f"{output}: which format? Give a name that ends in {', '.join(WRITERS)}")
+
+
+def _say(reporter: Reporter, scene: Scene, output: Path, before: int, seconds: float) -> None:
+    """One line about a file, and one about what its format could not hold."""
+    size = os.path.getsize(output)
+    factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"
+    if 0.95 < size / before < 1.05:
+        factor = "as large as"
+    reporter.say(f"{output}: {len(scene.gaussians):,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
+    result = {"file": output, "gaussians": len(scene.gaussians), "bytes": size, "seconds": round(seconds, 3)}
+    far = 0
+    if writer_of(output) is _spz:
+        bits, far = spz_grid(scene.gaussians)
+        if far:
+            reach = f"{LARGEST / 2**bits:,.0f} m"
+            reporter.say(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
+    reporter.result({**result, "drawn_nearer": far})

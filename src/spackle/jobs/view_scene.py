@@ -1,0 +1,81 @@
+"""A scene's file as the page takes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import load_ply, load_ply_base_count, load_ply_camera
+from spackle.gaussians import Gaussians
+from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels
+from spackle.jobs.options import PredictOptions
+from spackle.jobs.render import DEFAULT_SIZE
+from spackle.viewer import PageScene, page_scene
+
+MAGIC = b"ply"
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a file claims to be a scene, by its name or by its first bytes.
+
+    Raises:
+        InputError: there is no such file, or nothing in it.
+    """
+    check_file(path, "photo or scene")
+    with open(path, "rb") as file:
+        return path.suffix.lower() == ".ply" or file.read(len(MAGIC)) == MAGIC
+
+
+def load_page_scene(path: Path, options: PredictOptions) -> PageScene:
+    """A PLY of ours, or of others: where no camera is stored, a usual lens looks along z.
+
+    Raises:
+        InputError: a file that is no scene, or that cannot be seen from its camera.
+    """
+    gaussians = load_ply(path)
+    camera = _lens(load_ply_camera(path), options)
+    if not torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera)):
+        gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin
+        camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+    count = load_ply_base_count(path)
+    base, aux = _parts(gaussians, len(gaussians) if count is None else count)
+    try:
+        return page_scene(path.name, base, aux, camera)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{path.name}: ')}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
+
+
+def _parts(gaussians: Gaussians, count: int) -> tuple[Gaussians, Gaussians]:
+    """The base and what completion added."""
+    return gaussians.select(slice(0, count)), gaussians.select(slice(count, None))
+
+
+def _lens(stored: Camera | None, options: PredictOptions) -> Camera:
+    """The stored camera; a lens that a person gives beats it, and without either it is as `spackle render` has it."""
+    width, height = (stored.width, stored.height) if stored else DEFAULT_SIZE
+    focal = _given_focal(options, width)
+    if focal is None and stored is not None:
+        return stored
+    camera = Camera.from_focal(focal or film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)
+    return camera if stored is None else dataclasses.replace(camera, world_to_camera=stored.world_to_camera)
+
+
+def _given_focal(options: PredictOptions, width: int) -> float | None:
+    """In pixels, as a person gave it; InputError where it makes no sense."""
+    focal_px, fov = options.focal_px, options.fov
+    if focal_px is not None and fov is not None:
+        raise InputError("--focal-px and --fov are given together: give one of them")
+    if focal_px is not None and not (math.isfinite(focal_px) and focal_px > 0):
+        raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
+    if fov is None:
+        return focal_px
+    if not 0 < fov < 180:
+        raise InputError(f"--fov must lie between 0 and 180 degrees, got {fov:g}")
+    return width / 2 / math.tan(math.radians(fov) / 2)

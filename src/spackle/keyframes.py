@@ -1,0 +1,185 @@
+"""Camera paths through given places: what a path file holds, as cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spackle.camera import Camera
+from spackle.trajectory import DepthRange, max_offset
+
+PathUnit = Literal["metres", "disparity"]
+UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
+MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
+UP = (0.0, -1.0, 0.0)  # where nobody says otherwise: the photo's
+SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
+STILL = 1e-100  # slopes below it are none; their inverse would overflow
+LEAST_TILT = 1e-3  # radians between the view and its up
+Array = NDArray[np.float64]
+
+
+class PathError(ValueError):
+    """A camera path that cannot be flown, with the reason."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Keyframe:
+    """Where the camera is at one time, in the frame of the photo's camera (x right, y down, z forward)."""
+
+    time: float  # seconds
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]  # what it looks at
+    up: tuple[float, float, float] = UP  # what is up in the picture, roughly
+    fov: float | None = None  # horizontal, degrees; None: the photo's
+
+    def __post_init__(self) -> None:
+        """PathError where there is no such view."""
+        numbers = (self.time, *self.eye, *self.target, *self.up, *([] if self.fov is None else [self.fov]))
+        if not all(math.isfinite(number) for number in numbers):
+            raise PathError("every number must be finite, not NaN or infinite")
+        if self.fov is not None and not MIN_FOV <= self.fov <= MAX_FOV:
+            raise PathError(f"fov must be from {MIN_FOV:g} to {MAX_FOV:g} degrees, got {self.fov:g}")
+        view_matrix(*(np.array(part) for part in (self.eye, self.target, self.up)))
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyframePath:
+    """A smooth path through keyframes.
+
+    Each coordinate of eye, target and up, and the logarithm of the focal length, is a monotone cubic in time
+    (Fritsch and Butland): it passes through every key exactly, and between two keys it stays between their
+    values. A camera that is the same at two keys in a row stands still between them.
+    """
+
+    keys: tuple[Keyframe, ...]  # at least two, times increasing
+    closed: bool = False  # goes on from the last key to the first, in the mean time between keys
+    unit: PathUnit = "metres"  # disparity: lengths are multiples of the offset that --disparity 1 means
+
+    def __post_init__(self) -> None:
+        """PathError where the keys make no path."""
+        if len(self.keys) < 2:
+            raise PathError(f"a path needs at least two keyframes, got {len(self.keys)}")
+        for index, (one, other) in enumerate(zip(self.keys, self.keys[1:], strict=False)):
+            if not one.time < other.time:
+                order = f"keyframe {index + 1} is at {other.time:g} s, the one before at {one.time:g} s"
+                raise PathError(f"times must increase: {order}")
+        if self.unit not in UNITS:
+            raise PathError(f"unknown unit {self.unit!r}: choose {' or '.join(UNITS)}")
+
+    @property
+    def seconds(self) -> float:
+        """From the first key to the last, or back to the first."""
+        span = self.keys[-1].time - self.keys[0].time
+        return span * len(self.keys) / (len(self.keys) - 1) if self.closed else span
+
+    def frame_count(self, fps: float) -> int:
+        """How many frames the path takes, both ends included unless it is closed."""
+        return max(1, round(self.seconds * fps) + (not self.closed))
+
+    def cameras(self, camera: Camera, frames: int, depth_range: DepthRange) -> list[Camera]:
+        """Views at equal steps in time, of the size of the photo's `camera`, whose eye is the origin.
+
+        Of an open path the first and the last key are the first and the last frame; of a closed one the frame
+        after the last would be the first again. `depth_range` gives the unit "disparity" its length.
+
+        Raises:
+            PathError: between two keys the eye meets the target, or the view turns along its up.
+        """
+        steps = frames if self.closed else max(1, frames - 1)
+        return self.at([self.keys[0].time + k * self.seconds / steps for k in range(frames)], camera, depth_range)
+
+    def key_cameras(self, camera: Camera, depth_range: DepthRange) -> list[Camera]:
+        """The views of the keys themselves."""
+        return self.at([key.time for key in self.keys], camera, depth_range)
+
+    def at(self, times: list[float], camera: Camera, depth_range: DepthRange) -> list[Camera]:
+        """Views at these times in seconds; `cameras` says more."""
+        length = max_offset(camera, 1.0, depth_range) if self.unit == "disparity" else 1.0
+        fx = camera.focal[0]
+        focals = [
+            fx if key.fov is None else camera.width / 2 / math.tan(math.radians(key.fov) / 2) for key in self.keys
+        ]
+        rows = [
+            (*key.eye, *key.target, *(np.array(key.up) / np.linalg.norm(key.up)), math.log(focal))
+            for key, focal in zip(self.keys, focals, strict=True)
+        ]
+        values = interpolate(np.array([key.time for key in self.keys]), np.array(rows), np.array(times), self._period)
+        views = []
+        for time, row in zip(times, values, strict=True):
+            try:
+                matrix = view_matrix(row[:3] * length, row[3:6] * length, row[6:9])
+            except PathError as error:
+                raise PathError(f"at {time:.3g} s, between two keyframes, {error}: add a keyframe there") from None
+            views.append(_zoomed(camera, matrix, math.exp(row[9]) / fx))
+        return views
+
+    @property
+    def _period(self) -> float | None:
+        return self.seconds if self.closed else None
+
+
+def view_matrix(eye: Array, target: Array, up: Array) -> Array:
+    """world_to_camera [4, 4] of a camera at `eye` [3] that looks at `target` [3], with `up` [3] upwards.
+
+    Raises:
+        PathError: eye and target coincide, or up has no length, or lies along the view.
+    """
+    forward = target - eye
+    distance, height = float(np.linalg.norm(forward)), float(np.linalg.norm(up))
+    if distance <= SHORTEST_LOOK * max(1e-3, float(np.abs([eye, target]).max())):
+        raise PathError("eye and target coincide, so there is no direction to look in")
+    if height < 1e-9:
+        raise PathError("up has no length")
+    forward = forward / distance
+    right = np.cross(forward, up / height)
+    if (sine := float(np.linalg.norm(right))) < LEAST_TILT:
+        raise PathError("up lies along the view, so it does not say which way is up")
+    right = right / sine
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    return matrix
+
+
+def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:
+    """Monotone cubics [M, C] at `wanted` [M] through `values` [K, C] at increasing `times` [K].
+
+    With a period the values repeat: the first comes again at times[0] + period.
+    """
+    if period is not None:
+        times = np.concatenate([times[-1:] - period, times, times[:2] + period])
+        values = np.concatenate([values[-1:], values, values[:2]])
+    steps = np.diff(times)[:, None]
+    slopes = np.diff(values, axis=0) / steps
+    tangents = np.concatenate([slopes[:1], _inner_tangents(steps, slopes), slopes[-1:]])
+    segment = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, len(steps) - 1)
+    step = steps[segment]
+    u = np.clip((wanted - times[segment])[:, None] / step, 0, 1)
+    a, b = values[segment], values[segment + 1]
+    bend = (1 - u) ** 2 * u * tangents[segment] - u**2 * (1 - u) * tangents[segment + 1]
+    mixed = np.where(u < 0.5, a + (3 - 2 * u) * u**2 * (b - a), b - (1 + 2 * u) * (1 - u) ** 2 * (b - a))
+    bounded: Array = np.clip(mixed + step * bend, np.minimum(a, b), np.maximum(a, b))  # the last digit may be over
+    return bounded
+
+
+def _inner_tangents(steps: Array, slopes: Array) -> Array:
+    """[K − 2, C]: the weighted harmonic mean of the slopes on both sides, 0 where they disagree in sign."""
+    before, after = slopes[:-1], slopes[1:]
+    first, second = steps[1:] * 2 + steps[:-1], steps[1:] + 2 * steps[:-1]
+    agree = (before * after > 0) & (np.minimum(np.abs(before), np.abs(after)) > STILL)
+    safe_before, safe_after = np.where(agree, before, 1), np.where(agree, after, 1)
+    mean = (first + second) / (first / safe_before + second / safe_after)
+    tangents: Array = np.where(agree, mean, 0.0)
+    return tangents
+
+
+def _zoomed(camera: Camera, matrix: Array, zoom: float) -> Camera:
+    """The photo's lens with its focal length times `zoom`, put elsewhere."""
+    K = camera.K.clone()
+    K[:2, :2] *= zoom
+    return dataclasses.replace(camera, K=K, world_to_camera=torch.from_numpy(matrix).to(camera.world_to_camera))

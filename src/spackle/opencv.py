@@ -1,0 +1,58 @@
+"""What OpenCV does for us: flat inpainting and optical flow (optional: pip install 'spackle-nvs[opencv]')."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from spackle.errors import InputError
+
+
+class OpenCV:
+    """The package, found once."""
+
+    def __init__(self, wanted_by: str, instead: str = "") -> None:
+        """Find it.
+
+        Args:
+            wanted_by: for the message, what needs it.
+            instead: for the message, what to do without it.
+
+        Raises:
+            InputError: it is not installed.
+        """
+        try:
+            import cv2
+        except ImportError as error:
+            line = f"{wanted_by} needs a package: pip install 'spackle-nvs[opencv]'"
+            raise InputError(f"{line}; {instead}" if instead else line) from error
+        self._cv2: Any = cv2
+        self.version: str = cv2.__version__
+        self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def inpaint(self, rgb: Tensor, mask: Tensor, radius: float) -> Tensor:
+        """Telea's filling of a mask [H, W] bool in sRGB [H, W, 3]: [H, W, 3], of 8 bits a channel."""
+        filled = self._cv2.inpaint(_bytes(rgb).numpy(), mask.to(torch.uint8).numpy(), radius, self._cv2.INPAINT_TELEA)
+        return torch.from_numpy(filled).float() / 255
+
+    def flow(self, picture: Tensor, other: Tensor) -> Tensor:
+        """Dense inverse search (Kroeger et al., 2016): how far from each pixel its content lies in another picture.
+
+        Args:
+            picture: [H, W, 3] sRGB in 0..1.
+            other: [H, W, 3], likewise.
+
+        Returns:
+            [H, W, 2] (x, y) in pixels; zero where a side is too short to look for motion.
+        """
+        height, width = picture.shape[:2]
+        if min(height, width) < 16:  # the search works on patches of 8 pixels, at several sizes
+            return torch.zeros(height, width, 2, device=picture.device)
+        grey = [self._cv2.cvtColor(_bytes(image).numpy(), self._cv2.COLOR_RGB2GRAY) for image in (picture, other)]
+        return torch.from_numpy(self._flow.calc(grey[0], grey[1], None)).to(picture.device)
+
+
+def _bytes(rgb: Tensor) -> Tensor:
+    return (rgb.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

@@ -1,0 +1,198 @@
+"""Clips as files: read as they are, written with their times and sound; bad ones are one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from clips import moving, write_clip
+from command import report_of, run
+from photos import metres, picture, write_depth
+from PIL import Image
+from scenes import psnr
+
+from spackle.errors import InputError
+from spackle.formats.clip import clip_frames, is_clip, read_clip
+
+pytest.importorskip("cv2")
+
+
+# Reading -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pix_fmt"),
+    [
+        ("a.mp4", "libx264", "yuv420p"),
+        ("a.mov", "libx264", "yuv420p"),
+        ("a.mkv", "libx264", "yuv444p"),
+        ("a.webm", "libvpx-vp9", "yuv420p"),
+        ("a.gif", "gif", "rgb8"),
+    ],
+)
+def test_frames_come_as_they_were(tmp_path: Path, name: str, codec: str, pix_fmt: str) -> None:
+    given = moving(5, 47, 65) if pix_fmt == "yuv444p" else moving(5)
+    clip = read_clip(write_clip(tmp_path / name, given, codec, pix_fmt))
+    assert is_clip(clip.path)
+    assert (len(clip), clip.width, clip.height) == (5, given[0].shape[1], given[0].shape[0])
+    assert float(clip.rate) == pytest.approx(10, rel=0.01)
+    assert [float(t) for t in clip.times] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4], abs=0.002)
+    for sent, got in zip(given, clip_frames(clip), strict=True):
+        assert psnr(got, torch.from_numpy(sent).float() / 255) > (18 if name.endswith("gif") else 24)
+
+
+def test_only_the_first_frames_count_where_that_is_said(tmp_path: Path) -> None:
+    clip = read_clip(write_clip(tmp_path / "a.mp4", moving(5)), first=2)
+    assert len(list(clip_frames(clip))) == len(clip) == 2
+    assert clip.seconds == Fraction(1, 5)
+
+
+def test_uneven_times_are_kept(tmp_path: Path) -> None:
+    clip = read_clip(write_clip(tmp_path / "a.mkv", moving(4), ticks=[3, 4, 8, 9]))
+    assert [round(10 * t) for t in clip.times] == [0, 1, 5, 6]
+    assert float(clip.start) == pytest.approx(0.3, abs=0.01)
+
+
+@pytest.mark.skipif(not hasattr(av.video.stream.VideoStream, "set_display_rotation"), reason="an older PyAV")
+@pytest.mark.parametrize(("degrees", "quarters"), [(90, 1), (-90, 3), (180, 2)])
+def test_a_clip_is_turned_upright(tmp_path: Path, degrees: int, quarters: int) -> None:
+    given = moving(2)
+    clip = read_clip(write_clip(tmp_path / "a.mp4", given, turned=degrees))
+    upright = np.ascontiguousarray(np.rot90(given[0], quarters))
+    assert (clip.height, clip.width) == upright.shape[:2]
+    assert psnr(next(clip_frames(clip)), torch.from_numpy(upright).float() / 255) > 24
+
+
+def test_a_gif_with_one_picture_is_a_photo(tmp_path: Path) -> None:
+    Image.fromarray(picture()).save(tmp_path / "a.gif")
+    assert not is_clip(tmp_path / "a.gif")
+    assert not is_clip(tmp_path / "a.png")
+    assert not is_clip(tmp_path)
+
+
+def cut_off(path: Path) -> None:
+    write_clip(path, (np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8) for k in range(12)))
+    with av.open(str(path)) as source, av.open(str(path) + ".mp4", "w", options={"movflags": "faststart"}) as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    data = Path(str(path) + ".mp4").read_bytes()
+    path.write_bytes(data[: len(data) * 2 // 3])
+
+
+def sound_alone(path: Path) -> None:
+    with av.open(str(path), "w") as container:
+        voice = container.add_stream("aac", rate=8000)
+        tone = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        tone.rate = 8000
+        container.mux(voice.encode(tone))
+        container.mux(voice.encode(None))
+
+
+def unknown_codec(path: Path) -> None:
+    write_clip(path, moving(2))
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "empty": (lambda path: path.touch(), "the file is empty"),
+    "missing": (lambda path: None, "no such"),
+    "text": (lambda path: path.write_text("no clip"), "not a video"),
+    "headless": (lambda path: path.write_bytes(write_clip(path, moving(4)).read_bytes()[:-200]), "damaged"),
+    "cut off": (cut_off, "cut off"),
+    "sound alone": (sound_alone, "no moving picture"),
+    "unknown codec": (unknown_codec, "codec"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_clip_is_one_line(tmp_path: Path, name: str) -> None:
+    make, message = BAD[name]
+    make(tmp_path / "bad.mp4")
+    done = run("predict", "-i", tmp_path / "bad.mp4", "-o", tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1), done.err
+    assert "bad.mp4" in done.err
+    assert message in done.err
+    assert not (tmp_path / "out").exists()
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def depths(folder: Path, count: int) -> Path:
+    for index in range(count):
+        write_depth(folder / f"{index:06d}.npy", metres())
+    return folder
+
+
+def test_a_clip_becomes_a_clip_of_the_same_frames_times_and_sound(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.mp4", moving(5), ticks=[0, 1, 2, 5, 6], sound="aac")
+    done = run(
+        *("predict", "-i", tmp_path / "a.mp4", "-o", tmp_path / "out", "--depth", depths(tmp_path / "d", 5)),
+        *("--residual", "seeds", "--trajectory", "rotate", "--disparity", 0.1),
+    )
+    assert done.code == 0, done.err
+    assert {path.name for path in (tmp_path / "out/a").iterdir()} == {"video.mp4", "report.json"}
+    with av.open(str(tmp_path / "out/a/video.mp4")) as container:
+        frames = list(container.decode(video=0))
+        assert [round(10 * frame.time) for frame in frames] == [0, 1, 2, 5, 6]
+        assert (frames[0].width, frames[0].height) == (64, 48)
+        assert container.streams.audio[0].codec_context.name == "aac"
+    report = report_of(tmp_path / "out/a")
+    assert (report["clip"]["frames"], report["clip"]["cuts"], report["base"]["name"]) == (5, [], "rgbd")
+    assert report["clip"]["sound"] == {"codec": "aac", "copied": True}
+    assert report["hole_area_ratio"]["before"] > 0.02
+    assert report["hole_area_ratio"]["after"] < 0.001
+    assert report["flicker"]["carried"] < report["flicker"]["alone"]
+    assert set(report["seconds"]["by_stage"]) == {"decode", "base", "depth", "complete", "carry", "encode"}
+
+
+def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "a.mp4", moving(3))
+    done = run(
+        "predict", "-i", clip, "-o", tmp_path / "out", "--depth", depths(tmp_path / "d", 1), "--residual", "none"
+    )
+    assert done.code == 2
+    assert "a.mp4/000001" in done.lines[-1]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--cameras", "views.json"),
+        ("--mode", "view"),
+        ("--no-render",),
+        ("--depth", "a.npy"),
+        ("--format", "gif"),
+        ("--stereo", "sbs"),
+    ],
+)
+def test_an_option_that_a_clip_has_no_use_for_is_one_line(tmp_path: Path, options: tuple[str, ...]) -> None:
+    done = run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out", *options)
+    assert (done.code, len(done.lines)) == (2, 1), done.err
+    assert options[0] in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_opencv_a_clip_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    done = run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "pip install 'spackle-nvs[opencv]'" in done.err
+
+
+def test_a_damaged_frame_is_named(tmp_path: Path) -> None:
+    path = write_clip(tmp_path / "a.mp4", moving(4))
+    clip = read_clip(path)
+    path.write_bytes(b"gone")
+    with pytest.raises(InputError, match=r"a\.mp4"):
+        next(clip_frames(clip))

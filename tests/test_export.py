@@ -1,0 +1,561 @@
+"""Export: every format read back by a plain reader of its own, and what the command says."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import math
+import os
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import typer
+from plain_scenes import (
+    compressed_ply_rows,
+    gaussians_of,
+    glb_parts,
+    glb_rows,
+    sog_rows,
+    splat_rows,
+    spz_rows,
+)
+from rich.console import Console
+from scenes import box_before_wall, motorcycle, motorcycle_base, psnr, shifted, slanted_plane
+from typer.testing import CliRunner
+
+from spackle.camera import Camera
+from spackle.cli.export import register
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError
+from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, save_ply
+from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
+from spackle.formats.gltf import encode_glb
+from spackle.formats.sog import codebook, encode_sog
+from spackle.formats.splat import encode_splat
+from spackle.formats.spz import LIMIT, decode_spz, encode_spz, spz_grid
+from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
+from spackle.jobs import export as job
+from spackle.jobs.export import WRITERS, export_scene
+from spackle.jobs.progress import Reporter
+from spackle.render import CpuRenderer
+
+CPU = CpuRenderer()
+BOX = box_before_wall(width=64, height=48, focal=54)
+READERS: dict[str, Callable[[bytes], Gaussians]] = {
+    "compressed.ply": lambda data: gaussians_of(compressed_ply_rows(data), flipped=False),
+    "spz": lambda data: gaussians_of(spz_rows(data), flipped=True),
+    "splat": lambda data: gaussians_of(splat_rows(data), flipped=False),
+    "sog": lambda data: gaussians_of(sog_rows(data), flipped=False),
+    "glb": lambda data: gaussians_of(glb_rows(data), flipped=True),
+}
+ENCODERS: dict[str, Callable[[Gaussians], bytes]] = {
+    "compressed.ply": encode_compressed_ply,
+    "spz": encode_spz,
+    "splat": encode_splat,
+    "sog": encode_sog,
+    "glb": encode_glb,
+}
+# What a format's rounding leaves of a small scene: dB between renders, and the greatest error of a position in
+# standard deviations, of a scale's logarithm, of an axis' direction, of sRGB and of opacity.
+BOUNDS = {
+    "compressed.ply": (50, 0.1, 0.01, 0.005, 0.003, 0.003),
+    "spz": (43, 0.04, 0.04, 0.01, 0.008, 0.003),
+    "splat": (50, 0.0, 1e-5, 0.02, 0.003, 0.003),
+    "sog": (50, 0.1, 0.03, 0.02, 0.006, 0.003),
+    "glb": (80, 0.0, 1e-5, 1e-5, 1e-5, 1e-6),
+}
+
+
+def turned(count: int = 400, seed: int = 3) -> Gaussians:
+    """Gaussians with three different scales, turned any way, before the eye."""
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        torch.rand(count, 3, generator=g) * torch.tensor([2.0, 1.5, 4.0]) + torch.tensor([-1.0, -0.75, 2.0]),
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 3, generator=g) * 0.1 + 0.02,
+        torch.rand(count, generator=g),
+        torch.rand(count, 3, generator=g),
+    )
+
+
+def in_file_order(kind: str, gaussians: Gaussians, base_count: int = 0) -> Gaussians:
+    """A compressed PLY puts neighbours together."""
+    if kind != "compressed.ply":
+        return gaussians
+    parts = [gaussians.select(slice(0, base_count)), gaussians.select(slice(base_count, None))]
+    return Gaussians.cat(part.select(torch.from_numpy(morton_order(part.means.numpy()))) for part in parts)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_a_scene_read_back_is_the_scene(kind: str) -> None:
+    decibels, place, size, turn, color, opacity = BOUNDS[kind]
+    gaussians = turned()
+    found, expected = READERS[kind](ENCODERS[kind](gaussians)), in_file_order(kind, gaussians)
+    middle = expected.scales.median(dim=1).values[:, None]
+    assert float(((found.means - expected.means).abs() / middle).max()) <= place
+    assert float((found.scales.log() - expected.scales.log()).abs().max()) <= size
+    ball = expected.scales.amax(dim=1) < 1.07 * expected.scales.amin(dim=1)  # it has no axes that could be kept
+    axes = (quat_to_matrix(found.quats) - quat_to_matrix(expected.quats))[~ball]
+    assert float(axes.abs().max()) <= 2 * turn
+    assert float((linear_to_srgb(found.colors) - linear_to_srgb(expected.colors)).abs().max()) <= color
+    assert float((found.opacities - expected.opacities).abs().max()) <= opacity
+    base = BOX.base()
+    found = READERS[kind](ENCODERS[kind](base))
+    for camera in (BOX.camera, shifted(BOX.camera, 0.3)):
+        assert psnr(CPU.render(found, camera).rgb, CPU.render(base, camera).rgb) >= decibels
+
+
+EXTREMES = {
+    "scales": {"scales": [[1e-30, 1e-30, 1e-30], [1e-6, 1.0, 1e6], [0.0, 0.1, 0.2], [math.inf, 0.1, 0.1]]},
+    "opacities": {"opacities": [0.0, 1.0, 1e-9, 0.9999]},
+    "far": {"means": [[1e6, 0, 1e6], [0, -3e7, 1.0], [0, 0, 0], [0.001, 0.002, 0.3]]},
+    "quats": {"quats": [[-0.1, 0.2, 0.3, -0.9], [0.0, 0, 0, 0], [-1.0, 0, 0, 0], [0.5, -0.5, 0.5, -0.5]]},
+    "colors": {"colors": [[-1.0, 0.5, 2.0], [0.0, 0, 0], [1.0, 1, 1], [1e9, -1e9, 0.2]]},
+    "alike": {"means": [[1.0, 1, 1]] * 4, "scales": [[0.1, 0.1, 0.1]] * 4, "colors": [[0.5, 0.5, 0.5]] * 4},
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+@pytest.mark.parametrize("extreme", EXTREMES)
+def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -> None:
+    usual = turned(4)
+    given = {name: torch.tensor(values) for name, values in EXTREMES[extreme].items()}
+    fields = dict(zip(("means", "quats", "scales", "opacities", "colors"), usual.tensors, strict=True))
+    gaussians = Gaussians(**{**fields, **given})
+    found, expected = READERS[kind](ENCODERS[kind](gaussians)), in_file_order(kind, gaussians)
+    assert all(bool(torch.isfinite(t).all()) for t in found.tensors)
+    torch.testing.assert_close(found.opacities, expected.opacities, rtol=0, atol=0.003)
+    torch.testing.assert_close(
+        linear_to_srgb(found.colors), linear_to_srgb(expected.colors), rtol=0, atol=BOUNDS[kind][4]
+    )
+    low, high = {"spz": (-10, 5.94), "compressed.ply": (-20, 20)}.get(kind, (-85, 85))
+    expected_logs = expected.scales.log().clamp(low, high)
+    if extreme != "far":
+        torch.testing.assert_close(found.scales.log().clamp(low, high), expected_logs, rtol=0, atol=0.07)
+        torch.testing.assert_close(found.means, expected.means, rtol=0, atol=0.06)
+    if extreme == "quats":
+        unit = expected.quats.clone()
+        unit[unit.norm(dim=1) == 0] = torch.tensor([1.0, 0, 0, 0])
+        torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(unit), rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_one_gaussian_and_none(kind: str) -> None:
+    one = turned(1)
+    found = READERS[kind](ENCODERS[kind](one))
+    torch.testing.assert_close(found.means, one.means, rtol=0, atol=0.03)
+    if kind in ("sog", "glb"):
+        with pytest.raises(InputError, match="without Gaussians"):
+            ENCODERS[kind](Gaussians.empty())
+    else:
+        assert len(ENCODERS[kind](Gaussians.empty())) < 1000
+    broken = Gaussians(one.means * math.nan, *one.tensors[1:])
+    with pytest.raises(ValueError, match="not all finite"):
+        ENCODERS[kind](broken)
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_the_same_scene_makes_the_same_bytes(kind: str) -> None:
+    assert ENCODERS[kind](turned(50)) == ENCODERS[kind](turned(50))
+
+
+ONE = Gaussians(
+    torch.tensor([[1.0, 2.0, 4.0]]),
+    torch.tensor([[-0.5, 0.5, 0.5, 0.5]]),
+    torch.tensor([[math.exp(-2), math.exp(-3), math.exp(-4)]]),
+    torch.tensor([0.2]),
+    srgb_to_linear(torch.tensor([[1.0, 0.5, 0.0]])),
+)
+
+
+def test_spz_bytes_by_hand() -> None:
+    """y and z change their signs, and so do these parts of the quaternion; the first of the largest is left out."""
+    raw = gzip.decompress(encode_spz(ONE))
+    bits = raw[13]
+    assert raw[:16] == struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, bits, 0, 0)
+    places = b"".join((v << bits).to_bytes(3, "little", signed=True) for v in (1, -2, -4))
+    assert raw[16:25] == places
+    assert raw[25] == 51
+    assert list(raw[26:29]) == [195, 128, 60]  # (1 - 0.5) / 0.2821 · 0.15 · 255 + 127.5 = 195.3
+    assert list(raw[29:32]) == [128, 112, 96]
+    # (x, y, z, w) = (0.5, -0.5, -0.5, -0.5): x is the largest; -0.5 · √2 · 511 = -361.3
+    size = 1 << 9 | 361
+    assert raw[32:36] == (size << 20 | size << 10 | size).to_bytes(4, "little")
+
+
+def test_splat_bytes_by_hand() -> None:
+    scales = struct.pack("<3f", *ONE.scales[0].tolist())
+    expected = struct.pack("<3f", 1, 2, 4) + scales + bytes([255, 128, 0, 51, 64, 192, 192, 192])
+    found = encode_splat(ONE)
+    assert (found[:12], found[24:]) == (expected[:12], expected[24:])
+    np.testing.assert_allclose(struct.unpack("<3f", found[12:24]), struct.unpack("<3f", scales), rtol=1e-6)
+
+
+def test_glb_by_hand() -> None:
+    gltf, body = glb_parts(encode_glb(ONE))
+    assert gltf["accessors"][0]["min"] == gltf["accessors"][0]["max"] == [1, -2, -4]
+    assert struct.unpack("<3f", body[:12]) == (1, -2, -4)
+    assert struct.unpack("<4f", body[12:28]) == (0.5, -0.5, -0.5, -0.5)  # x y z w
+    np.testing.assert_allclose(struct.unpack("<3f", body[28:40]), ONE.scales[0], rtol=1e-6)
+    np.testing.assert_allclose(
+        struct.unpack("<f3f", body[40:56]), [0.2, 0.5 / 0.28209479, 0, -0.5 / 0.28209479], atol=1e-5
+    )
+    color = struct.unpack("<4H", body[56:64])
+    assert color == (65535, round(65535 * float(ONE.colors[0, 1])), 0, 13107)
+
+
+def moved() -> Camera:
+    camera = Camera.from_focal(50, 64, 48).looking(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 4.0]))
+    camera.K[0, 2] = 30
+    return camera
+
+
+def test_glb_keeps_the_photos_camera_and_the_border() -> None:
+    camera = moved()
+    gltf, _ = glb_parts(encode_glb(ONE, camera, 1))
+    (scene, photo), (lens,) = gltf["nodes"], gltf["cameras"]
+    assert scene["extras"] == {"spackle_base": 1}
+    assert gltf["scenes"][0]["nodes"] == [0, 1]
+    assert lens["extras"] == {"K": camera.K.tolist(), "width": 64, "height": 48}
+    assert lens["perspective"]["yfov"] == pytest.approx(2 * math.atan(24 / 50))
+    assert lens["perspective"]["aspectRatio"] == pytest.approx(64 / 48)
+    # What lies a metre before the photo's camera lies a metre along -z of glTF's.
+    pose = torch.tensor(photo["matrix"]).reshape(4, 4).T
+    there = pose @ torch.tensor([0.1, -0.2, -1.0, 1.0])
+    flipped = there[:3] * torch.tensor([1.0, -1.0, -1.0])
+    expected = torch.linalg.inv(camera.world_to_camera) @ torch.tensor([0.1, 0.2, 1.0, 1.0])
+    torch.testing.assert_close(flipped, expected[:3])
+    still, _ = glb_parts(encode_glb(ONE, Camera.from_focal(50, 64, 48)))
+    assert "matrix" not in still["nodes"][1]
+    assert "extras" not in still["nodes"][0]
+
+
+def test_compressed_ply_keeps_the_base_before_the_aux(tmp_path: Path) -> None:
+    gaussians = turned(700)
+    data = encode_compressed_ply(gaussians, Camera.from_focal(50, 64, 48), 300)
+    found = gaussians_of(compressed_ply_rows(data), flipped=False)
+    expected = in_file_order("compressed.ply", gaussians, 300)
+    assert float((found.means - expected.means).abs().max()) < 0.005
+    assert not torch.allclose(found.means, in_file_order("compressed.ply", gaussians).means, atol=0.1)
+    (tmp_path / "a.ply").write_bytes(data)
+    assert b"comment spackle_camera 50.0 50.0 32.0 24.0 64 48\ncomment spackle_base 300\n" in data
+
+
+def test_morton_order_is_that_of_interleaved_bits() -> None:
+    points = np.array(np.meshgrid(*[range(8)] * 3)).reshape(3, -1).T.astype(np.float32)
+
+    def curve(point: Any) -> int:
+        cells = (point / 7 * 1023).astype(int).tolist()
+        return sum((cells[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
+
+    assert [curve(points[i]) for i in morton_order(points)] == sorted(curve(point) for point in points)
+
+
+# SPZ's grid.
+
+
+def spz_scene(near: float, far: float) -> Gaussians:
+    """A plane at `near` and a sky at `far`, both as fine as a photo's pixels."""
+    x, y = (
+        t.flatten() for t in torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy")
+    )
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=1)
+    depth = torch.where(y < 0, far, near)
+    count = len(rays)
+    quats = quat_from_matrix(torch.eye(3)).expand(count, 4)
+    scales = (depth / 60)[:, None].expand(count, 3) * torch.tensor([1.0, 1.0, 0.1])
+    colors = 0.5 + 0.4 * torch.stack([torch.sin(20 * x), torch.sin(15 * y), torch.cos(12 * x + 9 * y)], dim=1)
+    return Gaussians(rays * depth[:, None], quats.contiguous(), scales.contiguous(), torch.full((count,), 0.99), colors)
+
+
+@pytest.mark.parametrize("far", [30.0, 500.0, 5000.0, 1e6])
+def test_spz_shows_what_is_near_and_a_far_sky(far: float) -> None:
+    gaussians = spz_scene(0.3, far)
+    camera = Camera.from_focal(60, 64, 48)
+    bits, beyond = spz_grid(gaussians)
+    assert (beyond > 0) == (far > 1000)
+    assert 2.0**-bits <= 0.3 / 2000
+    found = decode_spz(encode_spz(gaussians))
+    assert psnr(CPU.render(found, camera).rgb, CPU.render(gaussians, camera).rgb) >= 43
+    aside = shifted(camera, 0.02, 0.3)
+    assert psnr(CPU.render(found, aside).rgb, CPU.render(gaussians, aside).rgb) >= 41
+    directions = torch.nn.functional.normalize(gaussians.means, dim=1)
+    assert float((torch.nn.functional.normalize(found.means, dim=1) - directions).abs().max()) < 0.01
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_spz_takes_scenes_of_any_unit(size: float) -> None:
+    gaussians = turned()
+    scaled = Gaussians(gaussians.means * size, gaussians.quats, gaussians.scales * size, *gaussians.tensors[3:])
+    assert spz_grid(scaled)[1] == 0
+    found = decode_spz(encode_spz(scaled))
+    assert (
+        float(((found.means / size - gaussians.means).abs() / gaussians.scales.median(1).values[:, None]).max()) < 0.4
+    )
+
+
+def test_spz_is_an_eighth_of_the_ply() -> None:
+    base = slanted_plane(1.5, 6, 0).base()
+    data = encode_spz(base)
+    assert len(data) <= LIMIT * len(base) == 68 * len(base) / 8
+    # What can be had finer within that size is had: a scene of one colour and one size.
+    plain = Gaussians(base.means, base.quats, torch.full_like(base.scales, 0.01), base.opacities, base.colors * 0 + 0.5)
+    error = (decode_spz(encode_spz(plain)).means - base.means).abs().max()
+    assert float(error) < 0.01 / 16
+
+
+def test_spz_decoder_agrees_with_the_plain_one_and_reads_version_2() -> None:
+    data = encode_spz(turned())
+    for found, expected in zip(decode_spz(data).tensors, READERS["spz"](data).tensors, strict=True):
+        torch.testing.assert_close(found, expected.float(), rtol=1e-5, atol=2e-4)
+    raw = gzip.decompress(encode_spz(ONE))
+    older = gzip.compress(raw[:4] + bytes([2]) + raw[5:32] + bytes([191, 64, 128]))
+    quat = decode_spz(older).quats[0]
+    torch.testing.assert_close(quat, torch.tensor([0.7099, 0.498, 0.498, -0.0039]), rtol=0, atol=1e-3)
+    assert len(decode_spz(encode_spz(Gaussians.empty()))) == 0
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"NGSP" * 20,
+        encode_spz(ONE)[:-15],
+        gzip.compress(b"NGSP"),
+        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**31, 0, 12, 0, 0)),
+        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 4, 0, 0, 12, 0, 0)),
+        gzip.compress(struct.pack("<4sIIBBBB", b"ABCD", 3, 0, 0, 12, 0, 0)),
+    ],
+)
+def test_broken_spz_is_an_input_error(data: bytes) -> None:
+    with pytest.raises(InputError, match="SPZ"):
+        decode_spz(data)
+
+
+# SOG's codebooks.
+
+
+def test_a_codebook_is_nearly_as_good_as_k_means() -> None:
+    g = torch.Generator().manual_seed(0)
+    values = torch.cat([torch.randn(9000, 3, generator=g), 8 + 0.1 * torch.randn(900, 3, generator=g)]).numpy()
+    values[0] = [-30, 30, 17]
+    book, codes = codebook(values)
+    error = np.square(book[codes] - values).mean()
+    centres = np.quantile(values, (np.arange(256) + 0.5) / 256)
+    for _ in range(30):  # Lloyd's
+        edges = (centres[1:] + centres[:-1]) / 2
+        labels = np.searchsorted(edges, values.ravel())
+        counts = np.bincount(labels, minlength=256)
+        centres = np.where(counts, np.bincount(labels, values.ravel(), 256) / np.maximum(counts, 1), centres)
+        centres.sort()
+    best = np.square(centres[np.searchsorted((centres[1:] + centres[:-1]) / 2, values)] - values).mean()
+    assert error < 2.5 * best
+    assert np.abs(book[codes] - values).max() < 60 / 64 / 2  # what is rare is not far off either
+
+
+def test_a_codebook_of_few_values_is_exact() -> None:
+    values = np.linspace(-3, 5, 256, dtype=np.float32)[np.arange(3000) % 256].reshape(-1, 3)
+    book, codes = codebook(values)
+    np.testing.assert_allclose(book[codes], values, atol=1e-6)
+
+
+# The command.
+
+
+def told(console_width: int = 300) -> tuple[Reporter, io.StringIO]:
+    text = io.StringIO()
+    return Reporter(console=Console(file=text, width=console_width)), text
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    base, camera = BOX.base(), BOX.camera
+    path = tmp_path / "scene.ply"
+    save_ply(base, path, camera=camera, base_count=1000)
+    return path
+
+
+def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
+    reporter, text = told()
+    outputs = [tmp_path / f"out{suffix}" for suffix in WRITERS]
+    export_scene(scene, outputs, reporter)
+    lines = text.getvalue().splitlines()
+    assert len(lines) == len(outputs)
+    for output, line in zip(outputs, lines, strict=True):
+        assert line.startswith(f"{output}: 3,840 Gaussians, ")
+        assert line.endswith(" s")
+    for a, b in zip(load_ply(tmp_path / "out.ply").tensors, load_ply(scene).tensors, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+    assert load_ply_camera(tmp_path / "out.ply") is not None
+    assert "as large as the PLY" in lines[1]
+    assert "times smaller than the PLY" in lines[2]
+    base = load_ply(scene)
+    for kind, reader in READERS.items():
+        found = reader((tmp_path / f"out.{kind}").read_bytes())
+        assert psnr(CPU.render(found, BOX.camera).rgb, CPU.render(base, BOX.camera).rgb) >= BOUNDS[kind][0]
+    page = (tmp_path / "out.html").read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert "spackle-scene" in page
+    gltf, _ = glb_parts((tmp_path / "out.glb").read_bytes())
+    assert gltf["nodes"][0]["extras"] == {"spackle_base": 1000}
+    assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *(output.name for output in outputs)}
+
+
+def test_upper_case_and_the_scene_itself(scene: Path) -> None:
+    before = load_ply(scene)
+    export_scene(scene, [scene, scene.with_name("A.SPZ")], told()[0])
+    assert all(torch.equal(a, b) for a, b in zip(load_ply(scene).tensors[:1], before.tensors[:1], strict=True))
+    assert load_ply_base_count(scene) == 1000
+    assert len(decode_spz(scene.with_name("A.SPZ").read_bytes())) == len(before)
+
+
+def test_a_camera_elsewhere_is_no_comment(tmp_path: Path) -> None:
+    loaded = job.Scene(tmp_path / "a.ply", ONE, moved(), None)
+    WRITERS[".ply"](loaded, tmp_path / "b.ply")
+    assert load_ply_camera(tmp_path / "b.ply") is None
+
+
+def test_what_is_drawn_nearer_is_said(tmp_path: Path) -> None:
+    save_ply(spz_scene(0.3, 5000.0), tmp_path / "a.ply")
+    reporter, text = told()
+    export_scene(tmp_path / "a.ply", [tmp_path / "a.spz"], reporter)
+    assert "640 Gaussians beyond 1,024 m were drawn nearer" in text.getvalue()
+
+
+def test_bad_requests_are_one_line_and_leave_nothing(scene: Path, tmp_path: Path) -> None:
+    reporter, _ = told()
+    (tmp_path / "text.ply").write_text("hello")
+    for source, outputs, says in [
+        (scene, ["a.spz", "a.obj"], r"a\.obj: which format"),
+        (scene, ["a.spz", "none/a.sog"], "does not exist"),
+        (scene, ["a.spz", "a.spz"], "named twice"),
+        (tmp_path / "text.ply", ["a.spz"], "not a PLY"),
+        (tmp_path / "none.ply", ["a.spz"], "none.ply"),
+        (scene, ["a"], "which format"),
+    ]:
+        with pytest.raises(InputError, match=says) as caught:
+            export_scene(source, [tmp_path / name for name in outputs], reporter)
+        assert "\n" not in str(caught.value)
+    assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", "text.ply"}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "name", "value"),
+    [
+        ("spz", "formats.spz.MAX_COUNT", 3000),
+        ("sog", "formats.sog.LARGEST_SIDE", 40),
+        ("glb", "formats.gltf.LARGEST_FILE", 200_000),
+    ],
+)
+def test_too_large_a_scene_is_told_and_an_older_file_stays(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, name: str, value: int
+) -> None:
+    output = scene.with_name(f"a.{suffix}")
+    output.write_bytes(b"older")
+    monkeypatch.setattr(f"spackle.{name}", value)
+    with pytest.raises(InputError, match=rf"a\.{suffix}: 3,840 Gaussians are too many"):
+        export_scene(scene, [output], told()[0])
+    assert output.read_bytes() == b"older"
+    assert len(list(scene.parent.iterdir())) == 2
+
+
+def test_command_line(scene: Path, tmp_path: Path) -> None:
+    app = typer.Typer()
+    register(app)
+    done = CliRunner().invoke(app, [str(scene), "-o", str(tmp_path / "a.spz"), "-o", str(tmp_path / "a.splat")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "a.splat").stat().st_size == 32 * 3840
+    assert (tmp_path / "a.spz").is_file()
+    wrong = CliRunner().invoke(app, [str(scene), "-o", str(tmp_path / "a.obj")])
+    assert isinstance(wrong.exception, InputError)
+
+
+# The base's number in a PLY.
+
+
+def test_base_count_of_a_ply(scene: Path, tmp_path: Path) -> None:
+    assert load_ply_base_count(scene) == 1000
+    save_ply(ONE, tmp_path / "b.ply")
+    assert load_ply_base_count(tmp_path / "b.ply") is None
+    content = scene.read_bytes()
+    for wrong in (b"spackle_base 9999", b"spackle_base -3", b"spackle_base x", b"spackle_base 1 2", b"spackle_base"):
+        (tmp_path / "c.ply").write_bytes(content.replace(b"spackle_base 1000", wrong))
+        with pytest.raises(InputError, match=r"c\.ply: the stored number of base Gaussians"):
+            load_ply_base_count(tmp_path / "c.ply")
+
+
+# Readers that others wrote.
+
+
+def splat_transform() -> list[str]:
+    """The command of PlayCanvas's splat-transform, where it is installed."""
+    given = os.environ.get("SPLAT_TRANSFORM")  # .../node_modules/@playcanvas/splat-transform/bin/cli.mjs
+    if given and shutil.which("node"):
+        return ["node", given]
+    found = shutil.which("splat-transform")
+    if not found:
+        pytest.skip(
+            "splat-transform is not installed: npm install -g @playcanvas/splat-transform, or set SPLAT_TRANSFORM"
+        )
+    return [found]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in READERS if kind != "glb"])  # which it writes but does not read
+def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
+    command = splat_transform()
+    gaussians = turned(50)
+    (tmp_path / f"a.{kind}").write_bytes(ENCODERS[kind](gaussians))
+    files = [str(tmp_path / name) for name in (f"a.{kind}", "b.ply")]
+    done = subprocess.run([*command, "-q", *files], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found, expected = load_ply(tmp_path / "b.ply"), READERS[kind]((tmp_path / f"a.{kind}").read_bytes())
+    torch.testing.assert_close(found.means, expected.means.float(), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(found.colors, expected.colors.float(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(found.scales, expected.scales.float(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(found.opacities, expected.opacities.float(), rtol=0, atol=1e-3)
+    turn = 0.02 if kind == "splat" else 0.001  # of .splat's bytes it takes 127.5 for 0, others 128
+    torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(expected.quats.float()), rtol=0, atol=turn)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
+def test_gsply_reads_the_scene(kind: str, tmp_path: Path) -> None:
+    """It compiles its reader when it is first used."""
+    gsply = pytest.importorskip("gsply")
+    path = tmp_path / f"a.{kind}"
+    path.write_bytes(ENCODERS[kind](turned(50)))
+    raw, expected = gsply.read_spz(path) if kind == "spz" else gsply.plyread(path), READERS[kind](path.read_bytes())
+    flip = torch.tensor([1.0, -1.0, -1.0]) if kind == "spz" else torch.ones(3)  # it leaves SPZ's axes as they are
+    torch.testing.assert_close(torch.as_tensor(raw.means) * flip, expected.means.float(), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(torch.as_tensor(raw.scales).exp(), expected.scales.float(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(torch.as_tensor(raw.opacities).sigmoid(), expected.opacities.float(), rtol=0, atol=1e-3)
+    quats = torch.as_tensor(raw.quats) * torch.cat([torch.ones(1), flip])
+    torch.testing.assert_close(quat_to_matrix(quats), quat_to_matrix(expected.quats.float()), rtol=0, atol=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["compressed.ply", "spz", "splat", "sog", "glb"])
+def test_a_real_photos_scene_keeps_its_look(kind: str) -> None:
+    base, camera = motorcycle_base().gaussians, motorcycle().left.camera
+    data = ENCODERS[kind](base)
+    found = decode_spz(data) if kind == "spz" else READERS[kind](data)
+    assert kind != "spz" or len(data) <= LIMIT * len(base)
+    for view in (camera, shifted(camera, 0.3)):
+        assert psnr(CPU.render(found, view).rgb, CPU.render(base, view).rgb) >= min(BOUNDS[kind][0], 50) - 3
+
+
+def test_meta_of_sog_is_plain_json() -> None:
+    data = encode_sog(turned(10))
+    assert data.startswith(b"PK\x03\x04")
+    start = data.index(b"{")
+    meta, _ = json.JSONDecoder().raw_decode(data[start : start + 40_000].decode("latin-1"))
+    assert meta["means"]["files"] == ["means_l.webp", "means_u.webp"]
+    assert len(meta["scales"]["codebook"]) == len(meta["sh0"]["codebook"]) == 256

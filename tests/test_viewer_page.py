@@ -1,0 +1,420 @@
+"""The page: what it is given, what it shows in a real browser, and that it asks nobody for anything."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+import math
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scenes import box_before_wall, psnr
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb
+from spackle.errors import InputError
+from spackle.formats import save_png
+from spackle.gaussians import Gaussians
+from spackle.gaussians import quat_to_matrix as matrices
+from spackle.render import CpuRenderer
+from spackle.scene import Scene, complete, scene_path
+from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
+from spackle.viewer import PageScene, page_files, page_scene, single_html
+from spackle.viewer.layers import BYTES, encode_layer
+from spackle.viewer.server import ViewerServer
+
+WEB = Path(__file__).parents[1] / "web"
+EVIL = "</script><b>&\"'\ud800"
+CPU = CpuRenderer()
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
+
+
+@functools.cache
+def box() -> Scene:
+    """A small scene, completed by the seeds."""
+    prediction = box_before_wall(width=64, height=48, focal=53).lift()
+    path = scene_path(prediction.gaussians, prediction.camera, "swipe", 0.35, 4)
+    return complete(prediction, path, network=None)
+
+
+@functools.cache
+def page_of_box(name: str = "Box") -> PageScene:
+    return page_scene(name, box().base, box().aux, box().camera)
+
+
+# What the page is given.
+
+
+def decoded(data: bytes, low: float, step: float) -> Gaussians:
+    """The plain twin of the page's own reading, as the docstring of `encode_layer` has it."""
+    count = len(data) // BYTES
+    planes = np.frombuffer(data, np.uint8).reshape(BYTES, count).astype(np.int64)
+    rows = []
+    for i in range(count):
+        b = [int(value) for value in planes[:, i]]
+        words = [b[3 * k] << 8 | b[3 * k + 1] << 16 | b[3 * k + 2] << 24 for k in range(3)]
+        means = [float(np.uint32(word).view(np.float32)) for word in words]
+        scales = [math.exp(low + step * value) for value in b[9:12]]
+        quat = [(value - 128) / 127 / math.sqrt(2) for value in b[13:16]]
+        quat.insert(b[12], math.sqrt(max(0.0, 1 - sum(part * part for part in quat))))
+        rows.append([*means, *quat, *scales, b[19] / 255, *(value / 255 for value in b[16:19])])
+    table = torch.tensor(rows)
+    return Gaussians(table[:, :3], table[:, 3:7], table[:, 7:10], table[:, 10], table[:, 11:])
+
+
+def random_gaussians(count: int = 200) -> Gaussians:
+    """Near things and a sky, thin and thick, turned every way."""
+    torch.manual_seed(3)
+    means = torch.randn(count, 3) * torch.logspace(-1, 4, count)[:, None]
+    scales = torch.exp(torch.rand(count, 3) * 14 - 9)
+    return Gaussians(means, torch.randn(count, 4) * 3, scales, torch.rand(count), torch.rand(count, 3))
+
+
+def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
+    wanted = random_gaussians()
+    layer = encode_layer(wanted)
+    got = decoded(layer.data, layer.scale_low, layer.scale_step)
+    assert layer.count == len(wanted)
+    torch.testing.assert_close(got.means, wanted.means, rtol=2.0**-16, atol=0)
+    assert layer.scale_step < 0.06
+    torch.testing.assert_close(got.scales.log(), wanted.scales.log(), rtol=0, atol=layer.scale_step / 2 + 1e-4)
+    turn = matrices(got.quats) @ matrices(wanted.quats).transpose(1, 2)
+    assert float(torch.arccos(((turn.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).clamp(-1, 1)).max()) < 0.017  # radians
+    torch.testing.assert_close(got.colors, linear_to_srgb(wanted.colors), rtol=0, atol=0.502 / 255)
+    torch.testing.assert_close(got.opacities, wanted.opacities, rtol=0, atol=0.502 / 255)
+
+
+def test_one_broken_size_does_not_cost_the_others_their_precision() -> None:
+    gaussians = random_gaussians()
+    scales = gaussians.scales.clone()
+    scales[0] = 1e-37
+    assert encode_layer(dataclasses.replace(gaussians, scales=scales)).scale_step < 0.11
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("disparity", [0.0, 0.3, 0.8])
+def test_the_description_holds_the_paths_of_the_trajectories(kind: TrajectoryKind, disparity: float) -> None:
+    description: dict[str, Any] = page_of_box().description
+    still, moving = (np.array(description["paths"][kind][part]) for part in ("still", "moving"))
+    camera = box().camera.to(dtype=torch.float64)
+    cameras = trajectory(kind, camera, disparity, DepthRange.of(box().base), len(still))
+    np.testing.assert_allclose(still + disparity * moving, [view.position.tolist() for view in cameras], atol=1e-7)
+
+
+def test_the_description_is_plain_json_and_counts_its_layers() -> None:
+    description: dict[str, Any] = json.loads(json.dumps(page_of_box().description, allow_nan=False))
+    assert description["name"] == "Box"
+    assert [(layer["name"], layer["count"]) for layer in description["layers"]] == [
+        ("base", len(box().base)),
+        ("aux", len(box().aux)),
+    ]
+    assert {layer["file"]: layer["count"] * BYTES for layer in description["layers"]} == {
+        name: len(data) for name, data in page_of_box().files.items()
+    }
+
+
+def test_a_scene_without_aux_is_a_scene_and_one_that_cannot_be_seen_is_not() -> None:
+    alone = page_scene("alone", box().base, Gaussians.empty(), box().camera)
+    assert alone.files["aux.splats"] == b""
+    behind = dataclasses.replace(box().base, means=-box().base.means)
+    with pytest.raises(InputError, match=r"behind: no Gaussian stands in front"):
+        page_scene("behind", behind, box().aux, box().camera)
+
+
+# The page's files.
+
+
+def test_the_built_page_belongs_to_its_sources() -> None:
+    if not WEB.is_dir():
+        pytest.skip("web/ is not here: this is no checkout")
+    sources = [WEB / name for name in ("build.mjs", "package-lock.json", "package.json")] + list(
+        (WEB / "src").iterdir()
+    )
+    digest = hashlib.sha256()
+    for path in sorted(sources, key=lambda path: path.relative_to(WEB).as_posix()):
+        digest.update(f"{path.relative_to(WEB).as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    files = page_files()
+    assert digest.hexdigest() in files["/viewer.js"][1][:200].decode(), "run `make viewer`"
+    assert files["/"][1] == (WEB / "src" / "index.html").read_bytes(), "run `make viewer`"
+    assert files["/viewer.css"][1] == (WEB / "src" / "viewer.css").read_bytes(), "run `make viewer`"
+
+
+def test_the_lock_file_names_no_registry_and_the_packages_exact_versions() -> None:
+    if not WEB.is_dir():
+        pytest.skip("web/ is not here: this is no checkout")
+    assert "http" not in (WEB / "package-lock.json").read_text(encoding="utf-8")
+    wanted = json.loads((WEB / "package.json").read_text(encoding="utf-8"))["devDependencies"]
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in wanted.values())
+
+
+def test_licences_travel_with_the_page() -> None:
+    files = page_files()
+    for package in ("three", "@sparkjsdev/spark", "fflate"):
+        for name in ("/licenses.txt", "/viewer.js"):
+            assert f"\n{package} " in files[name][1][:8000].decode()
+    assert {kind for kind, _ in files.values()} == {
+        f"text/{kind}; charset=utf-8" for kind in ("html", "javascript", "css", "plain")
+    }
+
+
+def test_a_name_cannot_break_out_of_the_single_file() -> None:
+    page = single_html(page_of_box(EVIL))
+    assert EVIL[:9].encode() + b"<b>" not in page
+    inside = re.search(rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page)
+    assert inside is not None
+    assert json.loads(inside[1])["description"]["name"] == EVIL
+    assert page == single_html(page_of_box(EVIL))
+
+
+def test_the_single_file_allows_its_own_script_and_style_alone() -> None:
+    page = single_html(page_of_box()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
+    assert policy is not None
+    assert policy[1].startswith("default-src 'none';")
+    assert "unsafe-inline" not in policy[1]
+    for element, kind in (("script", "text/javascript"), ("style", "text/css")):
+        texts = re.findall(rf"<{element}>(.*?)</{element}>", page, re.DOTALL)
+        assert len(texts) == 1, kind
+        digest = base64.b64encode(hashlib.sha256(texts[0].encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy[1]
+
+
+# In a browser.
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("there is no Chromium")
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is missing: pip install '.[dev]'")
+    with api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=chromium, args=[*FLAGS])
+        yield browser
+        browser.close()
+
+
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """A page, and what it said and asked for."""
+
+    page: Any
+    said: list[str]
+    asked: list[str]
+
+
+def opened(browser: Any, url: str, script: str | None = None) -> Opened:
+    context = browser.new_context(viewport={"width": 740, "height": 490}, reduced_motion="reduce")
+    page = context.new_page()
+    page.set_default_timeout(120_000)  # software draws slowly on a busy machine
+    found = Opened(page, [], [])
+    page.on("console", lambda message: found.said.append(message.text))
+    page.on("pageerror", lambda error: found.said.append(str(error)))
+    page.on("request", lambda request: found.asked.append(request.url))
+    if script is not None:
+        page.add_init_script(script)
+    page.goto(url)
+    return found
+
+
+@pytest.fixture(scope="module")
+def shown(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+    """The single file, opened from the disk."""
+    file = tmp_path_factory.mktemp("page") / "box.html"
+    file.write_bytes(single_html(page_of_box()))
+    found = opened(browser, file.as_uri())
+    found.page.evaluate("spackle.ready")
+    yield found
+    found.page.context.close()
+
+
+@pytest.fixture
+def page(shown: Opened) -> Any:
+    """The same page as it was at first."""
+    first = "spackle.setCompare(null), spackle.setHeat(false), spackle.setLayers('both'), spackle.setView(...view)"
+    shown.page.evaluate(f"(view) => Promise.all([{first}])", list(VIEW))
+    return shown.page
+
+
+def pixels(png: bytes) -> Tensor:
+    """[H, W, 3] in 0..1."""
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"))).float() / 255
+
+
+def picture(page: Any, width: int, height: int) -> Tensor:
+    url: str = page.evaluate("([width, height]) => spackle.picture(width, height)", [width, height])
+    return pixels(base64.b64decode(url.partition(",")[2]))
+
+
+def canvas(page: Any) -> Tensor:
+    """What is on the screen where the canvas is."""
+    page.evaluate("spackle.settled()")
+    return pixels(page.locator("#view").screenshot())
+
+
+def camera_of(page: Any, width: int, height: int) -> Camera:
+    """Ours, where the page's eye is."""
+    eye = torch.tensor(page.evaluate("spackle.pose().eye"))
+    focus = torch.tensor([0.0, 0.0, DepthRange.of(box().base).focus])
+    return box().camera.resized(width, height).looking(eye, focus)
+
+
+def hole_and_rest(page: Any, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """[H, W] bool each: surely in the base's hole, and surely outside of it and of the rounded corners."""
+    alpha = CPU.render(box().base, camera_of(page, width, height)).alpha[None, None]
+    pool: Callable[[Tensor], Tensor] = lambda x: torch.nn.functional.max_pool2d(x, 9, 1, 4)[0, 0]  # noqa: E731
+    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside[12:-12, 12:-12] = True
+    hole, rest = (pool(alpha) < 0.5) & inside, (pool(1 - alpha) < 0.02) & inside
+    assert hole.float().mean() > 0.03
+    assert rest.float().mean() > 0.3
+    return hole, rest
+
+
+def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> None:
+    assert shown.said == []
+    assert [url.partition(":")[0] for url in shown.asked if not url.startswith("blob:")] == ["file"]
+    assert shown.page.title() == "Box · Spackle"
+    assert shown.page.locator("#facts").inner_text() == f"{len(box().base) + len(box().aux):,} Gaussians"
+    assert shown.page.locator("#open").is_hidden()
+    assert shown.page.locator("#notice").is_hidden()
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind) -> None:
+    cameras = trajectory(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
+    places = [0, 17, 60, 61, 103, 120]
+    eyes = page.evaluate("([kind, places]) => places.map((k) => spackle.eye(kind, 0.45, k / 120))", [kind, places])
+    for k, eye in zip(places, eyes, strict=True):
+        np.testing.assert_allclose(eye, cameras[k].position.numpy(), atol=2e-6)
+    page.evaluate("(kind) => spackle.setView(kind, 0.45, 17 / 120)", kind)
+    axes = page.evaluate("spackle.pose().axes")
+    np.testing.assert_allclose(axes, cameras[17].world_to_camera[:3, :3].numpy(), atol=2e-6)
+
+
+@pytest.mark.parametrize("disparity", [0.0, 0.3])
+def test_the_page_shows_what_our_renderer_shows(page: Any, disparity: float) -> None:
+    page.evaluate("(disparity) => spackle.setView('swipe', disparity, 1)", disparity)
+    ours = CPU.render(box().gaussians, camera_of(page, 256, 192)).rgb
+    assert psnr(picture(page, 256, 192), ours) > 50
+
+
+def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> None:
+    page.evaluate("spackle.setView('swipe', 0.05, 1)")
+    page.locator("#disparity").fill("0.3")
+    assert page.evaluate("spackle.pose().eye") == pytest.approx(page.evaluate("spackle.eye('swipe', 0.3, 1)"))
+    filled = canvas(page)
+    page.get_by_role("button", name="Base", exact=True).click(force=True)
+    base = canvas(page)
+    hole, rest = hole_and_rest(page, *base.shape[:2])
+    change = (filled - base).abs().amax(dim=-1)
+    assert float(change[hole].quantile(0.05)) > 0.3
+    assert float(change[rest].max()) < 0.04  # where the base lets 2 % through, no more
+    assert float(change[rest].mean()) < 0.002
+    assert float(base[hole].mean()) < 0.1
+
+
+def test_the_heat_map_glows_in_the_hole_alone(page: Any) -> None:
+    before = canvas(page)
+    page.evaluate("spackle.setHeat(true)")
+    after = canvas(page)
+    hole, rest = hole_and_rest(page, *after.shape[:2])
+    rest[-50:, :220] = False  # the legend
+    change = (after - before).abs().amax(dim=-1)
+    assert float(change[rest].max()) <= 2.5 / 255
+    glow = after[hole].mean(dim=0)
+    assert glow[0] > 0.7 > 0.45 > glow[1]
+    assert float(change[hole].quantile(0.05)) > 0.2
+
+
+def test_the_divider_stands_between_base_and_spackle(page: Any) -> None:
+    both = picture(page, 128, 96)
+    page.evaluate("spackle.setLayers('base')")
+    base = picture(page, 128, 96)
+    page.evaluate("spackle.setLayers('both')")
+    page.evaluate("spackle.setCompare(0.25)")
+    divided = picture(page, 128, 96)
+    torch.testing.assert_close(divided[:, :32], base[:, :32], rtol=0, atol=1.5 / 255)
+    torch.testing.assert_close(divided[:, 32:], both[:, 32:], rtol=0, atol=1.5 / 255)
+    divider = page.get_by_role("slider", name="Where the base ends and Spackle begins")
+    divider.press("ArrowRight")
+    assert divider.get_attribute("aria-valuenow") == "27"
+
+
+def test_hand_and_keys_move_the_eye_within_the_limit(page: Any) -> None:
+    view = page.locator("#view")
+    page.evaluate("spackle.setView('swipe', 0, 1)")
+    middle = view.bounding_box()
+    x, y = middle["x"] + middle["width"] / 2, middle["y"] + middle["height"] / 2
+    unit = page.evaluate("spackle.description.orbit.unit")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 0.2 * middle["width"], y)
+    assert page.evaluate("spackle.pose().eye[0]") == pytest.approx(0.32 * unit, rel=0.03)
+    page.mouse.move(x - 5000, y)
+    page.mouse.up()
+    assert 0.95 * unit < page.evaluate("spackle.pose().eye[0]") <= 1.0001 * unit
+    view.press("0")
+    assert page.evaluate("spackle.pose().eye") == [0, 0, 0]
+    view.press("ArrowDown")
+    assert page.evaluate("spackle.pose().eye") == pytest.approx([0, 0.05 * unit, 0])
+
+
+def test_a_picture_is_saved_at_the_photo_s_size_or_more(page: Any) -> None:
+    with page.expect_download() as download:
+        page.locator("#shot").dispatch_event("click")
+    assert download.value.suggested_filename == "Box.png"
+    saved = pixels(Path(download.value.path()).read_bytes())
+    ours = CPU.render(box().gaussians, camera_of(page, saved.shape[1], saved.shape[0])).rgb
+    assert saved.shape[1] >= box().camera.width
+    assert psnr(saved, ours) > 45
+
+
+def test_nothing_was_said_through_all_of_this(shown: Opened) -> None:
+    assert shown.said == []
+
+
+def test_without_webgl_2_the_page_says_so(browser: Any, tmp_path: Path) -> None:
+    file = tmp_path / "box.html"
+    file.write_bytes(single_html(page_of_box()))
+    script = """const get = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+      return kind.startsWith("webgl") ? null : get.call(this, kind, ...rest);
+    };"""
+    found = opened(browser, file.as_uri(), script)
+    assert "needs WebGL 2" in found.page.locator("#notice").inner_text()
+    found.page.context.close()
+
+
+def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:
+    photo = tmp_path / "my photo.png"
+    save_png(torch.rand(8, 8, 3), photo)
+
+    def complete_photo(path: Path, name: str, tell: Callable[[dict[str, object]], None]) -> PageScene:
+        tell({"stage": "complete", "done": 1, "total": 2})
+        return page_of_box(name)
+
+    with ViewerServer(page_files(), complete_photo) as server:
+        server.show(page_of_box("First"))
+        found = opened(browser, server.url)
+        found.page.evaluate("spackle.ready")
+        assert found.page.title() == "First · Spackle"
+        found.page.locator("#file").set_input_files(photo)
+        found.page.get_by_role("heading", name="my photo.png").wait_for()
+        found.page.evaluate("spackle.settled()")
+        assert found.said == []
+        assert all(url.startswith((server.url, f"blob:{server.url}")) for url in found.asked)
+        found.page.context.close()

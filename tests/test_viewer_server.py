@@ -1,0 +1,336 @@
+"""The viewer's server as browsers, strangers and broken clients meet it, each over a real socket of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import http.client
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from photos import write_photo
+from viewer_client import (
+    PAGES,
+    QUICK,
+    SECRET,
+    a_scene,
+    answer_of,
+    ask,
+    complete,
+    dial,
+    eventually,
+    get,
+    raw,
+    send,
+    serving,
+)
+
+from spackle.errors import InputError
+from spackle.viewer.events import Tell
+from spackle.viewer.patience import PatientReader
+from spackle.viewer.scene import PageScene
+from spackle.viewer.server import ViewerServer
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ViewerServer]:
+    """One that nobody sends photos to."""
+    with serving() as server:
+        server.show(a_scene())
+        yield server
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return write_photo(tmp_path_factory.mktemp("photo") / "photo.png").read_bytes()
+
+
+# What a page asks for
+
+
+def test_the_page_and_the_scene_are_there(server: ViewerServer) -> None:
+    page = ask(server)
+    assert (page.status, page.body, page.headers["Content-Type"]) == (200, b"<p>page", "text/html; charset=utf-8")
+    state = ask(server, "/scene.json").json
+    assert state["job"] is None
+    assert ".jpg" in state["upload"]["suffixes"]
+    assert state["upload"]["max_bytes"] == QUICK.upload_bytes
+    description = ask(server, state["scene"]).json
+    assert description == a_scene().description
+    layer = ask(server, state["scene"].replace(".json", "/") + description["layers"][0]["file"])
+    assert (layer.body, layer.headers["Content-Type"]) == (b"layer", "application/octet-stream")
+
+
+def test_every_answer_says_what_a_browser_may_do_with_it(server: ViewerServer) -> None:
+    for reply in (ask(server), ask(server, "/none"), ask(server, "/", "PUT"), ask(server, "/", Host="evil.example")):
+        assert reply.headers["X-Content-Type-Options"] == "nosniff"
+        assert reply.headers["Referrer-Policy"] == "no-referrer"
+        assert reply.headers["Cache-Control"] == "no-store"
+        assert reply.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        policy = reply.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert "unsafe-inline" not in policy
+        assert "*" not in policy
+        assert reply.headers["Server"] == "spackle"  # no versions
+        assert "Access-Control-Allow-Origin" not in reply.headers
+
+
+def test_head_is_get_without_the_body(server: ViewerServer) -> None:
+    for path in ("/", "/scene.json", "/scenes/1/base.bin", "/none"):
+        head, whole = ask(server, path, "HEAD"), ask(server, path)
+        assert head.body == b""
+        assert (head.status, head.headers["Content-Length"]) == (whole.status, whole.headers["Content-Length"])
+
+
+def test_one_connection_serves_many_requests(server: ViewerServer) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
+    with contextlib.closing(connection):
+        connection.connect()
+        first = connection.sock
+        for path in ("/", "/none", "/scene.json"):
+            connection.request("GET", path)
+            connection.getresponse().read()
+            assert connection.sock is first
+
+
+def test_a_silent_connection_is_closed(server: ViewerServer) -> None:
+    with dial(server) as silent, dial(server, b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ") as dripping:
+        start = time.monotonic()
+        with contextlib.suppress(OSError):
+            for _ in range(30):  # a byte now and then keeps nothing open
+                dripping.sendall(b"a")
+                time.sleep(0.05)
+        assert answer_of(silent) == b""
+        assert answer_of(dripping) == b""
+        assert time.monotonic() - start < 3
+
+
+def test_old_scenes_make_room() -> None:
+    with serving() as server:
+        paths = [server.show(a_scene(str(k))) for k in range(3)]
+        assert [ask(server, path).status for path in paths] == [404, 200, 200]
+        assert ask(server, "/scenes/1/base.bin").status == 404
+        assert ask(server, "/scene.json").json["scene"] == paths[-1]
+
+
+# What nobody gets
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        *("/none", "/index.html", "/scenes/", "/scenes/1", "/scenes/2.json", "/scenes/1/", "/jobs/1/events"),
+        *("/../../../../etc/passwd", "/scenes/1/../../../../../etc/passwd", "/scenes/1/..%2f..%2fetc%2fpasswd"),
+        *("/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "/%252e%252e%252fetc%252fpasswd", "//etc/passwd", "///etc/passwd"),
+        *("/..\\..\\..\\etc\\passwd", "/..%5c..%5cetc%5cpasswd", "\\etc\\passwd", "/viewer.js/../../etc/passwd"),
+        *("/viewer.js%00", "/viewer.js/", "/VIEWER.JS", "/./viewer.js", "/%76iewer.js", "/..%c0%af..%c0%afetc/passwd"),
+        *("http://localhost/etc/passwd", "http://evil.example/", "file:///etc/passwd", "etc/passwd", "*", "/é"),
+    ],
+)
+def test_nothing_but_the_table_is_served(server: ViewerServer, target: str) -> None:
+    answer = raw(server, get(target))
+    head, _, body = answer.partition(b"\r\n\r\n")
+    assert head.split()[1] == b"404", answer
+    assert SECRET.encode() not in body
+    assert set(json.loads(body)) == {"error"}
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "FOO"])
+def test_other_methods_are_refused(server: ViewerServer, method: str) -> None:
+    reply = ask(server, "/", method)
+    assert reply.status == 501
+    assert "error" in reply.json
+
+
+def test_posts_go_to_one_place(server: ViewerServer, photo: bytes) -> None:
+    for path in ("/", "/scene.json", "/photos/", "/photos/1", "//photos/"):
+        assert ask(server, path, "POST", photo).status == 404
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("evil.example", "evil.example:80", "localhost.evil.example", "127.0.0.1.evil.example", "10.0.0.7", ""),
+        *("localhost:x", "localhost@evil.example", "[::1", "0.0.0.0", "localhost evil.example"),
+    ],
+)
+def test_a_foreign_host_is_refused(server: ViewerServer, host: str, photo: bytes) -> None:
+    assert raw(server, get("/", host=host)).split()[1] == b"403"
+    assert send(server, photo, Host=host).status == 403
+
+
+def test_a_request_has_one_host(server: ViewerServer) -> None:
+    assert raw(server, b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n").split()[1] == b"403"
+    assert raw(server, get("/", "Host: evil.example")).split()[1] == b"403"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST:9", "localhost:9000", "[::1]:9000", "127.0.0.2"])
+def test_names_of_this_machine_are_ours_at_any_port(server: ViewerServer, host: str) -> None:
+    assert raw(server, get("/", host=host)).split()[1] == b"200"
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:1", "http://127.0.0.1", ""])
+def test_a_foreign_page_is_refused(server: ViewerServer, origin: str, photo: bytes) -> None:
+    assert send(server, photo, Origin=origin).status == 403
+    assert ask(server, Origin=origin).status == 403
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_a_browser_tells_who_asks(server: ViewerServer, site: str, photo: bytes) -> None:
+    assert send(server, photo, Sec_Fetch_Site=site).status == 403
+    assert ask(server, Sec_Fetch_Site=site).status == 403
+
+
+def test_open_to_the_network_its_names_are_more_but_not_all() -> None:
+    with serving(host="0.0.0.0") as server:
+        assert not server.local
+        assert server.url == f"http://127.0.0.1:{server.port}/"
+        named = {"10.0.0.7:80": b"200", socket.gethostname(): b"200", "evil.example": b"403"}
+        for host, status in named.items():
+            assert raw(server, get("/", host=host)).split()[1] == status
+
+
+# Clients that do not know how
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", b"400"),  # TLS
+        (b"GET\r\n\r\n", b"400"),
+        (b"GET / HTTP/1.1 and more\r\n\r\n", b"400"),
+        (b"GET / HTTP/x.y\r\n\r\n", b"400"),
+        (b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n", b"505"),
+        (b"GET /\r\n\r\n", b"505"),
+        (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"505"),
+        (b"GET /" + 70_000 * b"a" + b" HTTP/1.1\r\n\r\n", b"414"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + 70_000 * b"a" + b"\r\n\r\n", b"431"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\n" + 200 * b"X: a\r\n" + b"\r\n", b"431"),
+        (b"\x00\xff\xfe\x1b[31m\r\n\r\n", b"400"),
+    ],
+)
+def test_malformed_requests_get_a_plain_answer(server: ViewerServer, data: bytes, status: bytes) -> None:
+    answer = raw(server, data)
+    assert answer.split()[1] == status, answer
+    assert set(json.loads(answer.partition(b"\r\n\r\n")[2])) == {"error"}
+    assert ask(server).status == 200
+
+
+@pytest.mark.parametrize(
+    "key", ["", "Sec-WebSocket-Key: dGhl\r\nSec-WebSocket-Version: 13\r\n", "Sec-WebSocket-Key: \r\n"]
+)
+def test_there_is_no_websocket(server: ViewerServer, key: str) -> None:
+    upgrade = f"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n".encode()
+    answer = raw(server, upgrade + b"\x81\x85\x37\xfa\x21\x3d\x7f\x9f\x4d\x51\x58")
+    assert answer.split()[1] == b"200"
+    assert answer.count(b"HTTP/1.1") == 1  # what follows is no request
+    assert ask(server).status == 200
+
+
+def test_a_body_of_a_get_is_no_second_request(server: ViewerServer) -> None:
+    smuggled = get("/none")
+    data = f"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(smuggled)}\r\n\r\n".encode() + smuggled
+    assert raw(server, data).count(b"HTTP/1.1") == 1
+
+
+def test_a_client_that_never_reads_is_left() -> None:
+    content = bytes(30_000_000)  # more than the socket's buffers hold
+    with serving(limits=dataclasses.replace(QUICK, connections=1)) as server:
+        server.show(a_scene(content=content))
+        with dial(server, get("/scenes/1/base.bin")) as silent:  # it has the only place
+            silent.recv(12)
+            eventually(lambda: raw(server, get("/"))[9:12] == b"200")
+            assert len(answer_of(silent)) < len(content)
+        eventually(lambda: len(ask(server, "/scenes/1/base.bin").body) == len(content))
+
+
+def test_connections_are_counted() -> None:
+    with serving(limits=dataclasses.replace(QUICK, connections=3, request=5)) as server:
+        waiting = [dial(server) for _ in range(3)]
+        eventually(lambda: raw(server, get("/"))[9:12] == b"503")
+        for connection in waiting:
+            connection.close()
+        eventually(lambda: raw(server, get("/"))[9:12] == b"200")
+
+
+# The end
+
+
+def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: bytes) -> None:
+    reached = threading.Event()
+
+    def endless(path: Path, name: str, tell: Tell) -> PageScene:
+        while True:
+            tell({"stage": "base", "done": 0, "total": 0})
+            reached.set()
+            time.sleep(0.01)
+
+    with serving(endless) as server:
+        job = send(server, photo).json["job"]
+        assert reached.wait(3)
+        folder = Path(server.uploads.name)
+        with dial(server, get(f"{job}/events")) as listener:
+            listener.recv(12)
+            start = time.monotonic()
+            assert server.close()
+            assert time.monotonic() - start < 1.5
+            assert answer_of(listener).endswith(b'data: {"error": "the viewer has been stopped"}\n\n')
+        assert not folder.exists()
+        with pytest.raises(OSError, match="refused"):
+            dial(server)
+
+
+def test_a_job_that_cannot_be_interrupted_does_not_hold_up_the_end() -> None:
+    go_on = threading.Event()
+
+    def deaf(tell: Tell) -> PageScene:
+        go_on.wait(10)
+        return a_scene()
+
+    server = ViewerServer(PAGES, complete, limits=QUICK)
+    server.start()
+    server.work(deaf)
+    start = time.monotonic()
+    assert not server.close()
+    assert time.monotonic() - start < 1.5
+    go_on.set()
+
+
+def test_a_port_that_is_taken_is_one_line(server: ViewerServer) -> None:
+    with pytest.raises(InputError, match=f"--port {server.port}: cannot listen at 127.0.0.1: Address already in use"):
+        ViewerServer(PAGES, complete, port=server.port)
+    for wrong in (-1, 65536):
+        with pytest.raises(InputError, match="must lie between"):
+            ViewerServer(PAGES, complete, port=wrong)
+    with pytest.raises(InputError, match=r"--host no\.such\.host\.invalid: no address"):
+        ViewerServer(PAGES, complete, host="no.such.host.invalid")
+
+
+def test_the_log_cannot_play_with_a_terminal(server: ViewerServer) -> None:
+    lines: list[str] = []
+    with serving(log=lines.append) as server:
+        raw(server, get("/\x1b[31m\x07", host="localhost"))
+        eventually(lambda: lines)
+    assert all(line.isprintable() for line in lines), lines
+
+
+def test_patience_is_for_the_whole_too() -> None:
+    one, other = socket.socketpair()
+    with one, other:
+        reader = PatientReader(one)
+        reader.allow(60, 0.1)
+        with pytest.raises(TimeoutError):
+            reader.read(1)
+        reader.allow(1, 1)
+        other.sendall(b"a")
+        assert reader.read(1) == b"a"
+        reader.allow(1, 0)
+        other.sendall(b"b")
+        with pytest.raises(TimeoutError):
+            reader.read(1)

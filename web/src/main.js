@@ -1,0 +1,179 @@
+// Starts the page: finds a scene, shows it, and takes further photos where there is a server.
+import { control } from "./controls.js";
+import { divider, fit, panel } from "./panel.js";
+import * as source from "./source.js";
+import { KINDS, Viewer } from "./viewer.js";
+import { eyeOnPath, lookingAxes } from "./views.js";
+
+const STAGES = {
+  load: "Loading", base: "Finding depth", complete: "Filling what the photo hides", page: "Almost there",
+};
+const element = (id) => document.getElementById(id);
+const viewer = started();
+let upload = null; // what the server takes, where there is one
+let working = false;
+
+if (viewer) {
+  control(viewer.canvas, viewer);
+  panel(viewer, say);
+  divider(viewer);
+  uploads();
+  const ready = first();
+  ready.catch((error) => notice("Nothing to show", error.message));
+  window.spackle = scripting(ready);
+}
+
+function started() {
+  element("bar").classList.add("idle");
+  const canvas = element("view");
+  try {
+    canvas.addEventListener("webglcontextlost", () => notice("The graphics stopped", "Reload the page to go on."));
+    return new Viewer(canvas);
+  } catch (error) {
+    const missing = !document.createElement("canvas").getContext("webgl2");
+    notice("This page needs WebGL 2", missing ? "Your browser does not offer it here: another browser, or hardware acceleration in its settings, will help." : error.message);
+    return null;
+  }
+}
+
+async function first() {
+  const own = await source.embedded();
+  if (own) return show(own);
+  const state = await source.current();
+  upload = state.upload;
+  element("open").hidden = !upload;
+  if (upload) element("file").accept = upload.suffixes.join(",");
+  if (state.scene) await show(await source.load(state.scene, (share) => progress("load", share)));
+  if (state.job) await watch(state.job);
+  else if (!state.scene) notice("Spackle", "Open a photo, or drop one here, to look around in it.");
+}
+
+async function show({ description, layers }) {
+  viewer.show(description, layers);
+  element("name").textContent = description.name;
+  document.title = `${description.name} · Spackle`;
+  element("frame").hidden = false;
+  element("frame").classList.add("waiting");
+  element("bar").classList.remove("idle");
+  fit(viewer);
+  await viewer.stage.settled();
+  element("frame").classList.remove("waiting");
+  element("notice").hidden = true;
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
+}
+
+/** Follow a job to its scene. */
+async function watch(job) {
+  working = true;
+  viewer.playing = false; // the processor is needed elsewhere
+  progress(null, null);
+  try {
+    const url = await source.follow(job, ({ stage, done, total, line }) => {
+      if (stage) progress(stage, total ? done / total : null);
+      else element("notice").querySelector("p").textContent = line;
+    });
+    await show(await source.load(url, (share) => progress("load", share)));
+  } catch (error) {
+    failed(error);
+  }
+  working = false;
+}
+
+async function open(photo) {
+  if (!photo || working) return;
+  const suffix = /\.[^.]*$/.exec(photo.name.toLowerCase())?.[0] ?? "";
+  if (!upload.suffixes.includes(suffix)) return say(`${photo.name}: not a photo; it takes ${upload.suffixes.join(", ")}`);
+  if (photo.size > upload.max_bytes) return say(`${photo.name} is larger than ${Math.floor(upload.max_bytes / 2 ** 20)} MB`);
+  working = true;
+  progress(null, null);
+  try {
+    await watch(await source.send(photo));
+  } catch (error) {
+    failed(error);
+  }
+  working = false;
+}
+
+function uploads() {
+  const file = element("file");
+  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = () => file.click();
+  file.onchange = () => {
+    open(file.files[0]);
+    file.value = "";
+  };
+  const holdsFile = (event) => upload && !working && event.dataTransfer?.types.includes("Files");
+  addEventListener("dragover", (event) => {
+    event.preventDefault();
+    if (holdsFile(event)) document.body.classList.add("dropping");
+  });
+  addEventListener("dragleave", (event) => event.relatedTarget || document.body.classList.remove("dropping"));
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("dropping");
+    if (holdsFile(event)) open(event.dataTransfer.files[0]);
+  });
+}
+
+function notice(title, text, busy = false) {
+  const box = element("notice");
+  box.hidden = false;
+  box.classList.toggle("busy", busy);
+  box.classList.toggle("may-open", !busy && Boolean(upload));
+  box.querySelector("h2").textContent = title;
+  box.querySelector("p").textContent = text;
+}
+
+/** `share` in 0..1, or null where nobody knows. */
+function progress(stage, share) {
+  const box = element("notice");
+  const line = box.classList.contains("busy") ? box.querySelector("p").textContent : "";
+  notice(STAGES[stage] ?? stage ?? "Working on your photo", line, true);
+  const bar = element("notice").querySelector("progress");
+  if (share === null) bar.removeAttribute("value");
+  else bar.value = share;
+}
+
+function failed(error) {
+  if (viewer.description) {
+    element("notice").hidden = true;
+    say(error.message);
+  } else {
+    notice("That did not work", error.message);
+  }
+}
+
+function say(text) {
+  const toast = element("toast");
+  clearTimeout(say.timer);
+  toast.classList.toggle("shown", Boolean(text));
+  if (!text) return;
+  toast.textContent = text;
+  say.timer = setTimeout(() => toast.classList.remove("shown"), 6000);
+}
+
+/** For tests and for scripts in the console. Everything that changes the view resolves when it is drawn. */
+function scripting(ready) {
+  const drawn = (change) => {
+    change();
+    viewer.drawnElsewhere();
+    return viewer.stage.settled();
+  };
+  return {
+    ready, // resolves when the first scene is drawn
+    kinds: KINDS,
+    get description() {
+      return viewer.description;
+    },
+    /** Eye [x, y, z] in metres at t in 0..1 of a path. */
+    eye: (kind, disparity, t) => eyeOnPath(viewer.description, kind, disparity, t),
+    /** Where the eye is, and the rows right, down, forward of the camera's rotation. */
+    pose: () => ({ eye: viewer.stage.eye, axes: lookingAxes(viewer.stage.eye, viewer.description.focus) }),
+    setView: (kind, disparity, t) => drawn(() => viewer.setView(kind, disparity, t)),
+    setLayers: (layers) => drawn(() => viewer.setLayers(layers)), // base, aux or both
+    setHeat: (on) => drawn(() => viewer.setHeat(on)),
+    setCompare: (split) => drawn(() => viewer.setCompare(split)), // the base's share of the width, or null
+    settled: () => viewer.stage.settled(),
+    /** The view as the URL of a PNG of this size. */
+    picture: async (width, height) => (await viewer.stage.picture(width, height)).toDataURL(),
+  };
+}

@@ -1,0 +1,124 @@
+// The bar below the picture, what stands beside it, and the size of the picture.
+import { recorder, savePicture } from "./save.js";
+
+const MOST_CROP = 0.62; // of the photo's width, or height, that a window of another shape still shows
+const element = (id) => document.getElementById(id);
+
+export function panel(viewer, say) {
+  const slider = element("disparity");
+  const paths = [...element("paths").children];
+  const layers = [...element("layers").children];
+  const record = recorder(viewer);
+
+  element("play").onclick = () => (viewer.playing ? viewer.pause() : viewer.play());
+  slider.oninput = () => viewer.setDisparity(slider.valueAsNumber);
+  for (const button of paths) {
+    const { kind } = button.dataset;
+    button.onclick = () => (viewer.playing && viewer.onPath && viewer.kind === kind ? viewer.pause() : viewer.play(kind));
+  }
+  for (const button of layers) {
+    button.onclick = () => {
+      viewer.setCompare(null);
+      viewer.setLayers(button.dataset.layers);
+    };
+  }
+  element("heat").onclick = () => viewer.setHeat(!viewer.stage.heat);
+  element("compare").onclick = () => viewer.setCompare(viewer.stage.split === null ? 0.5 : null);
+  element("shot").onclick = () => savePicture(viewer).catch((error) => say(`The picture was not saved: ${error.message}`));
+  element("record").hidden = !record;
+  element("record").onclick = async () => {
+    if (pressed("record")) return viewer.pause();
+    press("record", true);
+    await record((share) => say(`Recording: ${Math.round(100 * share)} %`)).catch((error) => say(`No video: ${error.message}`));
+    press("record", false);
+    say("");
+  };
+  element("more").onclick = () => {
+    const open = element("bar").classList.toggle("open");
+    element("more").setAttribute("aria-expanded", open);
+  };
+
+  viewer.addEventListener("change", update);
+  viewer.addEventListener("turn", () => !viewer.onPath || showDisparity());
+  viewer.addEventListener("drawn", facts);
+  new ResizeObserver(() => fit(viewer)).observe(element("area"));
+
+  function update() {
+    const { stage, description } = viewer;
+    const play = element("play");
+    play.classList.toggle("on", viewer.playing);
+    play.setAttribute("aria-label", viewer.playing ? "Pause" : "Play");
+    for (const button of paths) button.setAttribute("aria-pressed", viewer.onPath && button.dataset.kind === viewer.kind);
+    const added = description.layers.some(({ name, count }) => name === "aux" && count);
+    for (const button of layers) {
+      button.setAttribute("aria-pressed", stage.split === null && button.dataset.layers === stage.layers);
+      button.disabled = !added;
+    }
+    element("compare").disabled = !added;
+    press("heat", stage.heat);
+    press("compare", stage.split !== null);
+    element("frame").classList.toggle("heat", stage.heat);
+    showDisparity();
+  }
+
+  function showDisparity() {
+    if (document.activeElement !== slider || !viewer.onPath) slider.value = viewer.disparity;
+    const shown = viewer.disparity.toFixed(2);
+    slider.style.setProperty("--at", `${100 * viewer.disparity}%`);
+    slider.setAttribute("aria-valuetext", `disparity ${shown}`);
+    document.querySelector("output[for=disparity]").value = shown;
+  }
+
+  function facts() {
+    const count = viewer.description.layers.reduce((sum, layer) => sum + layer.count, 0);
+    const speed = viewer.playing && viewer.fps ? ` · ${viewer.fps.toFixed(viewer.fps < 10 ? 1 : 0)} fps` : "";
+    const text = `${count.toLocaleString("en")} Gaussians${speed}`;
+    if (element("facts").textContent !== text) element("facts").textContent = text;
+  }
+}
+
+/** The picture as large as there is room; a narrow window crops it a little, so that it is not a strip. */
+export function fit(viewer) {
+  if (!viewer.description) return;
+  const { clientWidth: width, clientHeight: height } = element("area");
+  const { width: W, height: H } = viewer.description.camera;
+  const shape = Math.min(Math.max(width / height, Math.min(W / H, Math.max((MOST_CROP * W) / H, 0.5))), W / H);
+  const frame = element("frame");
+  const w = Math.min(width, height * shape);
+  frame.style.width = `${Math.floor(w)}px`;
+  frame.style.height = `${Math.floor(w / shape)}px`;
+  viewer.resize(Math.floor(w), Math.floor(w / shape));
+}
+
+/** The line between base and Spackle. */
+export function divider(viewer) {
+  const line = element("divider");
+  const frame = element("frame");
+  const move = (split) => viewer.setCompare(Math.min(Math.max(split, 0), 1));
+  line.addEventListener("pointerdown", (event) => line.setPointerCapture(event.pointerId));
+  line.addEventListener("pointermove", (event) => {
+    const box = frame.getBoundingClientRect();
+    if (line.hasPointerCapture(event.pointerId)) move((event.clientX - box.left) / box.width);
+  });
+  line.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -0.02, ArrowRight: 0.02, PageDown: -0.2, PageUp: 0.2, Home: -1, End: 1 }[event.key];
+    if (step === undefined) return;
+    event.preventDefault();
+    move(viewer.stage.split + step);
+  });
+  viewer.addEventListener("change", () => {
+    const { split } = viewer.stage;
+    frame.classList.toggle("compare", split !== null);
+    if (split === null) return;
+    line.style.left = `${100 * split}%`;
+    line.setAttribute("aria-valuenow", Math.round(100 * split));
+  });
+}
+
+function press(id, on) {
+  element(id).setAttribute("aria-pressed", on);
+}
+
+function pressed(id) {
+  return element(id).getAttribute("aria-pressed") === "true";
+}
