@@ -28,7 +28,7 @@ from urllib.request import Request
 
 import pytest
 from rich.console import Console
-from web import Site, serve
+from sites import Site, serve
 
 from spackle import cli
 from spackle.downloads import connect, partial
