@@ -6,8 +6,20 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from photos import metres, picture, write_depth, write_photo
 from PIL import Image
+from torch import Tensor
+
+
+def f32(values: object) -> NDArray[np.float32]:
+    return np.asarray(values, np.float32)
+
+
+def photo(rng: np.random.Generator) -> Tensor:
+    """[H, W, 3] always the same one."""
+    return torch.from_numpy(picture(96, 80)).float() / 255
 
 
 def write_data(place: Path) -> None:

@@ -43,7 +43,7 @@ def test_a_real_photo_comes_out_nearer_to_its_measured_depth_than_by_a_guess_wit
     seen = interpolate(seen[None, None], size=depth.shape, mode="bilinear", align_corners=False)[0, 0]
     found = score_depth(seen, depth, valid)
     for guess in (vertical_ramp(*depth.shape), torch.ones_like(depth)):
-        assert found.abs_rel < 0.95 * score_depth(guess, depth, valid).abs_rel
+        assert found.abs_rel < 0.9 * score_depth(guess, depth, valid).abs_rel
     assert found.delta > 0.8
 
 

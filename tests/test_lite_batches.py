@@ -12,16 +12,19 @@ import torch
 from lite_data import write_data
 from torch import nn
 
+from spackle.bases.lite.base import LiteBase
 from spackle.errors import InputError
 from spackle.training.ahead import Ahead
 from spackle.training.depth.augment import MINGLED_SCALE, Frame, mingled
 from spackle.training.depth.files import LiteFiles
 from spackle.training.depth.frames import Measured
+from spackle.training.depth.guessed import GuessedPhotos, sure_inverse_depth
 from spackle.training.depth.judging import DepthJudge
 from spackle.training.depth.losses import DepthLossWeights
 from spackle.training.depth.method import LiteMethod
 from spackle.training.depth.mixture import Kept, Mixture
 from spackle.training.depth.recipe import LiteData
+from spackle.training.depth.right import seen_from_the_right
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import RgbdFolder
 
@@ -53,8 +56,9 @@ def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     assert set(sizes) == {(64, 96), (96, 64)}
     assert 10 < sizes.count((96, 64)) < 30
     names = [mixture.name(step, 0) for step in range(300)]
-    assert 70 < sum("9" in name for name in names) < 130
+    assert 70 < sum(name.startswith("9") for name in names) < 130
     assert 70 < sum(" and " in name for name in names) < 140
+    assert any(name.startswith("9 and") and name != "9 and 9" for name in names)  # of two sources
 
 
 def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
@@ -107,6 +111,87 @@ def test_the_last_frames_of_a_folder_judge_and_the_others_teach(place: Path) -> 
     (near, far) = (file.read(480).inverse_depth for file in (files.rgbd[0], files.rgbd[4]))
     torch.testing.assert_close(near, 2 * far)
     assert float(near.max()) == pytest.approx(1.0)  # 1/m
+
+
+def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
+    """A near thing moves by 3 pixels and hides what is there; what it uncovers is not known."""
+    depth = torch.tensor([[8.0, 8.0, 8.0, 8.0, 2.0, 2.0, 8.0, 8.0]])
+    valid = torch.tensor([[True, True, True, True, True, True, True, False]])
+    seen, known = seen_from_the_right(depth, valid, -6 / depth + 0.75)  # 0, and 2.25 to the left
+    assert known.tolist() == [[True, True, True, True, False, False, True, False]]
+    assert seen[known].tolist() == [8, 8, 2, 2, 8]
+    # A slope that is seen wider has a crack a pixel wide; with nothing in it, or what is behind, it is closed.
+    slope, shift = torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]), torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]])
+    for behind in (True, False):
+        seen, known = seen_from_the_right(slope, torch.tensor([[behind, True, True, True, True]]), shift)
+        assert known.tolist() == [[False, True, True, True, True]]
+        torch.testing.assert_close(seen[0, 1:], torch.tensor([2.0, 2.02, 2.04, 2.04]))
+
+
+def test_both_photos_of_a_pair_teach_and_the_left_one_judges(place: Path) -> None:
+    files = LiteFiles.of(LiteData(stereo=place / "pairs", validation_stereo=place / "others"))
+    assert [(file.path.name, file.right) for file in files.stereo] == [("one", False), ("one", True)]
+    assert [file.right for group in files.groups for file in group.files] == [False]
+    left, right = (file.read(480) for file in files.stereo)
+    near, far = sorted(left.inverse_depth.unique().tolist(), reverse=True)
+    assert sorted(right.inverse_depth[right.valid].unique().tolist(), reverse=True) == pytest.approx([near, far])
+    # 6 f b / z: the near part by 2 pixels, the far one by 1.
+    columns = torch.arange(64.0)
+    edges = [columns[(frame.inverse_depth > 0.9 * near).any(0)] for frame in (left, right)]
+    assert float(edges[0].max() - edges[1].max()) == 2
+    assert files.stereo[1].name == f"{place / 'pairs' / 'one'} (right)"
+
+
+def test_guesses_are_kept_where_the_looks_agree_and_are_not_steep() -> None:
+    looks = torch.zeros(3, 8, 12)
+    looks[:, :, 7:] += 1  # an outline
+    looks += torch.tensor([0.0, 5.0, -2.0])[:, None, None]  # each has a factor of its own
+    looks[0, 2, 2] += 0.4  # nobody knows
+    guess = sure_inverse_depth(looks)
+    known = guess > 0
+    assert not known[:, 6:8].any()
+    assert not known[2, 2]
+    assert known[:, 9:].all()
+    assert guess[known].log().round(decimals=4).unique().tolist() == [0, 1]
+
+
+def test_another_teacher_is_another_run_wherever_it_lies(place: Path, tmp_path: Path) -> None:
+    data = LiteData(photos=place / "photos", stereo=place / "pairs", validation_stereo=place / "others")
+    for name, content in (("one", b"1"), ("same", b"1"), ("two", b"2")):
+        (tmp_path / name).write_bytes(content)
+    teachers = [None, *(tmp_path / name for name in ("one", "same", "two"))]
+    none, one, same, two = (LiteFiles.of(dataclasses.replace(data, teacher=teacher)) for teacher in teachers)
+    assert one.digest == same.digest
+    assert len({files.digest for files in (none, one, two)}) == 3
+    assert (len(none.guessed), len(one.guessed)) == (0, 3)
+    fewer = LiteFiles.of(dataclasses.replace(data, teacher=tmp_path / "one", guesses=2))
+    assert [file.name for file in fewer.guessed] == [one.guessed[0].name, one.guessed[1].name]
+    assert len(fewer.photos) == 3
+
+
+def test_photos_come_with_what_a_teacher_guesses_of_them(place: Path, tmp_path: Path) -> None:
+    photos = sorted((place / "photos").rglob("*.*"))
+    source, said = GuessedPhotos(tmp_path / "guesses", photos), list[str]()
+    with pytest.raises(InputError, match="guesses are missing"):
+        source.draw(np.random.default_rng(0))
+    base = LiteBase.load(device="cpu")
+    source.fill(base, lambda done, total: None, said.append)
+    assert len(said) == 1
+    assert "broken.jpg" in said[0]
+    drawn = [source.draw(np.random.default_rng(seed)) for seed in range(20)]
+    assert {Path(name.removeprefix("guessed ")).name for name, _ in drawn} == {"a.png", "b.png"}
+    for name, frame in drawn:
+        assert frame.rgb.shape[1:] == frame.inverse_depth.shape == frame.valid.shape, name
+        assert float(frame.valid.float().mean()) > 0.3
+        assert torch.equal(frame.valid, frame.inverse_depth > 0)
+    files = sorted((tmp_path / "guesses").iterdir())
+    before = [file.stat().st_mtime_ns for file in files]
+    source.fill(base, lambda done, total: None, lambda line: None)
+    assert [file.stat().st_mtime_ns for file in files] == before
+    for file in files:
+        file.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="no guess, or damaged: delete it"):
+        source.draw(np.random.default_rng(0))
 
 
 def test_a_large_frame_is_reduced_and_its_depths_are_not_mixed(place: Path) -> None:

@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from lite_data import f32
 from numpy.typing import NDArray
-from photos import picture, write_photo
+from photos import picture
 from plain_trace import plain_trace
 from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, pad, relu6
 
 from spackle.bases.lite.network import STAGES, TAPS, Encoder
 from spackle.errors import InputError
-from spackle.training.depth import rooms
 from spackle.training.depth.augment import Frame, Turning, relit, turned
 from spackle.training.depth.encoder import load_encoder
 from spackle.training.depth.losses import DepthLossWeights, depth_loss
-from spackle.training.depth.made import MadeScenes
 from spackle.training.depth.pictures import VIRIDIS, colored
 from spackle.training.depth.raycast import BOX, CYLINDER, ELLIPSOID, SHEET, Solid, trace
-from spackle.training.depth.rooms import made_scene
 from spackle.training.depth.score import score_depth, vertical_ramp
 
 Floats = NDArray[np.float32]
-
-
-def f32(values: object) -> Floats:
-    return np.asarray(values, np.float32)
-
-
-def photo(rng: np.random.Generator) -> Tensor:
-    return torch.from_numpy(picture(96, 80)).float() / 255
 
 
 # Rays ---------------------------------------------------------------------------------------------
@@ -94,92 +83,6 @@ def test_a_wall_has_the_depth_that_it_has_and_a_box_throws_a_shadow_on_it() -> N
     assert colors[0].tolist() == pytest.approx([0.5, 0.5, 0.5])
 
 
-# Made scenes --------------------------------------------------------------------------------------
-
-
-def test_a_made_scene_has_the_inverse_depth_of_its_planes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plane's inverse depth is an affine function of the pixel, whatever the lens and however the camera rolls."""
-
-    def ground(rng: np.random.Generator) -> tuple[list[Solid], float]:
-        """1.5 m below the eye, before a wall at 16 m."""
-        flat = f32([[50, 0, 0], [0, 0, -1], [0, 50, 0]])
-        floor = Solid(SHEET, f32([0, 1.5, 0]), flat, 0, (1.0, 1.0))
-        return [floor, Solid(SHEET, f32([0, 0, 16]), f32(np.diag([50, 50, 1])), 1, (1.0, 1.0))], 0.0
-
-    for kind in rooms.KINDS:
-        monkeypatch.setattr(rooms, f"_{kind}", ground)
-    rgb, inverse_depth = made_scene(np.random.default_rng(3), photo, 64, 96)
-    assert (rgb.shape, inverse_depth.shape) == ((64, 96, 3), (64, 96))
-    assert 0 <= float(rgb.min()) < float(rgb.max()) <= 1
-    wall = (inverse_depth - 1 / 16).abs() < 1e-6
-    assert wall[0].all()
-    floor = ~wall
-    assert 0.1 < float(floor.float().mean()) < 0.5
-    assert (inverse_depth[floor] > 1 / 16).all()
-    rows, columns = (place.double() for place in floor.nonzero(as_tuple=True))
-    A = torch.stack([rows, columns, torch.ones_like(rows)], 1)
-    fitted = torch.linalg.lstsq(A, inverse_depth[floor].double()[:, None]).solution
-    torch.testing.assert_close((A @ fitted)[:, 0], inverse_depth[floor].double(), rtol=0, atol=1e-5)
-    # Its slope is one over eye height and focal length, which was drawn between 0.7 and 1.5 widths.
-    focal = 1 / (1.5 * float(fitted[:2].norm()))
-    assert 0.7 * 96 < focal < 1.5 * 96
-
-
-def test_the_same_numbers_make_the_same_scene_and_others_another() -> None:
-    one, same, other = (made_scene(np.random.default_rng([seed, 1]), photo, 64, 64) for seed in (0, 0, 1))
-    assert all(map(torch.equal, one, same))
-    assert not torch.equal(one[1], other[1])
-    assert all(torch.isfinite(part).all() and (part >= 0).all() for part in (*one, *other))
-
-
-def scenes(folder: Path, count: int) -> MadeScenes:
-    return MadeScenes(folder / "made", sorted((folder / "photos").iterdir()), (32, 64), 0, count)
-
-
-def filled(made: MadeScenes) -> list[str]:
-    """What was said while the scenes were made."""
-    said: list[str] = []
-    made.fill(lambda done, total: None, said.append)
-    return said
-
-
-def test_scenes_are_made_once_and_a_damaged_file_is_made_anew(tmp_path: Path) -> None:
-    write_photo(tmp_path / "photos" / "a.png")
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
-    made = scenes(tmp_path, 6)
-    said = filled(made)
-    assert len(said) == 1
-    assert said[0].startswith("passed over: ")
-    assert "broken.jpg" in said[0]
-    frames = [made.frame(index) for index in range(6)]
-    assert {tuple(frame.rgb.shape) for frame in frames} == {(3, 32, 64), (3, 64, 32)}
-    assert all(frame.inverse_depth.shape == frame.rgb.shape[1:] and frame.valid.all() for frame in frames)
-    (file,) = (tmp_path / "made").iterdir()
-    before, whole = file.stat().st_mtime_ns, file.read_bytes()
-    assert not filled(made)
-    assert file.stat().st_mtime_ns == before
-    for damage in (whole[:-100], b"nothing", whole.replace(b'"U8"', b'"I8"')[:50]):
-        file.write_bytes(damage)
-        with pytest.raises(InputError, match=r"0000\.safetensors: no made scenes, or damaged: delete it"):
-            made.frame(5)
-        assert f"{file}: damaged, made anew" in filled(made)
-        assert file.read_bytes() == whole
-    # More of them begin with the same ones.
-    more = scenes(tmp_path, 8)
-    filled(more)
-    assert all(torch.equal(more.frame(index).rgb, frames[index].rgb) for index in range(6))
-    other = dataclasses.replace(made, folder=tmp_path / "other", seed=1)
-    filled(other)
-    assert not any(torch.equal(other.frame(index).rgb, frames[index].rgb) for index in range(6))
-
-
-def test_photos_that_cannot_be_read_at_all_end_it(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
-    with pytest.raises(InputError, match=r"photos in a row cannot be read: give others as data\.photos"):
-        filled(scenes(tmp_path, 1))
-
-
 # A photo by other cameras -------------------------------------------------------------------------
 
 
@@ -229,10 +132,12 @@ def test_other_light_changes_colours_and_keeps_them_colours() -> None:
 
 def terms(predicted: Tensor, truth: list[float], valid: list[bool]) -> dict[str, float]:
     loss, found = depth_loss(
-        predicted[None, None], torch.tensor([[truth]]), torch.tensor([[valid]]), DepthLossWeights(2.0, 3.0, 0.5)
+        predicted[None, None], torch.tensor([[truth]]), torch.tensor([[valid]]), DepthLossWeights(2.0, 3.0, 0.5, 0.25)
     )
     numbers = {name: float(value) for name, value in found.items()}
-    assert float(loss) == pytest.approx(2 * numbers["factor"] + 3 * numbers["line"] + 0.5 * numbers["steps"])
+    offset = numbers.pop("offset")
+    total = 2 * numbers["factor"] + 3 * numbers["line"] + 0.5 * numbers["steps"] + 0.25 * offset
+    assert float(loss) == pytest.approx(total)
     return numbers
 
 
@@ -251,6 +156,18 @@ def test_each_term_of_the_loss_is_what_it_says_it_is() -> None:
     line = sum(abs(scale * a + mean - b) / (b + 0.2) for a, b in zip(p, t, strict=True)) / 4
     assert found["line"] == pytest.approx(line, rel=1e-4)
     assert terms(right, truth, known) == pytest.approx({"factor": 0, "line": 0, "steps": 0}, abs=1e-3)
+
+
+def test_only_the_offset_knows_a_factor_and_pulls_it_back() -> None:
+    """Medians are of the known ones: of two pictures one is too near by e^3, and of the third nothing is known."""
+    truth = torch.tensor([[[1.0, 2.0, 4.0]]]).expand(3, 1, 3)
+    valid = torch.tensor([True, True, False])[:, None, None].expand(3, 1, 3)
+    predicted = (truth.log() + torch.tensor([3.0, 0.0, 9.0])[:, None, None]).requires_grad_()
+    loss, found = depth_loss(predicted, truth, valid, DepthLossWeights(offset=0.6))
+    assert float(found["offset"]) == pytest.approx((3 + 2 * math.log(2)) / 3)  # t is over its median, 2
+    assert loss.item() == pytest.approx(0.6 * float(found["offset"]), abs=2e-3)
+    (gradient,) = torch.autograd.grad(loss, predicted)
+    assert gradient.sum((1, 2)).tolist() == pytest.approx([0.2, 0.2, 0], abs=1e-3)
 
 
 def test_steps_are_compared_at_four_distances() -> None:

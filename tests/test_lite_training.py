@@ -21,6 +21,7 @@ from spackle.bases.lite.network import LiteNet
 from spackle.network_file import read_network
 from spackle.training.depth.mixture import DepthBatch, Mixture
 from spackle.training.depth.recipe import LiteRecipe
+from spackle.training.depth.start import EVEN, balanced
 from spackle.training.recipe_file import load_lite_recipe
 
 pytest.importorskip("yaml")
@@ -73,7 +74,7 @@ def train(place: Path, output: Path, *more: object) -> Run:
 def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> None:
     folder, done = whole
     assert done.code == 0, done.err
-    assert "to learn from: 3 made, 1 stereo, 4 rgbd; to be judged by: 2 kitchen, 1 stereo" in done.lines
+    assert "to learn from: 3 made, 2 stereo, 4 rgbd; to be judged by: 2 kitchen, 1 stereo" in done.lines
     assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
     report = json.loads((folder / "run.json").read_text())
     assert (report["method"], report["ended"], report["step"], report["aim"]) == ("lite", "steps", 4, "abs_rel")
@@ -126,8 +127,38 @@ def test_a_run_starts_from_weights_of_another(place: Path, whole: tuple[Path, Ru
     best = whole[0] / "best.safetensors"
     done = train(place, tmp_path / "out", f"init={best}", "optim.steps=1", "optim.lr=1e-9", "optim.min_lr=0")
     assert done.code == 0, done.err
-    weights, start = state(tmp_path / "out").network, read_network(LiteNet(), best, "lite", "").state_dict()
+    weights, start = state(tmp_path / "out").network, balanced(read_network(LiteNet(), best, "lite", "")).state_dict()
     assert all(torch.allclose(weights[name], start[name], atol=1e-6) for name in start)
+
+
+def test_weights_of_even_size_are_the_same_function() -> None:
+    torch.manual_seed(0)
+    network, rgb = LiteNet(), torch.rand(1, 3, 64, 96)
+    with torch.no_grad():
+        for name, weight in network.named_parameters():
+            if name.endswith(("refine.weight", "bias")) and not name.startswith("encoder."):
+                weight += 0.05 * torch.randn_like(weight)
+        for number, fuse in enumerate(network.fuse):
+            fuse.get_parameter("reduce.weight").mul_(3 + number)
+        before = network(rgb)
+        torch.testing.assert_close(balanced(network)(rgb), before, rtol=1e-4, atol=1e-3)
+        found: list[float] = []
+        for fuse in network.fuse:
+            fuse.register_forward_hook(lambda *call: found.append(float(call[2].std())))
+        network(torch.rand(1, 3, 256, 320, generator=torch.Generator().manual_seed(0)))
+    assert found == pytest.approx([EVEN] * 4, rel=1e-3)
+
+
+def test_a_run_learns_from_what_a_teacher_guesses(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+    options = (f"data.teacher={whole[0] / 'best.safetensors'}", "data.shares.guessed=100", "optim.steps=2")
+    done = train(place, tmp_path / "out", *options)
+    assert done.code == 0, done.err
+    assert "to learn from: 3 made, 2 stereo, 4 rgbd, 3 guessed; to be judged by: 2 kitchen, 1 stereo" in done.lines
+    assert len([line for line in done.lines if line.startswith("passed over: ") and "broken.jpg" in line]) == 1
+    (guesses,) = (place / "cache").glob("guesses-*")
+    assert len(list(guesses.iterdir())) == 2
+    fewer = train(place, tmp_path / "fewer", *options, "data.guesses=1")
+    assert ", 1 guessed; to be judged by" in "".join(fewer.lines)
 
 
 def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
@@ -197,6 +228,7 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     [
         (["data.photos=/nowhere"], "/nowhere: no such folder, but data.photos names it"),
         (["data.photos={empty}"], "there is nothing in it: looked for photos"),
+        (["data.teacher=/nowhere"], "/nowhere: no such file, but data.teacher names it"),
         (["data.photos=null", "data.stereo=null", "data.rgbd=[]"], "the recipe has no data: give data.photos=FOLDER"),
         (["data.rgbd=[]", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
         (["data.validation=0", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
@@ -269,5 +301,5 @@ def test_the_projects_recipe_can_be_read_and_learns_from_all_there_is() -> None:
     recipe = load_lite_recipe(RECIPES / "lite.yaml")
     data, shares = recipe.data, recipe.data.shares
     assert all((data.photos, data.stereo, data.rgbd, shares.made, shares.stereo, shares.rgbd))
-    assert shares.made + shares.stereo + shares.rgbd == pytest.approx(1)
+    assert shares.made + shares.stereo + shares.rgbd + shares.guessed == pytest.approx(1)
     assert recipe.encoder is None

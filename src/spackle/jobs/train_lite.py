@@ -6,11 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import ClassVar
 
+from spackle.bases.lite.base import LiteBase
 from spackle.bases.lite.network import LiteNet
 from spackle.jobs.inputs import make_folder
 from spackle.jobs.train_plan import Place, Start, parameters
 from spackle.training.depth.files import LiteFiles
 from spackle.training.depth.frames import JUDGED_SIDE, LEARNED_SIDE, read_all
+from spackle.training.depth.guessed import GuessedPhotos
 from spackle.training.depth.judging import DepthJudge
 from spackle.training.depth.made import MadeScenes
 from spackle.training.depth.method import LiteMethod
@@ -57,8 +59,12 @@ class LitePlan:
             if measured:
                 sources.append(Kept(read_all(measured, LEARNED_SIDE, say)))
                 parts.append(share)
+        if files.guessed:
+            sources.append(self._guesses())
+            parts.append(shares.guessed)
         groups = {group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, say)] for group in files.groups}
         counts = {"made": recipe.data.made if files.photos else 0, "stereo": len(files.stereo), "rgbd": len(files.rgbd)}
+        counts |= {"guessed": len(files.guessed)} if files.guessed else {}
         judged = {name: len(frames) for name, frames in groups.items()}
         say(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
 
@@ -74,6 +80,19 @@ class LitePlan:
             {"samples": samples, "parameters": parameters(self.network)},
             pace=lambda name: rate if name.startswith("encoder.") else 1.0,
         )
+
+    def _guesses(self) -> GuessedPhotos:
+        """Made by the first process, found by the others."""
+        place, data = self.place, self.place.recipe.data
+        folder = (data.cache or place.output / CACHE) / f"guesses-{self.files.guesses_digest}"
+        guesses = GuessedPhotos(folder, self.files.guessed)
+        if place.ranks.first:
+            make_folder(folder)
+            place.reporter.say(f"guesses of {len(self.files.guessed)} photos in {folder}")
+            with place.reporter.stage("guesses", {}) as step:
+                guesses.fill(LiteBase.load(data.teacher, device=str(place.device)), step, place.reporter.say)
+        place.ranks.wait()
+        return guesses
 
     def _scenes(self) -> MadeScenes:
         """Made by the first process, found by the others."""

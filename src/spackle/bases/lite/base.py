@@ -22,7 +22,7 @@ from spackle.network_file import read_network
 SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
 # What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
 # thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
-INPUT_PIXELS = (192 * 256, 256 * 320, 288 * 384)
+INPUT_PIXELS = (128 * 160, 192 * 256, 256 * 320, 352 * 480)
 FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
 
@@ -63,7 +63,6 @@ class LiteBase:
         notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
         return dataclasses.replace(prediction, notes=notes)
 
-    @torch.no_grad()
     def inverse_depth(self, rgb: Tensor) -> Tensor:
         """What the network says of a photo and of its mirror image, at several sizes: the mean of the logarithms.
 
@@ -71,14 +70,19 @@ class LiteBase:
             rgb: [H, W, 3] sRGB in 0..1, of any size.
 
         Returns:
-            [h, w] float32 inverse depth up to a factor, on the processor; about 144×192, of the photo's shape.
+            [h, w] float32 inverse depth up to a factor, on the processor; about 176×240, of the photo's shape.
         """
+        return self.looks(rgb).mean(0).exp()
+
+    @torch.no_grad()
+    def looks(self, rgb: Tensor) -> Tensor:
+        """[n, h, w] the logarithm of inverse depth at each of the sizes, as `inverse_depth` has them."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         height, width = rgb.shape[:2]
         sizes = [network_size(height, width, pixels) for pixels in INPUT_PIXELS]
         finest = tuple(side // 2 for side in sizes[-1])
         said = [interpolate(self._look(picture, size)[None, None], size=finest, mode="bilinear") for size in sizes]
-        return torch.cat(said).mean(0)[0].exp().cpu()
+        return torch.cat(said)[:, 0].cpu()
 
     def _look(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], seen at a size (h, w), both ways round."""

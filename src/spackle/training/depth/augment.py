@@ -33,8 +33,9 @@ class Turning:
     degrees: tuple[float, float, float]  # standard deviations of yaw, pitch and roll
 
 
-MEASURED = Turning((1.0, 1.6), (6.0, 6.0, 6.0))  # few scenes have to look like many
+MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # few scenes have to look like many
 MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # made scenes are drawn from every side already
+GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # photos are many
 MINGLED_SCALE = (-0.2, 0.8)  # logarithms: of the front frame's median inverse depth over the back one's
 
 
@@ -92,13 +93,14 @@ def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
 
 
 def relit(rng: Rng, rgb: Tensor) -> Tensor:
-    """[3, H, W] in another light, through another camera: brightness, tint, contrast, grey, blur, noise."""
+    """[3, H, W] in another light, through another camera: brightness, tint, contrast, glare, grey, blur, noise."""
     tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
     rgb = rgb * torch.from_numpy(tint)
     mean = rgb.mean((1, 2), keepdim=True)
-    rgb = mean + (rgb - mean) * math.exp(rng.normal(0, 0.2))
+    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0  # black shadows, and what is bright is white
+    rgb = mean + (rgb - mean) * math.exp(rng.normal(harsh, 0.25)) + harsh * rng.uniform(-0.1, 0.3)
     grey = rgb.mean(0, keepdim=True)
-    rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.15 else math.exp(rng.normal(0, 0.3)))
+    rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.2 else math.exp(rng.normal(0, 0.3)))
     rgb = rgb.clamp(1e-4, 1) ** math.exp(rng.normal(0, 0.2))
     if rng.random() < 0.2:
         rgb = avg_pool2d(rgb[None], 3, 1, 1, count_include_pad=False)[0]

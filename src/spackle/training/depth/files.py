@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from spackle.training.depth.frames import Group, Measured, of_camera, of_scenes
 from spackle.training.depth.recipe import LiteData
 from spackle.training.recipe import plain
 
-SCENES_VERSION = 1  # goes up whenever the same photos would make other scenes
+SCENES_VERSION = 4  # goes up whenever the same photos would make other scenes
+GUESSES_VERSION = 1  # likewise of guesses by the same weights
 STEREO = "stereo"  # the group of data.validation_stereo
 
 
@@ -27,6 +29,7 @@ class LiteFiles:
     photos: Sequence[Path]
     stereo: Sequence[Measured]
     rgbd: Sequence[Measured]
+    guessed: Sequence[Path]  # photos that a teacher makes guesses of
     groups: Sequence[Group]
 
     @staticmethod
@@ -38,7 +41,7 @@ class LiteFiles:
         """
         shares, groups = data.shares, []
         photos = [] if data.photos is None else find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
-        stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo")
+        stereo = [] if data.stereo is None else of_scenes(data.stereo, "data.stereo", right=True)
         rgbd: list[Measured] = []
         for camera in data.rgbd:
             learned, judged = of_camera(camera, data.validation)
@@ -47,14 +50,17 @@ class LiteFiles:
         if data.validation_stereo is not None:
             groups.append(Group(STEREO, of_scenes(data.validation_stereo, "data.validation_stereo")))
             _check_apart(stereo, groups[-1].files, data.validation_stereo)
+        if data.teacher is not None and not data.teacher.is_file():
+            raise InputError(f"{data.teacher}: no such file, but data.teacher names it")
         files = LiteFiles(
             data,
             photos if shares.made else (),
             stereo if shares.stereo else (),
             rgbd if shares.rgbd else (),
+            _spread(photos, data.guesses) if shares.guessed and data.teacher is not None else (),
             _with_own_names([group for group in groups if group.files]),
         )
-        if not (files.photos or files.stereo or files.rgbd):
+        if not (files.photos or files.stereo or files.rgbd or files.guessed):
             raise InputError(
                 "the recipe has no data: give data.photos=FOLDER, data.rgbd or data.stereo, and a share above 0"
             )
@@ -68,17 +74,32 @@ class LiteFiles:
     @property
     def scenes_digest(self) -> str:
         """Twelve digits: the same made scenes have the same ones, wherever the photos lie and however many are made."""
-        photos = [] if self.data.photos is None else _below(self.data.photos, self.photos)
-        return digest_of((SCENES_VERSION, self.data.seed, list(self.data.size), photos))
+        return digest_of((SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos)))
+
+    @property
+    def guesses_digest(self) -> str:
+        """Twelve digits: the same photos and the same teacher, wherever they lie; of no teacher too."""
+        teacher = self.data.teacher
+        weights = hashlib.sha256(teacher.read_bytes()).hexdigest() if teacher is not None and self.guessed else ""
+        return digest_of((GUESSES_VERSION, weights, self._below(self.guessed)))
+
+    def _below(self, files: Sequence[Path]) -> list[str]:
+        folder = self.data.photos
+        return [] if folder is None else [file.relative_to(folder).as_posix() for file in files]
 
     @property
     def digest(self) -> str:
         """Twelve digits of all that is learned from and judged by."""
         facts: dict[str, Any] = plain(self.data)
-        for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd"):
+        for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
         names = [_names(files) for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))]
-        return digest_of((self.scenes_digest, facts, names))
+        return digest_of((self.scenes_digest, self.guesses_digest, facts, names))
+
+
+def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:
+    """So many of them, from all over the folder; all where there are no more."""
+    return [photos[number * len(photos) // count] for number in range(count)] if count < len(photos) else photos
 
 
 def _check_apart(learned: Sequence[Measured], judged: Sequence[Measured], folder: Path) -> None:
@@ -99,9 +120,5 @@ def _with_own_names(groups: Sequence[Group]) -> list[Group]:
     return list(named.values())
 
 
-def _below(folder: Path, files: Sequence[Path]) -> list[str]:
-    return [file.relative_to(folder).as_posix() for file in files]
-
-
-def _names(files: Sequence[Measured]) -> list[tuple[str, float | None]]:
-    return [(file.path.name, file.unit_m) for file in files]
+def _names(files: Sequence[Measured]) -> list[tuple[str, float | None, bool]]:
+    return [(file.path.name, file.unit_m, file.right) for file in files]

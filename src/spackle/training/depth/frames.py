@@ -1,4 +1,4 @@
-"""Photos with measured depth: what depth cameras took, and the left photos of stereo pairs."""
+"""Photos with measured depth: what depth cameras took, and the photos of stereo pairs."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch.nn.functional import interpolate
 from spackle.errors import InputError
 from spackle.training.data import find_files
 from spackle.training.depth.augment import Frame
+from spackle.training.depth.right import seen_from_the_right
 from spackle.training.recipe import RgbdFolder
 from spackle.training.sources import load_frame, load_pair
 
@@ -27,14 +28,24 @@ class Measured:
 
     path: Path  # of the photo, or of the stereo pair's folder
     unit_m: float | None = None  # of a depth camera's files; None for a stereo pair
+    right: bool = False  # of a stereo pair's photos the right one
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages."""
+        return f"{self.path} (right)" if self.right else str(self.path)
 
     def read(self, side: int) -> Frame:
         """The frame, its longer side no longer than this; InputError where it cannot be read."""
-        if self.unit_m is None:
-            rgb, _, stored, *_ = load_pair(self.path)
-        else:
+        if self.unit_m is not None:
             rgb, stored = load_frame(self.path, self.unit_m)
-        return reduced(rgb, stored.depth, stored.valid, side)
+            return reduced(rgb, stored.depth, stored.valid, side)
+        rgb, other, stored, camera, beside = load_pair(self.path)
+        if not self.right:
+            return reduced(rgb, stored.depth, stored.valid, side)
+        moved = beside.world_to_camera[0, 3] * camera.K[0, 0]
+        shift = beside.K[0, 2] - camera.K[0, 2] + moved / stored.depth.clamp_min(1e-6)
+        return reduced(other, *seen_from_the_right(stored.depth, stored.valid, shift), side)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +72,10 @@ def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Mea
     return frames[: len(frames) - judged], frames[len(frames) - judged :]
 
 
-def of_scenes(folder: Path, key: str) -> list[Measured]:
-    """The stereo pairs below a folder; InputError where there are none."""
-    return [Measured(file.parent) for file in find_files(folder, key, ("scene.json",), "scene.json")]
+def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
+    """The left photos of the stereo pairs below a folder, or both; InputError where there are none."""
+    folders = [file.parent for file in find_files(folder, key, ("scene.json",), "scene.json")]
+    return [Measured(pair, right=side) for side in ((False, True) if right else (False,)) for pair in folders]
 
 
 def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) -> list[tuple[str, Frame]]:
@@ -80,9 +92,9 @@ def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) 
             warn(f"passed over: {error}")
             continue
         if bool(frame.valid.any()):
-            frames.append((str(file.path), frame))
+            frames.append((file.name, frame))
         else:
-            warn(f"passed over: {file.path}: hardly a pixel has a depth")
+            warn(f"passed over: {file.name}: hardly a pixel has a depth")
     if not frames:
         raise InputError(f"{files[0].path}: none of {len(files)} frames can be read: see above")
     return frames

@@ -14,7 +14,7 @@ from spackle.training.depth.losses import DepthLossWeights, depth_loss
 from spackle.training.depth.mixture import COARSER, DepthBatch
 from spackle.training.depth.score import score_depth, vertical_ramp
 
-MEASURES = ("abs_rel", "delta", "ramp_abs_rel", "loss", "factor", "line", "steps")
+MEASURES = ("abs_rel", "delta", "ramp_abs_rel", "loss", "factor", "line", "steps", "offset")
 
 
 @dataclasses.dataclass(frozen=True)

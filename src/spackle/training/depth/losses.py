@@ -21,6 +21,7 @@ class DepthLossWeights:
     factor: float = 1.0
     line: float = 1.0
     steps: float = 0.5
+    offset: float = 0.1  # of no use to anyone, but without it features grow until half precision cannot hold them
 
 
 def depth_loss(
@@ -30,7 +31,8 @@ def depth_loss(
 
     With t the true inverse depth over its median, and e = predicted − log t minus its own median:
     factor is mean |e|; line is mean |a·exp(predicted) + b − t| / (t + 0.2) after the least-squares a ≥ 0 and b,
-    in the spirit of MiDaS (Ranftl et al. 2020); steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|.
+    in the spirit of MiDaS (Ranftl et al. 2020); steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|;
+    offset is the size of the median that e was freed from, which the other terms do not know.
 
     Args:
         predicted: [B, H, W] log inverse depth.
@@ -41,14 +43,17 @@ def depth_loss(
     mask = valid.to(predicted.dtype)
     truth = (truth / _median(truth, valid & (truth > 0)).clamp_min(1e-6)).clamp(FARTHEST, NEAREST)
     error = predicted - truth.log()
-    middle = _median(error.detach(), valid)
+    offset = _median(error, valid)
+    middle = offset.detach()
     error = error - middle
     terms = {
         "factor": _mean(error.abs().clamp_max(AT_MOST), mask).mean(),
         "line": _line(predicted - middle, truth, mask).mean(),
         "steps": _steps(error, mask).mean(),
+        "offset": offset.where(valid.any(2).any(1)[:, None, None], 0.0).abs().mean(),
     }
     total = weights.factor * terms["factor"] + weights.line * terms["line"] + weights.steps * terms["steps"]
+    total = total + weights.offset * terms["offset"]
     return total, {name: term.detach() for name, term in terms.items()}
 
 

@@ -26,7 +26,7 @@ class Source(Protocol):
 
     @property
     def mingles(self) -> float:
-        """How often two of its frames make one picture."""
+        """How often one of its frames and another, of any source, make one picture."""
 
     def draw(self, rng: Rng) -> tuple[str, Frame]:
         """A random one and what it is called; InputError where it cannot be read."""
@@ -38,7 +38,7 @@ class Drawn:
 
     scenes: MadeScenes
     turning: Turning = MADE
-    mingles: float = 0.0
+    mingles: float = 0.2
 
     def draw(self, rng: Rng) -> tuple[str, Frame]:
         """As `Source` has it."""
@@ -94,12 +94,15 @@ class Mixture:
     def _picture(self, step: int, place: int, height: int, width: int) -> tuple[str, Frame]:
         """What it is called, which its size does not change, and itself."""
         rng = np.random.default_rng([self.seed, step, 1 + place])
-        chosen = rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares))
-        source = self.sources[int(chosen)]
+        source = self._source(rng)
         name, frame = source.draw(rng)
         seen = turned(rng, frame, height, width, source.turning)
         if rng.random() < source.mingles:
+            source = self._source(rng)
             other, frame = source.draw(rng)
             name = f"{name} and {other}"
             seen = mingled(rng, seen, turned(rng, frame, height, width, source.turning))
         return name, dataclasses.replace(seen, rgb=relit(rng, seen.rgb))
+
+    def _source(self, rng: Rng) -> Source:
+        return self.sources[int(rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares)))]

@@ -54,8 +54,9 @@ def trace(
     skins = np.array([s.texture for s in solids])
     repeats = np.array([s.repeats for s in solids], np.float32)
     casts = np.array([s.casts for s in solids])
+    around = 1.001 * np.array([(s.axes.astype(np.float64) ** 2).sum() for s in solids])  # squared radii of balls
     colors, distances = sky.astype(np.float32).copy(), np.full(len(rays), np.inf, np.float32)
-    _trace(kinds, centers, inverse, skins, repeats, casts, textures, rays, light, ambient, colors, distances)
+    _trace(kinds, centers, inverse, skins, repeats, casts, around, textures, rays, light, ambient, colors, distances)
     return colors, distances
 
 
@@ -117,6 +118,14 @@ def _covered(textures: Any, skin: int, u: float, v: float) -> Any:
 
 
 @kernel
+def _near(center: Any, start: Any, ray: Any, around: float) -> Any:
+    """Whether the line start + t·ray comes as near to a center as the root of `around`."""
+    x, y, z = center[0] - start[0], center[1] - start[1], center[2] - start[2]
+    along = x * ray[0] + y * ray[1] + z * ray[2]
+    return (x * x + y * y + z * z - around) * (ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2) <= along * along
+
+
+@kernel
 def _trace(
     kinds: Any,
     centers: Any,
@@ -124,6 +133,7 @@ def _trace(
     skins: Any,
     repeats: Any,
     casts: Any,
+    around: Any,
     textures: Any,
     rays: Any,
     light: Any,
@@ -133,10 +143,12 @@ def _trace(
 ) -> None:
     size = textures.shape[1]
     o, d, found, best = np.empty(3), np.empty(3), np.empty(5), np.empty(5)
-    start, normal = np.empty(3), np.empty(3)
+    start, normal, eye = np.empty(3), np.empty(3), np.zeros(3)
     for i in range(len(rays)):
         nearest, which = FAR, -1
         for s in range(len(kinds)):
+            if not _near(centers[s], eye, rays[i], around[s]):
+                continue
             for k in range(3):
                 o[k] = -(
                     inverse[s, k, 0] * centers[s, 0]
@@ -163,7 +175,7 @@ def _trace(
         shine = max(0.0, lit / math.sqrt(length))
         if shine > 0.0:
             for s in range(len(kinds)):
-                if not casts[s]:
+                if not casts[s] or not _near(centers[s], start, light, around[s]):
                     continue
                 for k in range(3):
                     o[k], d[k] = 0.0, 0.0

@@ -18,9 +18,10 @@ WEIGHTS, RUN = DepthLossWeights(), RunRecipe()
 class LiteShares:
     """How often a picture comes from each source; they need not add up to 1. One without data counts as 0."""
 
-    made: float = 0.45
-    stereo: float = 0.33
-    rgbd: float = 0.22
+    made: float = 0.4
+    stereo: float = 0.28
+    rgbd: float = 0.14
+    guessed: float = 0.18  # where there is a teacher
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,10 +31,12 @@ class LiteData:
     photos: Path | None = None  # a folder, with its subfolders: the surfaces of made scenes are cut from them
     rgbd: tuple[RgbdFolder, ...] = ()  # of these the focal length is not asked for
     stereo: Path | None = None  # a folder of scenes, each with a scene.json
-    made: int = 2000  # made scenes
+    made: int = 4900  # made scenes
+    teacher: Path | None = None  # weights of an earlier run: what they guess of `photos` is learned from as well
+    guesses: int = 1500  # of so many photos at most
     shares: LiteShares = LiteShares()
     size: tuple[int, int] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
-    cache: Path | None = None  # a folder for the made scenes; inside the output where None
+    cache: Path | None = None  # a folder for made scenes and guesses; inside the output where None
     seed: int = 0  # of the made scenes alone, so that runs with other seeds learn from the same ones
     validation: float = 0.2  # share of each folder of `rgbd`, the last frames by name: neighbours look alike
     validation_stereo: Path | None = None  # scenes to be judged by; those of `stereo` are learned from, all of them
@@ -67,11 +70,12 @@ def check_lite(recipe: LiteRecipe, file: str) -> None:
 
 
 LITE_RANGES: dict[str, tuple[float, float]] = {
-    "data.shares.made": (0, 1e6),
+    **{f"data.shares.{name}": (0, 1e6) for name in ("made", "guessed")},
+    "data.guesses": (1, 1e6),
     "data.made": (1, 1e6),  # six digits name a file
     "data.size": (STRIDE, 2048),
     "data.validation": (0, 0.9),
-    **{f"loss.{name}": (0, 1e6) for name in ("factor", "line", "steps")},
+    **{f"loss.{name}": (0, 1e6) for name in ("factor", "line", "steps", "offset")},
     "optim.encoder_rate": (0, 10),
     "optim.frozen": (0, len(STAGES)),
 }

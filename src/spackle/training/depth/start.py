@@ -9,6 +9,8 @@ from spackle.network_file import read_network
 from spackle.training.depth.encoder import load_encoder
 from spackle.training.depth.recipe import RANDOM, LiteRecipe
 
+EVEN = 10.0  # the standard deviation that features of the decoder are brought to where a run starts from another
+
 
 def first_network(recipe: LiteRecipe) -> LiteNet:
     """A file's weights; else those that ImageNet taught, and a decoder by the run's seed.
@@ -17,12 +19,37 @@ def first_network(recipe: LiteRecipe) -> LiteNet:
         InputError: a file that is missing, or of another network.
     """
     if recipe.init is not None:
-        return read_network(LiteNet(), recipe.init, "lite", "a .safetensors file as init").requires_grad_()
+        return balanced(read_network(LiteNet(), recipe.init, "lite", "a .safetensors file as init")).requires_grad_()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.run.seed)
         network = LiteNet()
     if recipe.encoder != RANDOM:
         network.encoder = load_encoder(recipe.encoder)
+    return network
+
+
+@torch.no_grad()
+def balanced(network: LiteNet) -> LiteNet:
+    """The same function by weights of even size, changed in place.
+
+    Features of the decoder grow while it learns, and its last weights shrink, until a step of the optimiser is large
+    beside them and the run diverges. Every level is linear but for ReLU, so a factor can go from one to the next.
+    """
+    spreads: list[float] = []
+    hooks = [fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std()))) for fuse in network.fuse]
+    network(torch.rand(1, 3, 256, 320, generator=torch.Generator().manual_seed(0)))
+    for hook in hooks:
+        hook.remove()
+    before = 1.0
+    for fuse, spread in zip(network.fuse, spreads, strict=True):
+        factor = spread / EVEN
+        for name, weight in fuse.named_parameters():
+            if name in ("lateral.weight", "reduce.weight") or name.endswith("bias"):
+                weight.div_(factor)
+        fuse.get_parameter("reduce.weight").mul_(before)
+        before = factor
+    network.get_parameter("head.0.bias").div_(before)
+    network.get_parameter("head.2.weight").mul_(before)
     return network
 
 
