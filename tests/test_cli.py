@@ -893,6 +893,16 @@ def test_bad_render_options(tmp_path: Path, scene: Path, options: tuple[str, str
 # The real thing, in a process of its own
 
 
+def test_another_kind_of_video_is_no_folder(tmp_path: Path, scene: Path) -> None:
+    refuses(run("render", "-i", scene, "-o", tmp_path / "film.avi", *SHORT), "film.avi: not a kind of video")
+    assert not (tmp_path / "film.avi").exists()
+
+
+def test_python_m_spackle_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "spackle", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("spackle ")
+
+
 def test_the_installed_command_is_this_one() -> None:
     commands = [point for point in entry_points(group="console_scripts") if point.name == "spackle"]
     assert [point.load() for point in commands] == [cli.main]

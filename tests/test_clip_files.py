@@ -102,12 +102,18 @@ def unknown_codec(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"avc1", b"zzzz"))
 
 
+def listing(path: Path) -> None:
+    write_clip(path.with_name("other.mp4"), moving(2))
+    path.write_text("ffconcat version 1.0\nfile other.mp4\n")
+
+
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty": (lambda path: path.touch(), "the file is empty"),
     "missing": (lambda path: None, "no such"),
     "text": (lambda path: path.write_text("no clip"), "not a video"),
     "headless": (lambda path: path.write_bytes(write_clip(path, moving(4)).read_bytes()[:-200]), "damaged"),
     "cut off": (cut_off, "cut off"),
+    "a list of files": (listing, "a list of other files"),
     "sound alone": (sound_alone, "no moving picture"),
     "unknown codec": (unknown_codec, "codec"),
 }

@@ -110,6 +110,12 @@ def test_a_scene_travels_once(gpu: GsplatRenderer) -> None:
         gpu.device = torch.device("meta")  # anywhere else
     first = [gpu._on_device(tensor) for tensor in BASE.tensors]
     assert all(gpu._on_device(tensor) is there for tensor, there in zip(BASE.tensors, first, strict=True))
+    changing = BASE.colors.clone()
+    before = gpu._on_device(changing)
+    assert gpu._on_device(changing.mul_(0.5)) is not before
+    at_home = torch.ones(3, device=gpu.device)
+    assert gpu._on_device(at_home) is at_home
+    assert at_home not in gpu._there
     asking = BASE.colors.clone().requires_grad_()
     assert gpu._on_device(asking) is not gpu._on_device(asking)  # it changes at every step of a training
 

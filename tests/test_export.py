@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import io
 import json
@@ -253,7 +254,7 @@ def test_morton_order_is_that_of_interleaved_bits() -> None:
     points = np.array(np.meshgrid(*[range(8)] * 3)).reshape(3, -1).T.astype(np.float32)
 
     def curve(point: Any) -> int:
-        cells = (point / 7 * 1023).astype(int).tolist()
+        cells = (np.log1p(point.astype(float)) / np.log1p(7.0) * 1023).astype(int).tolist()
         return sum((cells[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
 
     assert [curve(points[i]) for i in morton_order(points)] == sorted(curve(point) for point in points)
@@ -334,6 +335,7 @@ def test_spz_decoder_agrees_with_the_plain_one_and_reads_version_2() -> None:
         gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 4, 0, 0, 12, 0, 0)),
         gzip.compress(struct.pack("<4sIIBBBB", b"ABCD", 3, 0, 0, 12, 0, 0)),
     ],
+    ids=["nothing", "not packed", "cut off", "no header", "too many", "version 4", "another name"],
 )
 def test_broken_spz_is_an_input_error(data: bytes) -> None:
     with pytest.raises(InputError, match="SPZ"):
@@ -409,12 +411,64 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *(output.name for output in outputs)}
 
 
-def test_upper_case_and_the_scene_itself(scene: Path) -> None:
-    before = load_ply(scene)
-    export_scene(scene, [scene, scene.with_name("A.SPZ")], told()[0])
-    assert all(torch.equal(a, b) for a, b in zip(load_ply(scene).tensors[:1], before.tensors[:1], strict=True))
-    assert load_ply_base_count(scene) == 1000
-    assert len(decode_spz(scene.with_name("A.SPZ").read_bytes())) == len(before)
+def test_upper_case_and_a_copy_keeps_what_the_header_says(scene: Path) -> None:
+    export_scene(scene, [scene.with_name("A.SPZ"), scene.with_name("copy.PLY")], told()[0])
+    copy = scene.with_name("copy.PLY")
+    assert copy.read_bytes().partition(b"end_header")[0] == scene.read_bytes().partition(b"end_header")[0]
+    for one, other in zip(load_ply(copy).tensors, load_ply(scene).tensors, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+    assert len(decode_spz(scene.with_name("A.SPZ").read_bytes())) == len(load_ply(scene))
+
+
+def test_the_scene_itself_is_no_output(scene: Path) -> None:
+    before = scene.read_bytes()
+    (scene.parent / "link.ply").symlink_to(scene)
+    for output in (scene, scene.parent / "link.ply"):
+        with pytest.raises(InputError, match=r"scene\.ply: is the scene itself"):
+            export_scene(scene, [scene.with_name("a.spz"), output], told()[0])
+    assert scene.read_bytes() == before
+    assert not scene.with_name("a.spz").exists()
+
+
+def test_harmonics_that_no_format_keeps_are_told(scene: Path, tmp_path: Path) -> None:
+    head, _, body = scene.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(len(load_ply(scene)), -1)
+    more = "".join(f"property float f_rest_{k}\n" for k in range(45)).encode()
+    foreign = tmp_path / "inria.ply"
+    foreign.write_bytes(head + more + b"end_header\n" + np.hstack([rows, np.ones((len(rows), 45), "<f4")]).tobytes())
+    for path, said in ((foreign, True), (scene, False)):
+        reporter, text = told()
+        export_scene(path, [tmp_path / "out.splat"], reporter)
+        assert ("45 spherical harmonics" in text.getvalue()) == said
+
+
+def test_a_long_name_in_any_script(scene: Path) -> None:
+    output = scene.with_name("\u3042" * 80 + ".splat")  # 246 bytes, as many as a folder allows
+    export_scene(scene, [output], told()[0])
+    assert output.stat().st_size == 32 * len(load_ply(scene))
+
+
+def test_rotations_too_long_to_square_keep_their_direction(tmp_path: Path) -> None:
+    one = turned(4)
+    huge = dataclasses.replace(one, quats=one.quats / one.quats.norm(dim=-1, keepdim=True) * 3e38)
+    assert encode_splat(huge) == encode_splat(one)
+    save_ply(huge, tmp_path / "huge.ply")
+    torch.testing.assert_close(load_ply(tmp_path / "huge.ply").quats, huge.quats / 3e38, atol=1e-6, rtol=0)
+
+
+def test_something_far_away_does_not_shuffle_what_is_near() -> None:
+    near = np.random.default_rng(0).uniform(1, 3, (4000, 3)).astype(np.float32)
+
+    def steps(points: np.ndarray[Any, Any]) -> float:
+        order = morton_order(points)
+        kept = points[order][np.abs(points[order]).max(axis=1) < 10]
+        return float(np.linalg.norm(np.diff(kept, axis=0), axis=1).mean())
+
+    alone = steps(near)
+    assert steps(np.vstack([near, [[1e4, 1e4, 1e4]]]).astype(np.float32)) < 2.5 * alone
+    ends = np.vstack([near, [[3e38, 0, 0], [-3e38, 0, 0]]]).astype(np.float32)
+    with np.errstate(all="raise"):
+        morton_order(ends)
 
 
 def test_a_camera_elsewhere_is_no_comment(tmp_path: Path) -> None:

@@ -202,7 +202,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "no up": (with_key(up=[0, 0, 0]), "keyframe 1: up has no length"),
     "wide": (with_key(fov=179), "keyframe 1: fov must be from 1 to 170"),
     "fov 0": (with_key(fov=0), "keyframe 1: fov"),
-    "same time": (with_key(time=0), "times must increase: keyframe 1 is at 0 s"),
+    "same time": (with_key(time=0), "times must increase, by a microsecond at least: keyframe 1 is at 0 s"),
+    "hardly later": (with_key(time=1e-300), "times must increase, by a microsecond"),
     "back in time": (with_key(time=-1), "times must increase"),
     "twice": ('{"keyframes": [], "keyframes": []}', "'keyframes' is there twice"),
 }

@@ -25,6 +25,8 @@ from scenes import box_before_wall
 import spackle
 from spackle.formats import save_ply
 from spackle.image import film_to_pixels
+from spackle.jobs.options import PredictOptions
+from spackle.jobs.view_scene import load_page_scene
 
 # The command line in a process of its own; a photo takes for ever.
 DEAF = """
@@ -129,10 +131,26 @@ def test_a_scene_of_ours_keeps_its_two_parts_and_its_camera(tmp_path: Path, visi
     result = visit(browse, tmp_path / "scene.ply")
     assert (result.code, result.lines[-1]) == (130, "spackle: interrupted")
     assert b"<html" in seen["page"]
-    assert seen["name"] == "scene.ply"
+    assert seen["name"] == tmp_path.name  # every scene of ours is called scene.ply
     assert counts(seen) == {"base": len(scene.base()) - 10, "aux": 10}
     assert seen["camera"]["K"] == scene.camera.K.tolist()
     assert not any(line.startswith("warning") for line in result.lines)
+
+
+def test_the_page_goes_as_far_as_the_scene_was_completed(tmp_path: Path) -> None:
+    scene = box_before_wall()
+    for stored, count, free in ((0.2, 10, 0.2), (None, 10, 0.3), (None, 0, 0.6), (5.0, 10, 1.0)):
+        base = len(scene.base()) - count
+        save_ply(scene.base(), tmp_path / "a.ply", camera=scene.camera, base_count=base, disparity=stored)
+        orbit: Any = load_page_scene(tmp_path / "a.ply", PredictOptions()).description["orbit"]
+        assert (orbit["free"], orbit["limit"]) == (free, pytest.approx(1.3 * free))
+
+
+def test_formats_that_are_written_only_are_told_apart_from_photos(tmp_path: Path) -> None:
+    (tmp_path / "a.spz").write_bytes(b"anything")
+    result = run("view", tmp_path / "a.spz")
+    assert (result.code, len(result.lines)) == (2, 1)
+    assert ".spz files are written, not read: give the scene.ply" in result.err
 
 
 def test_a_strangers_scene_is_all_base_behind_a_usual_lens(tmp_path: Path, visit: Callable[..., Run]) -> None:

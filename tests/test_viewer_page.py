@@ -52,7 +52,7 @@ def box() -> Scene:
 
 @functools.cache
 def page_of_box(name: str = "Box") -> PageScene:
-    return page_scene(name, box().base, box().aux, box().camera)
+    return page_scene(name, box().base, box().aux, box().camera, 0.35)
 
 
 # What the page is given.
@@ -366,7 +366,7 @@ def test_hand_and_keys_move_the_eye_within_the_limit(page: Any) -> None:
     assert page.evaluate("spackle.pose().eye[0]") == pytest.approx(0.32 * unit, rel=0.03)
     page.mouse.move(x - 5000, y)
     page.mouse.up()
-    assert 0.95 * unit < page.evaluate("spackle.pose().eye[0]") <= 1.0001 * unit
+    assert 0.95 * 1.3 * 0.35 * unit < page.evaluate("spackle.pose().eye[0]") <= 1.3001 * 0.35 * unit
     view.press("0")
     assert page.evaluate("spackle.pose().eye") == [0, 0, 0]
     view.press("ArrowDown")

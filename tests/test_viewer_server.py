@@ -213,6 +213,7 @@ def test_open_to_the_network_its_names_are_more_but_not_all() -> None:
         (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + 70_000 * b"a" + b"\r\n\r\n", b"431"),
         (b"GET / HTTP/1.1\r\nHost: localhost\r\n" + 200 * b"X: a\r\n" + b"\r\n", b"431"),
         (b"\x00\xff\xfe\x1b[31m\r\n\r\n", b"400"),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\nno colon\r\nOrigin: http://evil\r\n\r\n", b"400"),
     ],
 )
 def test_malformed_requests_get_a_plain_answer(server: ViewerServer, data: bytes, status: bytes) -> None:
@@ -308,6 +309,8 @@ def test_a_port_that_is_taken_is_one_line(server: ViewerServer) -> None:
     for wrong in (-1, 65536):
         with pytest.raises(InputError, match="must lie between"):
             ViewerServer(PAGES, complete, port=wrong)
+    with pytest.raises(InputError, match=r"--host 192\.0\.2\.1: is no address of this machine"):
+        ViewerServer(PAGES, complete, host="192.0.2.1")
     with pytest.raises(InputError, match=r"--host no\.such\.host\.invalid: no address"):
         ViewerServer(PAGES, complete, host="no.such.host.invalid")
 

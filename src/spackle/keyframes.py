@@ -18,6 +18,7 @@ UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
 UP = (0.0, -1.0, 0.0)  # where nobody says otherwise: the photo's
 SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
+LEAST_STEP = 1e-6  # seconds between two keys
 STILL = 1e-100  # slopes below it are none; their inverse would overflow
 LEAST_TILT = 1e-3  # radians between the view and its up
 Array = NDArray[np.float64]
@@ -65,9 +66,9 @@ class KeyframePath:
         if len(self.keys) < 2:
             raise PathError(f"a path needs at least two keyframes, got {len(self.keys)}")
         for index, (one, other) in enumerate(zip(self.keys, self.keys[1:], strict=False)):
-            if not one.time < other.time:
+            if not other.time - one.time >= LEAST_STEP:
                 order = f"keyframe {index + 1} is at {other.time:g} s, the one before at {one.time:g} s"
-                raise PathError(f"times must increase: {order}")
+                raise PathError(f"times must increase, by a microsecond at least: {order}")
         if self.unit not in UNITS:
             raise PathError(f"unknown unit {self.unit!r}: choose {' or '.join(UNITS)}")
 

@@ -71,9 +71,14 @@ class Scene:
         for camera in cameras:
             yield self.render(camera, renderer)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a plain PLY that every common viewer opens."""
-        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base))
+    def save(self, path: str | os.PathLike[str], disparity: float | None = None) -> None:
+        """Write a plain PLY that every common viewer opens.
+
+        Args:
+            path: the file.
+            disparity: how far the scene was completed, where that is known: so far `spackle view` goes.
+        """
+        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base), disparity=disparity)
 
     def save_video(
         self,

@@ -62,9 +62,10 @@ export function panel(viewer, say) {
   }
 
   function showDisparity() {
+    slider.max = Math.ceil(viewer.description.orbit.limit * 20) / 20;
     if (document.activeElement !== slider || !viewer.onPath) slider.value = viewer.disparity;
     const shown = viewer.disparity.toFixed(2);
-    slider.style.setProperty("--at", `${100 * viewer.disparity}%`);
+    slider.style.setProperty("--at", `${(100 * viewer.disparity) / slider.max}%`);
     slider.setAttribute("aria-valuetext", `disparity ${shown}`);
     document.querySelector("output[for=disparity]").value = shown;
   }

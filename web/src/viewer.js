@@ -7,6 +7,8 @@ const TURN_S = 8; // seconds that a path takes, there and back where it is open
 const GLIDE_S = 0.7; // seconds from where the eye is to the path
 const MOST_PIXELS = 2.6e6;
 
+const USUAL = 0.3; // disparity
+
 export class Viewer extends EventTarget {
   constructor(canvas) {
     super();
@@ -14,7 +16,7 @@ export class Viewer extends EventTarget {
     this.stage = new Stage(canvas, () => this.refresh());
     this.kind = "rotate_forward";
     this.t = 0; // on the path, 0..1
-    this.disparity = 0.3;
+    this.disparity = USUAL;
     this.onPath = true; // false where a hand holds the eye
     this.playing = false;
     this.clock = null; // how much of a turn is gone, 0..1
@@ -31,6 +33,7 @@ export class Viewer extends EventTarget {
     this.stage.show(description, layers);
     Object.assign(this.stage.zoom, { scale: 1, x: 0, y: 0 });
     this.onPath = true;
+    this.disparity = Math.min(USUAL, description.orbit.free);
     this.glide.left = 0;
     this.place();
     this.changed();

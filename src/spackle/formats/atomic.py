@@ -23,7 +23,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: where nothing can be written there, or the disk fills up.
     """
     target = check_writable(path)
-    temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}{target.suffix}")
+    stem = os.fsdecode(os.fsencode(target.stem)[:100]) if len(os.fsencode(target.stem)) > 100 else target.stem
+    temporary = target.with_name(f".{stem}.{secrets.token_hex(6)}{target.suffix}")
     try:
         yield temporary
         os.replace(temporary, target)
@@ -32,7 +33,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             raise  # about another file, such as an input that the block reads
         raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:

@@ -26,6 +26,7 @@ SUFFIXES = (
 )
 UNSPECIFIED, BT709, BT601 = 2, 1, 5  # FFmpeg's numbers of matrices
 HD_ROWS = 720  # a video that says nothing of its colours has BT.709's from this height on, as players take it
+LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # FFmpeg opens what they name
 HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
 DEFAULT_RATE = Fraction(25)
 
@@ -128,6 +129,8 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
         reason = reason_in_a_line(error)
         raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
     with container:
+        if LISTS & set(container.format.name.split(",")):
+            raise InputError(f"{path}: is a list of other files, not a video: give one of those")
         pictures = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
         if not pictures:
             what = "has sound but no moving picture" if container.streams.audio else "has no moving picture"
@@ -156,6 +159,8 @@ def _decoded(
                 count += 1
                 if count == first:
                     return
+    except InputError:
+        raise
     except (av.FFmpegError, ValueError) as error:
         raise InputError(
             f"{path}: frame {count} cannot be decoded ({reason_in_a_line(error)}): the clip is damaged or cut off"

@@ -43,6 +43,7 @@ class Columns:
                 raise ValueError(f"{name} of these Gaussians are not all finite")
         if torch.isnan(scales).any():
             raise ValueError("scales of these Gaussians are not all finite")
+        quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may be too large
         norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
         unit = torch.where(norm < SMALLEST_QUAT, torch.tensor([1.0, 0, 0, 0]), quats / norm.clamp_min(SMALLEST_QUAT))
         log_scales = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))

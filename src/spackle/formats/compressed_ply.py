@@ -35,7 +35,7 @@ def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, ba
     columns = columns.select(order)
     scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     starts = np.arange(0, count, CHUNK)
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count)]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count, None)]
     lines += [f"element chunk {len(starts)}", *(f"property float {name}" for name in _CHUNK_NAMES)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _VERTEX_NAMES), "end_header", ""]
     chunks = np.zeros((len(starts), len(_CHUNK_NAMES)), "<f4")
@@ -55,9 +55,11 @@ def morton_order(means: Floats) -> NDArray[np.int64]:
     """[N] an order of points [N, 3] along Morton's curve, which keeps neighbours together."""
     if not len(means):
         return np.zeros(0, np.int64)
-    low = means.min(axis=0)
-    span = np.maximum((means.max(axis=0) - low), np.float32(1e-30))
-    cells = ((means - low) / span * np.float32(2**GRID_BITS - 1)).astype(np.uint32)
+    # By logarithms: else one that is far away would put all the near ones into one cell.
+    places = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    low = places.min(axis=0)
+    span = np.maximum(places.max(axis=0) - low, 1e-30)
+    cells = ((places - low) / span * (2**GRID_BITS - 1)).astype(np.uint32)
     return np.argsort(sum(_spread(cells[:, axis]) << axis for axis in range(3)), kind="stable")
 
 
@@ -72,8 +74,10 @@ def _normalised(values: Floats, starts: NDArray[np.int64]) -> tuple[Floats, Floa
     """Values [N, 3] as shares 0..1 of their chunk's bounds, and the bounds [chunks, 6]: least, greatest."""
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     rows = np.arange(len(values)) // CHUNK
-    span = np.maximum(high - low, np.float32(1e-30))
-    return (values - low[rows]) / span[rows], np.concatenate([low, high], axis=1)
+    wide = low.astype(np.float64)  # the ends may be farther apart than a float32 can say
+    span = np.maximum(high - wide, 1e-30)
+    shares = (values - wide[rows]) / span[rows]
+    return shares.astype(np.float32), np.concatenate([low, high], axis=1)
 
 
 def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:

@@ -33,7 +33,7 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
     if check_file(path, "path file") > MAX_FILE_BYTES:
         raise InputError(f"{path}: too long for a path file (at most 4 MiB): is it the right file?")
     try:
-        with open(path, encoding="utf-8") as file:
+        with open(path, encoding="utf-8-sig") as file:
             content = json.load(file, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error

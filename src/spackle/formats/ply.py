@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator
@@ -36,9 +37,11 @@ _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
 
 
-# Comments of the header, which other readers pass over: the photo's camera, and how many Gaussians are the base's.
+# Comments of the header, which other readers pass over: the photo's camera, how many Gaussians are the base's, and how
+# far to the side the scene was completed.
 CAMERA_COMMENT = "spackle_camera"  # fx fy cx cy width height
 BASE_COMMENT = "spackle_base"
+DISPARITY_COMMENT = "spackle_disparity"
 
 
 @torch.no_grad()
@@ -48,6 +51,7 @@ def save_ply(
     *,
     camera: Camera | None = None,
     base_count: int | None = None,
+    disparity: float | None = None,
 ) -> None:
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
@@ -59,13 +63,14 @@ def save_ply(
         path: the file.
         camera: the photo's camera, at the world's origin; kept in a comment for `load_ply_camera`.
         base_count: how many of the first Gaussians are the base's; kept in a comment likewise.
+        disparity: how far the scene was completed, see `spackle.trajectory.max_offset`; likewise.
 
     Raises:
         InputError: where nothing can be written at `path`.
         ValueError: where a Gaussian is not finite.
     """
     count = len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count)]
+    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count, disparity)]
     lines.append(f"element vertex {count}")
     lines += [*(f"property float {name}" for name in _WRITTEN), "end_header", ""]
     columns = [t.detach().to("cpu", torch.float32).contiguous() for t in gaussians.tensors]
@@ -77,7 +82,7 @@ def save_ply(
             _encode([_padded(c[start : start + rows]) for c in columns], table)
             if not np.isfinite(table[:rows]).all():
                 raise ValueError(f"{path}: Gaussians {start} to {start + rows - 1} are not all finite")
-            table[:rows].tofile(file)
+            file.write(table[:rows].data)
 
 
 def load_ply(path: str | os.PathLike[str]) -> Gaussians:
@@ -159,14 +164,36 @@ def load_ply_base_count(path: str | os.PathLike[str]) -> int | None:
     return int(words[0])
 
 
-def header_comments(camera: Camera | None, base_count: int | None) -> list[str]:
-    """Header lines that keep the photo's camera, which stands at the world's origin, and the base's number."""
+def load_ply_disparity(path: str | os.PathLike[str]) -> float | None:
+    """How far `save_ply` was told that the scene was completed; None in other files.
+
+    Raises:
+        InputError: a broken file, or a number that makes no sense.
+    """
+    check_file(path, "PLY file")
+    with open(path, "rb") as file:
+        words = read_header(file, path).comments.get(DISPARITY_COMMENT)
+    if words is None:
+        return None
+    try:
+        (value,) = (float(word) for word in words)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise InputError(f"{path}: the stored disparity makes no sense: {' '.join(words)[:80]}")
+    return value
+
+
+def header_comments(camera: Camera | None, base_count: int | None, disparity: float | None) -> list[str]:
+    """Header lines that keep the photo's camera, which stands at the world's origin, and the two numbers."""
     lines = []
     if camera is not None:
         numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
         lines.append(" ".join(["comment", CAMERA_COMMENT, *(repr(number) for number in numbers)]))
     if base_count is not None:
         lines.append(f"comment {BASE_COMMENT} {base_count}")
+    if disparity is not None:
+        lines.append(f"comment {DISPARITY_COMMENT} {disparity!r}")
     return lines
 
 
@@ -195,6 +222,7 @@ def _encode(columns: list[Tensor], table: NDArray[np.float32]) -> None:
     o = np.clip(opacities.numpy(), SMALLEST_OPACITY, LARGEST_OPACITY)
     table[:, 9] = np.log(o / (1 - o))  # 1 - o is exact above one half
     table[:, 10:13] = np.log(np.clip(scales.numpy(), SMALLEST_SCALE, LARGEST_SCALE))
+    quats = quats / quats.abs().amax(-1, keepdim=True).clamp_min(1.0)  # their squares may be too large
     norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
     table[:, 13:17] = (quats / norm.clamp_min(SMALLEST_QUAT)).numpy()
     table[norm[:, 0].numpy() < SMALLEST_QUAT, 13] = 1.0

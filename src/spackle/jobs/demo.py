@@ -106,7 +106,7 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
     scene, cameras = _complete_path(prediction, renderer, reporter, seconds)
     with reporter.stage("write", seconds):
         save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
-        scene.save(output / "scene.ply")
+        scene.save(output / "scene.ply", disparity=DISPARITY)
     with reporter.stage("video", seconds) as step:
         total = len(cameras)
         views = ((step(i + 1, total), scene.render(camera, renderer).rgb)[1] for i, camera in enumerate(cameras))

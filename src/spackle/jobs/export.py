@@ -13,9 +13,18 @@ from rich.filesize import decimal
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats import atomic_path, check_writable, load_ply, load_ply_base_count, load_ply_camera, save_ply
+from spackle.formats import (
+    atomic_path,
+    check_writable,
+    load_ply,
+    load_ply_base_count,
+    load_ply_camera,
+    load_ply_disparity,
+    save_ply,
+)
 from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb
+from spackle.formats.ply_header import read_header
 from spackle.formats.sog import encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LARGEST, encode_spz, spz_grid
@@ -31,6 +40,7 @@ class Scene:
     gaussians: Gaussians
     camera: Camera | None  # the photo's
     base_count: int | None
+    disparity: float | None = None  # how far it was completed
 
     @staticmethod
     def load(path: Path) -> Scene:
@@ -39,7 +49,7 @@ class Scene:
         Raises:
             InputError: a file that is no scene.
         """
-        return Scene(path, load_ply(path), load_ply_camera(path), load_ply_base_count(path))
+        return Scene(path, load_ply(path), load_ply_camera(path), load_ply_base_count(path), load_ply_disparity(path))
 
     @property
     def untilted_camera(self) -> Camera | None:
@@ -50,7 +60,13 @@ class Scene:
 
 
 def _ply(scene: Scene, path: Path) -> None:
-    save_ply(scene.gaussians, path, camera=scene.untilted_camera, base_count=scene.base_count)
+    save_ply(
+        scene.gaussians,
+        path,
+        camera=scene.untilted_camera,
+        base_count=scene.base_count,
+        disparity=scene.disparity,
+    )
 
 
 def _compressed_ply(scene: Scene, path: Path) -> None:
@@ -105,8 +121,14 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
     twice = [output for output, target in zip(outputs, targets, strict=True) if targets.count(target) > 1]
     if twice:
         raise InputError(f"{twice[0]}: named twice: give each output once")
+    if os.path.realpath(scene) in map(str, targets):
+        raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
     loaded = Scene.load(scene)
-    size = os.path.getsize(scene)  # an output may take its place
+    size = os.path.getsize(scene)
+    if rest := _harmonics(scene):
+        reporter.say(
+            f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
+        )
     for output, writer in zip(outputs, writers, strict=True):
         start = time.perf_counter()
         try:
@@ -115,6 +137,13 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
         except InputError as error:
             raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
         _say(reporter, loaded, output, size, time.perf_counter() - start)
+
+
+def _harmonics(scene: Path) -> int:
+    """How many values above degree 0 each Gaussian of a file has."""
+    with open(scene, "rb") as file:
+        elements = read_header(file, scene).elements
+    return sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields)
 
 
 def writer_of(output: Path) -> Callable[[Scene, Path], None]:

@@ -115,9 +115,10 @@ def _predict_loaded(
     with reporter.stage("write", seconds):
         (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
         count = len(completed.base)
-        save_ply(completed.base, folder / "base.ply", camera=prediction.camera, base_count=count)
+        reach = None if options.cameras or options.path else options.disparity
         merged = Gaussians.cat([completed.base, completed.aux])
-        save_ply(merged, folder / "scene.ply", camera=prediction.camera, base_count=count)
+        for file, part in (("base.ply", completed.base), ("scene.ply", merged)):
+            save_ply(part, folder / file, camera=prediction.camera, base_count=count, disparity=reach)
     video = None
     if options.render:
         video = describe_video(plan, _video(options))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import mimetypes
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path, load_ply, load_ply_camera, save_png, save_video
-from spackle.formats.video import is_video_name
+from spackle.formats.video import FORMATS, is_video_name
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.jobs.film import Film, cover, fly, make_film
@@ -53,6 +54,8 @@ def render_scene(scene: Path, output: Path, options: RenderOptions, reporter: Re
     single = is_video_name(output)
     if single:
         options = dataclasses.replace(options, video=named_format(options.video, output))
+    elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
+        raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
     check_path_options(options.disparity, options.frames)
     check_view_options(options.cameras, options.path, options.video)
     renderer = get_renderer(options.device)

@@ -59,9 +59,9 @@ def check_video_options(options: VideoOptions) -> None:
 def _named(option: str, fps: float, loop: int | None, options: VideoOptions) -> None:
     """Blame an option for what the format refuses."""
     try:
-        check_video(f"video{options.suffix}", fps, loop)
+        check_video(name := f"video{options.suffix}", fps, loop)
     except InputError as error:
-        raise InputError(f"{option}: {error}") from error
+        raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
 
 
 def named_format(options: VideoOptions, file: Path) -> VideoOptions:

@@ -86,7 +86,8 @@ def complete(photo: Photo, name: str, options: PredictOptions, tools: Tools, tel
     try:
         done = complete_photo(photo, name, options, tools, teller, seconds)
         with teller.stage("page", seconds):
-            return page_scene(name, done.completed.base, done.completed.aux, done.prediction.camera)
+            completed, camera = done.completed, done.prediction.camera
+            return page_scene(name, completed.base, completed.aux, camera, options.disparity)
     except InputError as error:
         Reporter.say(teller, f"error: {error}")  # the page is told as the job ends
         raise

@@ -10,7 +10,7 @@ import torch
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats import load_ply, load_ply_base_count, load_ply_camera
+from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels
 from spackle.jobs.options import PredictOptions
@@ -18,6 +18,7 @@ from spackle.jobs.render import DEFAULT_SIZE
 from spackle.viewer import PageScene, page_scene
 
 MAGIC = b"ply"
+WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
 
 
 def is_scene(path: Path) -> bool:
@@ -27,6 +28,8 @@ def is_scene(path: Path) -> bool:
         InputError: there is no such file, or nothing in it.
     """
     check_file(path, "photo or scene")
+    if path.suffix.lower() in WRITTEN_ONLY:
+        raise InputError(f"{path}: {path.suffix} files are written, not read: give the scene.ply that it was made of")
     with open(path, "rb") as file:
         return path.suffix.lower() == ".ply" or file.read(len(MAGIC)) == MAGIC
 
@@ -45,11 +48,17 @@ def load_page_scene(path: Path, options: PredictOptions) -> PageScene:
     count = load_ply_base_count(path)
     base, aux = _parts(gaussians, len(gaussians) if count is None else count)
     try:
-        return page_scene(path.name, base, aux, camera)
+        return page_scene(name_of(path), base, aux, camera, load_ply_disparity(path))
     except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path.name}: ')}") from error
+        raise InputError(f"{path}: {str(error).removeprefix(f'{name_of(path)}: ')}") from error
     except ValueError as error:
         raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
+
+
+def name_of(path: Path) -> str:
+    """What people call a scene: the folder's name where every scene has the same one."""
+    path = path.absolute()
+    return path.parent.name if path.name in ("scene.ply", "base.ply") and path.parent.name else path.stem
 
 
 def _parts(gaussians: Gaussians, count: int) -> tuple[Gaussians, Gaussians]:

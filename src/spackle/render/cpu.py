@@ -19,7 +19,8 @@ from spackle.rendering import Rendering
 class CpuRenderer:
     """Classic 3D Gaussian splatting on the CPU; a `Renderer`.
 
-    The last whole drawing is remembered: more sets on top of it, in some tiles, cost those tiles only.
+    The last whole drawing is remembered: more sets on top of it, in some tiles, cost those tiles only. Changes that
+    PyTorch makes in place are noticed; writes to the same memory through NumPy or `.data` are not.
     """
 
     def __init__(self) -> None:

@@ -81,11 +81,14 @@ class GsplatRenderer:
         ), home
 
     def _on_device(self, tensor: Tensor) -> Tensor:
-        if tensor.requires_grad or tensor.device == self.device:
+        own = tensor.device.type == self.device.type and self.device.index in (None, tensor.device.index)
+        if own or tensor.requires_grad or tensor.is_inference():
             return tensor.to(self.device, torch.float32)
-        if tensor not in self._there:
-            self._there[tensor] = tensor.to(self.device, torch.float32)
-        there: Tensor = self._there[tensor]
+        there: Tensor
+        version, there = self._there.get(tensor, (None, tensor))  # type: ignore[no-untyped-call]
+        if version != tensor._version:  # new, or changed in place
+            there = tensor.to(self.device, torch.float32)
+            self._there[tensor] = (tensor._version, there)
         return there
 
     def _draw(self, part: Gaussians, cameras: Sequence[Camera], eps2d: float, wanted: Tensor | None) -> Rendering:

@@ -23,6 +23,7 @@ from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 
+State = tuple[int, int]  # the count of a tensor's changes in place, and where it lies
 MERGE_GRAIN = 64  # tiles a thread merges at a time
 
 
@@ -33,7 +34,7 @@ class Kept:
     view: View
     splats: Splats  # with room for more
     lists: TileLists
-    tensors: list[tuple[weakref.ref[Tensor], int]]  # and their versions, which count changes in place
+    tensors: list[tuple[weakref.ref[Tensor], State]]
     sets: int
     count: int  # Gaussians in those sets
 
@@ -43,7 +44,7 @@ class Kept:
         return (
             len(flat) == len(self.tensors)
             and self.view.same_as(view)
-            and all(ref() is t and version == t._version for (ref, version), t in zip(self.tensors, flat, strict=True))
+            and all(ref() is t and state == _state(t) for (ref, state), t in zip(self.tensors, flat, strict=True))
         )
 
 
@@ -59,7 +60,7 @@ class Memory:
         flat = [tensor for part in sets for tensor in part.tensors]
         self._kept = None
         if not any(tensor.is_inference() for tensor in flat):  # such tensors do not count their changes
-            refs = [(weakref.ref(tensor), tensor._version) for tensor in flat]
+            refs = [(weakref.ref(tensor), _state(tensor)) for tensor in flat]
             count = sum(len(part) for part in sets)
             self._kept = Kept(drawing.view, drawing.splats, drawing.lists, refs, len(sets), count)
 
@@ -77,6 +78,11 @@ class Memory:
             return _add(kept, more, wanted, onto)
         finally:
             self._lock.release()
+
+
+def _state(tensor: Tensor) -> State:
+    """What changes when PyTorch changes a tensor in place; a write to its memory by others is not seen."""
+    return tensor._version, tensor.data_ptr()
 
 
 def _add(kept: Kept, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:

@@ -126,6 +126,8 @@ class Handler(BaseHTTPRequestHandler):
         if not self.request_version.startswith("HTTP/1."):
             self.request_version = "HTTP/1.0"  # an answer to HTTP/0.9 would have no headers
             return HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "this server speaks HTTP/1.1"
+        if self.headers.defects:  # what stands below the broken line was not read
+            return HTTPStatus.BAD_REQUEST, "a line of the headers makes no sense"
         line = refusal(self.headers, self.site.names, local=self.site.local)
         return (HTTPStatus.FORBIDDEN, line) if line else None
 

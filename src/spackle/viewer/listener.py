@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import sys
@@ -55,6 +56,9 @@ class Listener(ThreadingHTTPServer):
             super().__init__(place, Handler)
         except (OSError, OverflowError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            if isinstance(error, OSError) and error.errno == errno.EADDRNOTAVAIL:
+                line = f"--host {host}: is no address of this machine: leave it out, or give 0.0.0.0 for all of them"
+                raise InputError(line) from error
             raise InputError(f"--port {port}: cannot listen at {host}: {reason}: give another, or none") from error
         numeric = str(self.server_address[0])
         self.local, self.names = is_loopback(numeric), own_names(host, numeric)

@@ -13,7 +13,9 @@ from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_off
 from spackle.viewer.layers import encode_layer
 
 SAMPLES = 121  # of a path, between which the page goes straight
-FREE, LIMIT = 0.6, 1.0  # disparities up to which the eye follows the hand, and that it never passes
+USUAL, FOREIGN = 0.3, 0.6  # disparities that a scene is good for if nobody says: a completed one, one of others
+LEAST, MOST = 0.1, 1.0
+BEYOND = 1.3  # how much farther than that the eye never goes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +26,7 @@ class PageScene:
     files: dict[str, bytes]  # the layers, by the names that the description gives them
 
 
-def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera) -> PageScene:
+def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None) -> PageScene:
     """A scene for the page.
 
     The description's `paths` hold, for each trajectory, eye positions [SAMPLES, 3] in metres: the eye stands at
@@ -35,6 +37,7 @@ def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera) -> Pa
         base: what the photo shows.
         aux: what completion added; may be empty.
         camera: the photo's, at the world's origin.
+        disparity: how far it was completed: up to there the eye follows the hand, and little farther.
 
     Raises:
         InputError: where no Gaussian stands in front of the camera.
@@ -42,6 +45,7 @@ def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera) -> Pa
     if not bool((base.means[:, 2] > 0).any()):
         raise InputError(f"{name}: no Gaussian stands in front of the photo's camera: nothing can be shown")
     depths = DepthRange.of(base)
+    free = min(max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST)
     files, layers = {}, []
     for layer, gaussians in {"base": base, "aux": aux}.items():
         encoded, file = encode_layer(gaussians), f"{layer}.splats"
@@ -53,7 +57,7 @@ def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera) -> Pa
         "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height},
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": FREE, "limit": LIMIT},
+        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": BEYOND * free},
         "paths": {kind: _path(kind, camera, depths) for kind in TRAJECTORIES},
         "layers": layers,
     }

@@ -6,6 +6,7 @@ files out of memory. A framework would be one more thing to install, to keep up 
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
@@ -120,7 +121,7 @@ class ViewerServer:
         path = Path(tempfile.mkdtemp(dir=self.uploads.name)) / f"upload{promise.suffix}"
 
         def remove() -> None:
-            path.unlink(missing_ok=True)
+            shutil.rmtree(path.parent, ignore_errors=True)
 
         def job(tell: Tell) -> str:
             try:
