@@ -10,12 +10,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import Scene, texture
+from scenes import Scene, box_before_wall, texture
 from torch import Tensor, nn
 
 from spackle.camera import Camera
 from spackle.render import CpuRenderer
-from spackle.residual import Cues, ResidualNet, Seeds, make_seeds
+from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds
+from spackle.residual.complete import SEEDS_HAR
 from spackle.residual.crops import Crop, crops_around
 from spackle.residual.network import STRIDE, predict_deltas
 from spackle.residual.rim import Rim
@@ -120,3 +121,20 @@ def test_an_empty_mask_costs_the_network_nothing(view: tuple[Cues, Seeds, Rim], 
     counting = Counting(network)
     predict_deltas(counting, dataclasses.replace(cues, mask=torch.zeros_like(cues.mask)), seeds, rim)
     assert counting.cells == 0
+
+
+def test_specks_of_a_path_are_the_seeds_alone_and_great_holes_the_networks(network: ResidualNet) -> None:
+    scene = box_before_wall(width=160, height=120, focal=133)
+    counting = Counting(network)
+    subject = Completer(scene.base(), scene.camera, CpuRenderer(), counting)  # type: ignore[arg-type]
+    depths = DepthRange.of(subject.base)
+    wide, little = (extremes(scene.camera, disparity, depths)[1] for disparity in (0.3, 0.006))
+    holes = [hole_area_ratio(subject.renderer.render(subject.base, camera).alpha) for camera in (wide, little)]
+    assert holes[1] < SEEDS_HAR < holes[0]
+    assert len(subject.complete_scene([little])) > 0
+    assert counting.cells == 0
+    assert len(subject.complete_scene([little], exact=True)) > 0
+    assert counting.cells > 0
+    counting.cells = 0
+    subject.complete_scene([wide])
+    assert counting.cells > 0

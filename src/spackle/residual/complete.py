@@ -24,6 +24,7 @@ PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 # What may stay open in a view of a path: little of the picture, and little of the hole that was there.
 QUIET_HAR, VISIBLE_HAR, QUIET_SHARE = 5e-4, 2e-3, 0.01
+SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +102,9 @@ class Completer:
             camera = cameras[index]
             before = self.renderer.render([self.base, aux], camera)
             if not self._is_quiet(before, camera, exact):
-                new, after = self._fill(camera, shields, [self.base, aux], before)
+                small = hole_area_ratio(before.alpha, self.threshold) < SEEDS_HAR and not exact
+                chosen = dataclasses.replace(self, network=None) if small else self
+                new, after = chosen._fill(camera, shields, [self.base, aux], before)
                 aux = Gaussians.cat([aux, new])
                 shields.append(Shield.of(after, camera, self.threshold))
             if progress:
