@@ -14,10 +14,10 @@ from torch.autograd.function import once_differentiable
 
 from spackle.gaussians import Gaussians
 from spackle.render.blend_backward import backward_tiles, collect_sums, count_wanted
+from spackle.render.paste import tile_mask
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array, draw
 from spackle.render.project import View
 from spackle.render.project_backward import project_backward
-from spackle.render.protocol import TILE
 from spackle.render.walk import SUMS
 from spackle.rendering import Rendering
 from spackle.threads import run_chunks, thread_count
@@ -95,7 +95,7 @@ class Draw(torch.autograd.Function):
 def keep_undrawn(gradient: Tensor, wanted: Array) -> Tensor:
     """The gradient of the image that was drawn onto: nothing where tiles were drawn over it."""
     height, width = gradient.shape[:2]
-    drawn = torch.from_numpy(wanted).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+    drawn = tile_mask(torch.from_numpy(wanted), height, width)
     return torch.where(drawn if gradient.ndim == 2 else drawn[..., None], 0, gradient)
 
 

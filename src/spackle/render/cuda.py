@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
+from spackle.render.paste import paste
 from spackle.render.protocol import NEAR_PLANE, TILE
 from spackle.rendering import Rendering
 
@@ -56,7 +56,8 @@ class GsplatRenderer:
         wanted = None if tiles is None else tiles.to(self.device, torch.bool)
         found = _first(self._draw(sets, [camera], eps2d, None if wanted is None else wanted[None]))
         if wanted is not None:
-            found = _pasted(found, wanted, onto)
+            under = None if onto is None else Rendering(*(t.to(found.rgb) for t in (onto.rgb, onto.depth, onto.alpha)))
+            found = paste(found, wanted, under)
         return Rendering(*(image.to(home) for image in (found.rgb, found.depth, found.alpha)))
 
     def render_batch(
@@ -171,16 +172,3 @@ def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
 
 def _first(rendering: Rendering) -> Rendering:
     return Rendering(rendering.rgb[0], rendering.depth[0], rendering.alpha[0])
-
-
-def _pasted(drawn: Rendering, wanted: Tensor, onto: Rendering | None) -> Rendering:
-    """The wanted tiles of a drawing, and the rest of `onto`, or black."""
-    height, width = drawn.alpha.shape
-    mask = wanted.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
-
-    def mixed(image: Tensor, other: Any) -> Tensor:
-        under = torch.zeros_like(image) if other is None else other.to(image)
-        return torch.where(mask if image.ndim == 2 else mask[..., None], image, under)
-
-    under = (None, None, None) if onto is None else (onto.rgb, onto.depth, onto.alpha)
-    return Rendering(*(mixed(a, b) for a, b in zip((drawn.rgb, drawn.depth, drawn.alpha), under, strict=True)))

@@ -13,7 +13,8 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.gaussians import Gaussians, quat_to_matrix
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
+from spackle.render.paste import paste
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTANCE_STOP
 from spackle.rendering import Rendering
 
 
@@ -89,15 +90,3 @@ def falloff(gaussians: Gaussians, camera: Camera, eps2d: float) -> Tensor:
     # The squared distance in standard deviations, dᵀ Σ⁻¹ d.
     distance = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / torch.where(proper, det, 1)
     return torch.where(proper, gaussians.opacities[:, None, None] * torch.exp(-0.5 * distance), 0)
-
-
-def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
-    """Keep the chosen tiles of a rendering, [rows, columns] bool, and the rest of `onto`, or black."""
-    height, width = rendering.alpha.shape
-    if tuple(tiles.shape) != (-(-height // TILE), -(-width // TILE)):
-        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected one of each {TILE}×{TILE} pixels")
-    mask = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
-    parts = (rendering.rgb, rendering.depth, rendering.alpha)
-    others = (onto.rgb, onto.depth, onto.alpha) if onto is not None else tuple(torch.zeros_like(p) for p in parts)
-    rgb = torch.where(mask[..., None], parts[0], others[0])
-    return Rendering(rgb, torch.where(mask, parts[1], others[1]), torch.where(mask, parts[2], others[2]))
