@@ -35,11 +35,11 @@ from spackle.render import CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.carve import CLEARANCE, MAX_REACH_PX, REACH, SHIELD_PX, STEPS, Shield, push_behind
-from spackle.residual.complete import farthest_first
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.network import IN_CHANNELS, network_input
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import OPACITY, cell_centers
+from spackle.residual.visits import farthest_first
 from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
 CPU = CpuRenderer()

@@ -19,11 +19,13 @@ from spackle.residual.cues import MASK_THRESHOLD, Cues, hole_area_ratio
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds, make_seeds
+from spackle.residual.tuck import tucked
+from spackle.residual.visits import Visits, farthest_first
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
-# What may stay open in a view of a path: little of the picture, and little of the hole that was there.
-QUIET_HAR, VISIBLE_HAR, QUIET_SHARE = 5e-4, 2e-3, 0.01
+QUIET_HAR = 1e-3  # fewer holes than this may stay open in a view of a path
+WIDEST = 8  # views of a path whose own content stays in front from the first
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
 
@@ -88,47 +90,55 @@ class Completer:
         """One set of aux Gaussians for a whole path, the same from every frame.
 
         Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
-        added, and may add only behind what the photo and the views before it show.
+        added, and may add only behind what the photo, the widest views and the views before it show.
 
         Args:
-            cameras: the path.
+            cameras: the frames of a path, in their order.
             exact: complete every view that has a hole; else what nobody would see may stay open.
             progress: called with (views visited, views in all).
         """
         order = farthest_first(cameras, self.photo_camera)
-        shields = [self.photo_shield()] if order else []
+        shields = self._first_shields(cameras, order)
+        visits = Visits(len(cameras))
         aux = Gaussians.empty()
         for count, index in enumerate(order):
-            camera = cameras[index]
-            before = self.renderer.render([self.base, aux], camera)
-            if not self._is_quiet(before, camera, exact):
-                small = hole_area_ratio(before.alpha, self.threshold) < SEEDS_HAR and not exact
-                chosen = dataclasses.replace(self, network=None) if small else self
-                new, after = chosen._fill(camera, shields, [self.base, aux], before)
-                aux = Gaussians.cat([aux, new])
-                shields.append(Shield.of(after, camera, self.threshold))
+            if exact or not visits.known(index):
+                camera = cameras[index]
+                before = self.renderer.render([self.base, aux], camera)
+                holes = hole_area_ratio(before.alpha, self.threshold)
+                quiet = holes <= (0.0 if exact else QUIET_HAR)
+                if not quiet:
+                    others = [shield for of, shield in shields.items() if of != index]
+                    chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
+                    new, after = chosen._fill(camera, others, [self.base, aux], before, tuck=True)
+                    aux = Gaussians.cat([aux, new])
+                    shields[index] = Shield.of(after, camera, self.threshold)
+                visits.looked(index, quiet)
             if progress:
                 progress(count + 1, len(order))
         return aux
 
-    def _is_quiet(self, rendering: Rendering, camera: Camera, exact: bool) -> bool:
-        """Whether a view needs no completion."""
-        holes = hole_area_ratio(rendering.alpha, self.threshold)
-        if exact or holes > VISIBLE_HAR:
-            return holes == 0
-        if holes < QUIET_HAR:
-            return True
-        alone = self.renderer.render(self.base, camera)
-        return holes < QUIET_SHARE * hole_area_ratio(alone.alpha, self.threshold)
+    def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> dict[int, Shield]:
+        """What stays in front from the first: the photo (-1), and what the base shows from the widest views."""
+        if not order:
+            return {}
+        wide = {index: self.renderer.render(self.base, cameras[index]) for index in order[:WIDEST]}
+        shields = {index: Shield.of(view, cameras[index], self.threshold) for index, view in wide.items()}
+        return {-1: self.photo_shield(), **shields}
 
     def _fill(
-        self, camera: Camera, shields: Sequence[Shield], there: Sequence[Gaussians], rendering: Rendering
+        self,
+        camera: Camera,
+        shields: Sequence[Shield],
+        there: Sequence[Gaussians],
+        rendering: Rendering,
+        tuck: bool = False,
     ) -> tuple[Gaussians, Rendering]:
         """New aux Gaussians for a view, and the view with them."""
         added = [Gaussians.empty()]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = self._propose(rendering, camera, self.network if turn == 0 else None)
+            new = self._propose(rendering, camera, self.network if turn == 0 else None, tuck)
             if not len(new):
                 break
             new = push_behind(new, camera.position, shields)
@@ -139,34 +149,17 @@ class Completer:
                 break
         return Gaussians.cat(added), rendering
 
-    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None) -> Gaussians:
-        """One Gaussian for each masked cell of a rendering."""
+    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None, tuck: bool) -> Gaussians:
+        """One Gaussian for each masked cell of a rendering, and those beneath the holes' rims."""
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return Gaussians.empty()
         seeds = make_seeds(cues, camera, self.photo_camera)
         deltas = None if network is None else self._deltas(network, cues, seeds, camera)
-        return compose(seeds.select(cues.mask), deltas, camera)
+        new = compose(seeds.select(cues.mask), deltas, camera)
+        return Gaussians.cat([new, tucked(cues, seeds, camera)]) if tuck else new
 
     def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
         """[n, 14] for the masked cells."""
         rim = Rim.of(cues, seeds, camera, self.photo_camera)
         return predict_deltas(network, cues, seeds, rim, self.precision)[cues.mask]
-
-
-def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """An order that visits the widest view first and then always the one farthest from all visited.
-
-    Any beginning of it is spread evenly over the path.
-    """
-    if not cameras:
-        return []
-    eyes = torch.stack([camera.position.double() for camera in cameras])
-    distance = (eyes - photo_camera.position.double()).norm(dim=-1)
-    order: list[int] = []
-    for _ in cameras:
-        pick = int(distance.argmax())
-        order.append(pick)
-        distance = torch.minimum(distance, (eyes - eyes[pick]).norm(dim=-1))
-        distance[pick] = -1.0
-    return order
