@@ -24,3 +24,9 @@ def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` whose sums may be reordered, which lets them run in vector registers."""
     compiled = numba.njit(cache=True, nogil=True, fastmath={"reassoc", *_FASTMATH}, error_model="numpy")(function)
     return cast("Callable[..., R]", compiled)
+
+
+def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
+    """A `kernel` that becomes part of the loops that call it, which only then run in vector registers."""
+    compiled = numba.njit(cache=True, nogil=True, fastmath=_FASTMATH, error_model="numpy", forceinline=True)(function)
+    return cast("Callable[..., R]", compiled)

@@ -1,16 +1,17 @@
-"""The few functions of a pixel, without branches or calls, so that whole rows run in vector registers."""
+"""The few functions of a pixel or a Gaussian, without branches or calls, so that whole rows run in vector registers."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle._numba import kernel
+from spackle._numba import inlined_kernel, kernel
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN
 
-# Constants are float32 throughout: a Python float would widen a whole expression to float64.
+# Constants of the pixels' functions are float32 throughout: a Python float would widen a whole expression to float64.
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 LIMIT = np.float32(ALPHA_MAX)
 FAINT = np.float32(ALPHA_MIN)
@@ -20,6 +21,8 @@ ROUND_BITS = np.int32(0x4B400000)
 MANTISSA = np.int32(23)
 KNEE = np.float32(0.0031308)  # where sRGB turns from a line into a power
 LINE = np.float32(12.92)
+ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half
+LN_2 = math.log(2.0)
 
 
 def _power_series(function: Any, low: float, high: float, degree: int) -> list[np.float32]:
@@ -36,6 +39,9 @@ MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
 S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
     lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
 )
+
+# ln((1 + t) / (1 - t)) is 2t + 2t³/3 + 2t⁵/5 + …; what is left out is below float64's last digit for t² < 0.0295.
+L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
 
 
 @kernel
@@ -69,3 +75,15 @@ def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
     """The derivative of `encode_srgb`, whose value is known: 0 where it clamps."""
     slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
     return slope if ZERO <= linear <= ONE else ZERO
+
+
+@inlined_kernel
+def natural_log(x: np.float32) -> float:
+    """The logarithm of a positive number, to float64's last digits."""
+    bits = np.float32(x).view(np.int32)
+    exponent = (bits - ROOT_HALF_BITS) >> MANTISSA
+    m = np.float64(np.int32(bits - (exponent << MANTISSA)).view(np.float32))  # from sqrt(1/2) to sqrt(2)
+    t = (m - 1.0) / (m + 1.0)
+    s = t * t
+    series = L3 + s * (L5 + s * (L7 + s * (L9 + s * (L11 + s * (L13 + s * (L15 + s * (L17 + s * L19)))))))
+    return np.float64(exponent) * LN_2 + (2.0 * t + t * s * series)

@@ -14,7 +14,8 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.blend import blend_tiles
-from spackle.render.project import Splats, View, count_before, project_chunk
+from spackle.render.project import Splats, View, count_before
+from spackle.render.project_forward import project_chunk
 from spackle.render.sort import sort_by_depth
 from spackle.render.tiles import TileLists, list_tiles
 from spackle.rendering import Rendering

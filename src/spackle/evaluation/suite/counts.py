@@ -14,7 +14,8 @@ from spackle.evaluation.suite.arithmetic import operations_of
 from spackle.evaluation.suite.values import Need
 from spackle.gaussians import Gaussians
 from spackle.render import project as projection
-from spackle.render.approx import ONE, ZERO, alpha_of, encode_srgb, exp2
+from spackle.render import project_forward as forward
+from spackle.render.approx import ONE, ZERO, alpha_of, encode_srgb, exp2, natural_log
 from spackle.render.blend import (
     CHECK_EVERY,
     INVISIBLE,
@@ -39,8 +40,8 @@ BOX, KEY, ID, START = 4 * 2, 4, 4, 8
 PIXEL = FLOAT * (3 + 1 + 1)  # colour, depth, alpha
 PASSES = 3  # of the radix sort
 
-INTEGERS = frozenset({"i", "first", "start", "found", "out", "row"})  # in the kernels' sources
-EDGES = frozenset({"left", "right", "top", "bottom"})  # in that of `cover`
+INTEGERS = frozenset({"i", "k", "first", "found", "row", "bits", "exponent"})  # in the kernels' sources
+EDGES = frozenset({"left", "right", "top", "bottom"})  # in those of the projection
 SPLAT_OPERATIONS = 4  # of a Gaussian in a tile: its centre, counted from the tile's corner
 DEPTH_OPERATIONS = 2  # of a pixel: depth over alpha, where that is more than zero
 DEPTH_TEST = 10  # of a Gaussian behind the camera: z in three products and three sums, and the four comparisons
@@ -71,11 +72,11 @@ def drawing_needs(sets: Sequence[Gaussians], view: View, tiles: Array | None = N
 def project_need(gaussians: int, visible: int) -> Need:
     """Read five tensors of each; write the record, the box, the key and the id of each visible one.
 
-    A visible one's operations are those written in `project_chunk`, `covariance`, `cover` and `touches`, in float64;
+    A visible one's operations are those written in `measure_block` and what it calls, and in `pack_block`, in float64;
     of any other it takes the depth to know that.
     """
-    each = sum(operations_of(part, INTEGERS) for part in (projection.project_chunk, projection.covariance))
-    each += operations_of(projection.cover, EDGES)
+    parts = (forward.measure_block, forward.covariance, natural_log, forward.cover, forward.cover, forward.pack_block)
+    each = sum(operations_of(part, INTEGERS | EDGES) for part in parts)
     operations = float(visible * each + (gaussians - visible) * DEPTH_TEST)
     return Need(float(gaussians * GAUSSIAN + visible * (RECORD + BOX + KEY + ID)), {"fp64": operations})
 

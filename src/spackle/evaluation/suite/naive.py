@@ -15,7 +15,8 @@ from spackle.camera import Camera
 from spackle.evaluation.suite.clock import Lap
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
-from spackle.render.project import View, covariance
+from spackle.render.project import View
+from spackle.render.project_forward import covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
 from spackle.threads import run_chunks
 
