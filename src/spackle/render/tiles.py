@@ -48,30 +48,35 @@ def count_entries(
     first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
 ) -> None:
     """Count the entries that pieces first..last of the order bring to each tile, and sort the boxes on the way."""
-    columns = wanted.shape[1]
+    columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         row_counts = counts[piece]
-        for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            box = boxes[order[k]]
-            left, right, top, bottom = box[0], box[1], box[2], box[3]
+        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            k = np.uint64(place)  # unsigned numbers need no look at whether they count from an array's end
+            i = np.uint64(order[k])
+            left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
             sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
-            for row in range(top, bottom):
-                for column in range(left, right):
-                    row_counts[row * columns + column] += wanted[row, column]
+            # Of bounds that it cannot keep, the compiler makes plain loops: vectors for two tiles cost more.
+            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
+                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+                    tile = np.uint64(row * columns + column)
+                    if flat[tile]:
+                        row_counts[tile] += 1
 
 
 @kernel
 def write_entries(
-    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, positions: Array, ids: Array
+    first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
 ) -> None:
     """Write the entries that pieces first..last of the order, whose boxes are sorted, bring to each tile."""
-    columns = wanted.shape[1]
+    columns, flat = wanted.shape[1], wanted.reshape(-1)
     for piece in range(first, last):
         places = positions[piece]
-        for k in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
-            for row in range(boxes[k, 2], boxes[k, 3]):
-                for column in range(boxes[k, 0], boxes[k, 1]):
-                    if wanted[row, column]:
-                        tile = row * columns + column
-                        ids[places[tile]] = order[k]
+        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            k = np.uint64(place)
+            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
+                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+                    tile = np.uint64(row * columns + column)
+                    if flat[tile]:
+                        ids[np.uint64(places[tile])] = order[k]
                         places[tile] += 1
