@@ -7,16 +7,19 @@ import importlib
 import importlib.util
 import sys
 from types import ModuleType
+from typing import Any
 
 import gsplat_stand_in
 import pytest
 import torch
 from scenes import box_before_wall, same_bits, shifted
+from torch import Tensor
 
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, get_renderer
 from spackle.render.cuda import GsplatRenderer, load_gsplat
+from spackle.render.cuda_sets import SetStore
 from spackle.rendering import Rendering
 
 CPU = CpuRenderer()
@@ -105,19 +108,52 @@ def test_many_cameras_in_one_call_are_the_same_as_one_by_one(gpu: GsplatRenderer
         gpu.render_batch(BASE, [SIDE, SIDE.resized(30, 20)])
 
 
-def test_a_scene_travels_once(gpu: GsplatRenderer) -> None:
-    if gpu.device.type == "cpu":
-        gpu.device = torch.device("meta")  # anywhere else
-    first = [gpu._on_device(tensor) for tensor in BASE.tensors]
-    assert all(gpu._on_device(tensor) is there for tensor, there in zip(BASE.tensors, first, strict=True))
-    changing = BASE.colors.clone()
-    before = gpu._on_device(changing)
-    assert gpu._on_device(changing.mul_(0.5)) is not before
-    at_home = torch.ones(3, device=gpu.device)
-    assert gpu._on_device(at_home) is at_home
-    assert at_home not in gpu._there
-    asking = BASE.colors.clone().requires_grad_()
-    assert gpu._on_device(asking) is not gpu._on_device(asking)  # it changes at every step of a training
+def test_a_scene_travels_once() -> None:
+    store = SetStore(torch.device("cpu"))
+    kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
+    first = store.material(kept)
+    assert store.material(kept) is first
+    assert store.material(dataclasses.replace(kept, colors=kept.colors.clone())) is not first
+    again = store.material(kept)
+    kept.colors.mul_(0.5)
+    assert store.material(kept) is not again
+    torch.testing.assert_close(store.material(kept).colors, kept.colors)
+    asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in BASE.tensors))
+    assert store.material(asking) is not store.material(asking)  # it changes at every step of a training
+    with torch.inference_mode():
+        passing = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
+        assert store.material(passing) is not store.material(passing)
+    assert len(store._entries) == 1
+    del kept
+    assert len(store._entries) == 0
+
+
+def test_a_scene_is_projected_once_for_a_camera(gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    counts: list[int] = []
+    package = gpu._gsplat
+
+    class Counting:
+        def __getattr__(self, name: str) -> Any:
+            return getattr(package, name)
+
+        def fully_fused_projection(self, means: Tensor, *arguments: Any, **options: Any) -> Any:
+            counts.append(len(means))
+            return package.fully_fused_projection(means, *arguments, **options)
+
+    monkeypatch.setattr(gpu, "_gsplat", Counting())
+    more = BASE.select(slice(0, 50))
+    tiles = torch.ones(3, 3, dtype=torch.bool)
+    whole = gpu.render(BASE, SIDE)
+    redrawn = gpu.render([BASE, more], SIDE, tiles=tiles, onto=whole)
+    gpu.render([BASE, more], SIDE)
+    assert counts == [len(BASE), 50]
+    assert same_bits(redrawn, gpu.render([BASE, more], SIDE))
+    gpu.render(BASE, SCENE.camera)
+    gpu.render(BASE, SIDE, eps2d=0.3)
+    assert counts == [len(BASE), 50, len(BASE), len(BASE)]
+    gpu.render_batch(BASE, [SIDE, SIDE])
+    gpu.render_batch(BASE, [SIDE, SIDE])
+    assert counts[4:] == [len(BASE)] * 2  # what many cameras see would be too much to remember
 
 
 def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from types import ModuleType
 
 import torch
 from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
+from spackle.render.cuda_sets import Material, Projection, SetStore
 from spackle.render.paste import paste
 from spackle.render.protocol import NEAR_PLANE, TILE
 from spackle.rendering import Rendering
 
-UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # gsplat's order of a symmetric matrix' six values
 EXTRA = "pip install 'spackle-nvs[cuda]'"
 
 
@@ -26,7 +24,8 @@ class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
     Gaussians may lie on the processor or on the GPU: the images come back to where the first set lies. What asks for
-    no gradient is kept on the GPU as long as its tensors live, so that a scene travels there once.
+    no gradient is remembered on the GPU as long as its tensors live: a scene travels there once, and is projected once
+    for a camera however often some of its tiles are drawn again with more sets.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
@@ -37,7 +36,7 @@ class GsplatRenderer:
         """
         self.device = torch.device(device)
         self._gsplat = load_gsplat(self.device)
-        self._there = WeakTensorKeyDictionary()
+        self._store = SetStore(self.device)
 
     def render(
         self,
@@ -49,7 +48,7 @@ class GsplatRenderer:
         onto: Rendering | None = None,
     ) -> Rendering:
         """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
-        sets, home = self._upload(gaussians)
+        sets = _listed(gaussians)
         grid = (-(-camera.height // TILE), -(-camera.width // TILE))
         if tiles is not None and tuple(tiles.shape) != grid:
             raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}")
@@ -58,7 +57,7 @@ class GsplatRenderer:
         if wanted is not None:
             under = None if onto is None else Rendering(*(t.to(found.rgb) for t in (onto.rgb, onto.depth, onto.alpha)))
             found = paste(found, wanted, under)
-        return Rendering(*(image.to(home) for image in (found.rgb, found.depth, found.alpha)))
+        return Rendering(*(image.to(_home(sets)) for image in (found.rgb, found.depth, found.alpha)))
 
     def render_batch(
         self, gaussians: Gaussians | Sequence[Gaussians], cameras: Sequence[Camera], *, eps2d: float = 0.0
@@ -68,53 +67,49 @@ class GsplatRenderer:
             raise ValueError("cameras drawn in one call must have one size")
         if not cameras:
             return []
-        sets, home = self._upload(gaussians)
-        rgb, depth, alpha = (image.to(home) for image in dataclasses.astuple(self._draw(sets, cameras, eps2d, None)))
+        sets = _listed(gaussians)
+        drawn = self._draw(sets, cameras, eps2d, None)
+        rgb, depth, alpha = (image.to(_home(sets)) for image in (drawn.rgb, drawn.depth, drawn.alpha))
         return [Rendering(*images) for images in zip(rgb, depth, alpha, strict=True)]
 
-    def _upload(self, gaussians: Gaussians | Sequence[Gaussians]) -> tuple[Gaussians, torch.device]:
-        """All sets as one on the GPU, and where the first one lies."""
-        sets = [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians]
-        home = sets[0].means.device if sets else torch.device("cpu")
-        there = [Gaussians(*(self._on_device(tensor) for tensor in part.tensors)) for part in sets]
-        return _usable(
-            there[0] if len(there) == 1 else Gaussians.cat([Gaussians.empty().to(self.device), *there])
-        ), home
-
-    def _on_device(self, tensor: Tensor) -> Tensor:
-        own = tensor.device.type == self.device.type and self.device.index in (None, tensor.device.index)
-        if own or tensor.requires_grad or tensor.is_inference():
-            return tensor.to(self.device, torch.float32)
-        there: Tensor
-        version, there = self._there.get(tensor, (None, tensor))  # type: ignore[no-untyped-call]
-        if version != tensor._version:  # new, or changed in place
-            there = tensor.to(self.device, torch.float32)
-            self._there[tensor] = (tensor._version, there)
-        return there
-
-    def _draw(self, part: Gaussians, cameras: Sequence[Camera], eps2d: float, wanted: Tensor | None) -> Rendering:
+    def _draw(
+        self, sets: Sequence[Gaussians], cameras: Sequence[Camera], eps2d: float, wanted: Tensor | None
+    ) -> Rendering:
         """[C, …] images of all cameras, drawn where `wanted` [C, rows, columns] says; elsewhere they hold anything."""
         count, width, height = len(cameras), cameras[0].width, cameras[0].height
         rows, columns = -(-height // TILE), -(-width // TILE)
-        views = torch.stack([camera.world_to_camera.to(self.device, torch.float32) for camera in cameras])
-        lenses = torch.stack([camera.K.to(self.device, torch.float32) for camera in cameras])
-        covariances = part.covariances()[:, UPPER[0], UPPER[1]]
-        opacities = part.opacities
-        radii, means2d, depths, conics, _ = self._gsplat.fully_fused_projection(
-            part.means, covariances, None, None, views, lenses, width, height,
-            eps2d=eps2d, near_plane=NEAR_PLANE, opacities=opacities,
-        )  # fmt: skip
+        parts = [self._store.material(part) for part in sets]
+        seen = self._seen(sets, cameras, eps2d)
+        radii = seen.radii
         if wanted is not None:
-            radii = radii * _touching(means2d.detach(), radii, wanted)[..., None]
-        _, keys, ids = self._gsplat.isect_tiles(means2d.detach(), radii, depths.detach(), TILE, columns, rows)
+            radii = radii * _touching(seen.means2d.detach(), radii, wanted)[..., None]
+        _, keys, ids = self._gsplat.isect_tiles(seen.means2d.detach(), radii, seen.depths.detach(), TILE, columns, rows)
         offsets = self._gsplat.isect_offset_encode(keys, count, columns, rows)
-        colors = torch.cat([part.colors.expand(count, -1, -1), depths[..., None]], dim=-1)
+        opacities = torch.cat([part.opacities for part in parts])
+        colors = torch.cat([part.colors for part in parts]).expand(count, -1, -1)
         drawn, alpha = self._gsplat.rasterize_to_pixels(
-            means2d, conics, colors, opacities.expand(count, -1).contiguous(), width, height, TILE,
+            seen.means2d, seen.conics, torch.cat([colors, seen.depths[..., None]], dim=-1),
+            opacities.expand(count, -1).contiguous(), width, height, TILE,
             offsets.reshape(count, rows, columns), ids, masks=wanted,
         )  # fmt: skip
         alpha = alpha[..., 0]
         return Rendering(linear_to_srgb(drawn[..., :3]), drawn[..., 3] / torch.where(alpha > 0, alpha, 1), alpha)
+
+    def _seen(self, sets: Sequence[Gaussians], cameras: Sequence[Camera], eps2d: float) -> Projection:
+        """All sets as all cameras see them; what one camera sees of a set is remembered."""
+        views = torch.stack([camera.world_to_camera.to(self.device, torch.float32) for camera in cameras])
+        lenses = torch.stack([camera.K.to(self.device, torch.float32) for camera in cameras])
+        size = cameras[0].width, cameras[0].height
+
+        def project(part: Material) -> Projection:
+            radii, means2d, depths, conics, _ = self._gsplat.fully_fused_projection(
+                part.means, part.covariances, None, None, views, lenses, *size,
+                eps2d=eps2d, near_plane=NEAR_PLANE, opacities=part.opacities,
+            )  # fmt: skip
+            return Projection(radii, means2d, depths, conics)
+
+        key = (eps2d, _key(cameras[0])) if len(cameras) == 1 else None
+        return Projection.joined([self._store.projection(part, key, project) for part in sets])
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
@@ -142,13 +137,19 @@ def load_gsplat(device: torch.device) -> ModuleType:
     return package
 
 
-def _usable(part: Gaussians) -> Gaussians:
-    """The same, with those that are not finite made transparent points: to take them out would wait for the GPU."""
-    finite = torch.stack(
-        [(t.detach().isfinite() if t.ndim == 1 else t.detach().isfinite().all(-1)) for t in part.tensors]
-    )
-    keep = finite.all(0)
-    return Gaussians(*(torch.where(keep if t.ndim == 1 else keep[:, None], t, 0) for t in part.tensors))
+def _listed(gaussians: Gaussians | Sequence[Gaussians]) -> list[Gaussians]:
+    """One set at least, if only an empty one."""
+    return [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians] or [Gaussians.empty()]
+
+
+def _home(sets: Sequence[Gaussians]) -> torch.device:
+    """Where the images are wanted."""
+    return sets[0].means.device
+
+
+def _key(camera: Camera) -> Hashable:
+    """A camera's values."""
+    return camera.width, camera.height, *camera.K.flatten().tolist(), *camera.world_to_camera.flatten().tolist()
 
 
 def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.gaussians import Gaussians
@@ -18,12 +16,12 @@ from spackle.render.pipeline import Canvas, Drawing, blend, project
 from spackle.render.project import DEPTH, Splats, View
 from spackle.render.sort import sort_by_depth
 from spackle.render.tiles import TileLists, list_tiles
+from spackle.render.unchanged import Snapshot
 from spackle.rendering import Rendering
 from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 
-State = tuple[int, int]  # the count of a tensor's changes in place, and where it lies
 MERGE_GRAIN = 64  # tiles a thread merges at a time
 
 
@@ -34,18 +32,14 @@ class Kept:
     view: View
     splats: Splats  # with room for more
     lists: TileLists
-    tensors: list[tuple[weakref.ref[Tensor], State]]
+    snapshot: Snapshot
     sets: int
     count: int  # Gaussians in those sets
 
     def shows(self, sets: Sequence[Gaussians], view: View) -> bool:
         """Whether these sets begin with those that were drawn, unchanged, and are seen from the same camera."""
         flat = [tensor for part in sets[: self.sets] for tensor in part.tensors]
-        return (
-            len(flat) == len(self.tensors)
-            and self.view.same_as(view)
-            and all(ref() is t and state == _state(t) for (ref, state), t in zip(self.tensors, flat, strict=True))
-        )
+        return self.view.same_as(view) and self.snapshot.shows(flat)
 
 
 class Memory:
@@ -59,10 +53,9 @@ class Memory:
         """Remember a drawing of all tiles."""
         flat = [tensor for part in sets for tensor in part.tensors]
         self._kept = None
-        if not any(tensor.is_inference() for tensor in flat):  # such tensors do not count their changes
-            refs = [(weakref.ref(tensor), _state(tensor)) for tensor in flat]
+        if Snapshot.possible(flat):
             count = sum(len(part) for part in sets)
-            self._kept = Kept(drawing.view, drawing.splats, drawing.lists, refs, len(sets), count)
+            self._kept = Kept(drawing.view, drawing.splats, drawing.lists, Snapshot(flat), len(sets), count)
 
     def redraw(self, sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None) -> Drawing | None:
         """What `draw` would give, bit for bit, or None where the last whole drawing is of no help."""
@@ -78,11 +71,6 @@ class Memory:
             return _add(kept, more, wanted, onto)
         finally:
             self._lock.release()
-
-
-def _state(tensor: Tensor) -> State:
-    """What changes when PyTorch changes a tensor in place; a write to its memory by others is not seen."""
-    return tensor._version, tensor.data_ptr()
 
 
 def _add(kept: Kept, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:
