@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from scenes import same_bits
 
 from spackle.camera import Camera
-from spackle.color import linear_to_srgb
+from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer, cpu, get_renderer, touched_tiles
-from spackle.render.approx import encode_srgb, exp2
+from spackle.render.approx import decode_srgb, encode_srgb, exp2
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
 from spackle.rendering import Rendering
@@ -289,6 +289,9 @@ def test_approximations_hold_over_their_whole_range():
     values = torch.cat([torch.linspace(-0.1, 1.1, 4001), torch.tensor([0.0, 0.0031308, 0.0031309, 1.0])])
     encoded = torch.tensor([encode_srgb(x) for x in values.numpy()])
     torch.testing.assert_close(encoded, linear_to_srgb(values), atol=1e-6, rtol=0)
+    values = torch.cat([values, torch.tensor([0.04045, 0.040451])])
+    decoded = torch.tensor([decode_srgb(x) for x in values.numpy()])
+    torch.testing.assert_close(decoded, srgb_to_linear(values), atol=0, rtol=2e-6)
 
 
 # Promises of the protocol --------------------------------------------------------------------------

@@ -27,19 +27,23 @@ from scenes import (
     wall,
 )
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.fill import FAR_BIAS, far_fill
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.carve import CLEARANCE, MAX_REACH_PX, REACH, SHIELD_PX, STEPS, Shield, push_behind
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
+from spackle.residual.cues import CELL
 from spackle.residual.network import IN_CHANNELS, network_input
 from spackle.residual.rim import Rim
-from spackle.residual.seeds import OPACITY, cell_centers
+from spackle.residual.seeds import BEHIND, OPACITY, RIM_CELLS, cell_centers
 from spackle.residual.visits import farthest_first
+from spackle.surface import surface_slope
 from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
 CPU = CpuRenderer()
@@ -132,19 +136,53 @@ def test_cues_are_cut_off_from_what_made_them() -> None:
     assert not any(t.requires_grad for t in (cues.rgb, cues.inverse_depth, cues.alpha))
 
 
-@PROPERTY
-@given(SEEDS, SIZES, st.integers(1, 3))
-def test_the_farthest_around_matches_a_plain_loop(seed: int, size: tuple[int, int], radius: int) -> None:
-    cues = Cues.of(random_view(seed, *size))
-    found = cues.farthest_around(radius)
-    rows, columns = cues.mask.shape
-    for y in range(rows):
-        for x in range(columns):
-            near = cues.inverse_depth[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
-            assert float(found[y, x]) == min([float(n) for n in near.flatten() if n > 0], default=math.inf)
-
-
 # Seeds
+
+
+def plain_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
+    """`make_seeds` of a view that shows something: whole grids, one torch operation at a time."""
+    share = avg_pool2d(cues.covered.float()[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
+    choices = (cues.covered & (share > 0.5), cues.covered, cues.inverse_depth > 0)
+    known = next(choice for choice in choices if choice.any())
+    uv, colors = cell_centers(camera), cues.rgb.permute(2, 0, 1)
+    across, _ = far_fill(cues.inverse_depth, colors, known, far_bias=0.0)
+    point = camera.to(dtype=torch.float64).unproject(uv.double(), 1.0 / across.double())
+    place, z = photo_camera.project(point)
+    size = torch.tensor([photo_camera.width, photo_camera.height])
+    inside = ((place >= 0) & (place < size)).all(-1) & (z > 0)
+    filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=torch.where(inside, FAR_BIAS, 0.0))
+    seen = torch.where(cues.inverse_depth > 0, cues.inverse_depth, torch.inf)
+    close = -max_pool2d(-seen[None, None], 2 * RIM_CELLS + 1, stride=1, padding=RIM_CELLS)[0, 0]
+    inverse_depth = torch.where(cues.mask, torch.minimum(filled, close) * (1.0 - BEHIND), filled)
+    slope = surface_slope(inverse_depth) / CELL
+    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
+
+
+@PROPERTY
+@given(SEEDS, st.tuples(st.integers(1, 40), st.integers(1, 40)), st.floats(0, 1))
+def test_seeds_match_their_plain_twin(seed: int, size: tuple[int, int], solid: float) -> None:
+    view = random_view(seed, *size)
+    generator = torch.Generator().manual_seed(seed)
+    closed = torch.rand(size, generator=generator) < solid
+    closed[seed % size[0], seed % size[1]] = True
+    depth = torch.where(closed, 1 + 3 * torch.rand(size, generator=generator), view.depth)
+    cues = Cues.of(Rendering(view.rgb, depth, torch.where(closed, 1.0, view.alpha)))
+    photo_camera = Camera.from_focal(25, size[1], size[0])
+    camera = photo_camera.looking(torch.rand(3, generator=generator) - 0.5, torch.tensor([0.1, 0.2, 3.0]))
+    found, plain = make_seeds(cues, camera, photo_camera), plain_seeds(cues, camera, photo_camera)
+    for field in dataclasses.fields(Seeds):
+        one, other = getattr(found, field.name), getattr(plain, field.name)
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7, msg=field.name)
+
+
+def test_chosen_seeds_are_those_of_the_grid() -> None:
+    completer, camera = box_view()
+    cues = Cues.of(CPU.render(completer.base, camera))
+    seeds = make_seeds(cues, camera, completer.photo_camera)
+    chosen = seeds.select(cues.mask)
+    for name in ("uv", "inverse_depth", "slope", "rgb"):
+        assert torch.equal(getattr(chosen, name), getattr(seeds, name)[cues.mask])
+    assert chosen.unit == seeds.unit
 
 
 def test_cell_centres_cover_odd_pictures_too() -> None:
@@ -516,6 +554,15 @@ def test_a_shield_is_the_farthest_depth_within_reach_and_none_over_holes() -> No
     block[:, 20 + SHIELD_PX :] = 0
     block[10 - SHIELD_PX : 11 + SHIELD_PX, 15 - SHIELD_PX : 16 + SHIELD_PX] = 7
     assert torch.equal(shield.depth, block)
+
+
+@PROPERTY
+@given(SEEDS, st.tuples(st.integers(1, 90), st.integers(1, 30)))
+def test_a_shield_is_the_maximum_over_windows(seed: int, size: tuple[int, int]) -> None:
+    view = random_view(seed, *size)
+    shield = Shield.of(view, Camera.from_focal(20, size[1], size[0]))
+    seen = torch.where(hole_mask(view.alpha), 0.0, view.depth)[None, None]
+    assert torch.equal(shield.depth, max_pool2d(seen, 2 * SHIELD_PX + 1, stride=1, padding=SHIELD_PX)[0, 0])
 
 
 def test_pushing_changes_nothing_for_the_eye_that_asked() -> None:

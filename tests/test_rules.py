@@ -178,7 +178,10 @@ TWINS = {
     "fill.py": "test_fill.py",
     "render": "test_render.py",
     "residual/carve.py": "test_residual.py",
+    "residual/cues.py": "test_residual.py",
     "residual/rim.py": "test_rim.py",
+    "residual/seeds.py": "test_residual.py",
+    "surface.py": "test_surface.py",
     "training/depth/raycast.py": "test_lite_scenes.py",
 }
 

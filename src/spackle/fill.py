@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle._numba import kernel
+from spackle.threads import run_chunks
 
 FAR_BIAS = 80.0  # how sharply the far side of a rim wins: a sample 5 % nearer than the fill counts 1/50
 SWEEPS = 12  # relaxation sweeps at each resolution; more gain nothing
 
 MIN_TRUST = 1e-6  # a hole whose whole rim is near still gets its colour from there
 MAX_EXPONENT = 30.0  # keeps weights within single precision
+LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
+AROUND = 4  # neighbours of a pixel
+GRAIN = 32  # coarse rows that a thread takes at a time
 
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -51,95 +55,191 @@ def far_fill(
     """
     if not bool(known.any()):
         raise ValueError("nothing to fill from: no pixel is known")
-    field = torch.cat([inverse_depth[None], values]).detach().to("cpu", torch.float32).numpy()
-    mask = known.cpu().numpy()
-    bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous().numpy()
-    filled = torch.from_numpy(_fill_level(np.where(mask, field, np.float32(0)), mask, bias, sweeps))
-    return filled[0].to(inverse_depth.device), filled[1:].to(values.device)
+    # Pixel by pixel what belongs together lies together: the hole's pixels are scattered through memory.
+    depths = inverse_depth.detach().to("cpu", torch.float32).clone(memory_format=torch.contiguous_format)
+    carried = values.detach().to("cpu", torch.float32).permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous()
+    _fill_level(depths.numpy(), carried.numpy(), known.cpu().contiguous().numpy(), bias.numpy(), sweeps)
+    return depths.to(inverse_depth.device), carried.permute(2, 0, 1).to(values.device)
 
 
-def _fill_level(field: Floats, known: Bools, bias: Floats, sweeps: int) -> Floats:
-    """Fill one level [1 + C, H, W] from the next coarser one, then relax it."""
-    if known.all():
-        return field
-    reference = np.float32(np.quantile(field[0][known], 0.5, method="lower"))
-    coarse, coarse_known, coarse_bias = _coarsen(field, known, bias, reference)
-    coarse = _fill_level(coarse, coarse_known, coarse_bias, sweeps)
-    holes = np.argwhere(~known).astype(np.int32)
-    field = field.copy()
-    _guess(field, coarse, holes)
-    _relax(field, known, bias, holes, sweeps)
-    return field
+def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats, sweeps: int) -> None:
+    """Fill one level's inverse depths [H, W] and values [H, W, C] in place: from the next coarser one, then relaxed."""
+    count = known.size - np.count_nonzero(known)
+    if count == 0:
+        return
+    coarse = _coarser(depths, values, known, bias)
+    _fill_level(*coarse, sweeps)
+    holes, links, rim = _find_holes(known, count)
+    samples = _guess(depths, values, coarse[0], coarse[1], holes, rim)
+    _relax(samples, links, bias.ravel()[holes], sweeps)
+    _put(depths, values, holes, samples)
+
+
+def _coarser(depths: Floats, values: Floats, known: Bools, bias: Floats) -> tuple[Floats, Floats, Bools, Floats]:
+    """The next coarser level, in the same order."""
+    reference = np.float32(1)
+    if bias.any():
+        reference = np.float32(torch.from_numpy(depths[known]).median())  # the lower one
+    rows, columns = (-(-size // 2) for size in known.shape)
+    means = np.empty((rows, columns), np.float32), np.empty((rows, columns, values.shape[-1]), np.float32)
+    flags, biases = np.empty((rows, columns), np.bool_), np.empty((rows, columns), np.float32)
+    run_chunks(
+        lambda start, stop: _coarsen(start, stop, depths, values, known, bias, reference, *means, flags, biases),
+        rows,
+        GRAIN,
+    )
+    return *means, flags, biases
 
 
 @kernel
-def _coarsen(field: Any, known: Any, bias: Any, reference: Any) -> Any:
-    """Means of 2×2 pixels over the known ones, the far ones counting most; known flags; mean bias."""
-    channels, height, width = field.shape
-    rows, columns = (height + 1) // 2, (width + 1) // 2
-    coarse = np.zeros((channels, rows, columns), np.float32)
-    coarse_known = np.zeros((rows, columns), np.bool_)
-    coarse_bias = np.zeros((rows, columns), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            mass = np.float32(0)
+def _coarsen(
+    start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
+    coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
+) -> None:  # fmt: skip
+    """Rows start..stop of means of 2×2 pixels over the known ones, the far ones counting most; flags; mean bias."""
+    height, width = depths.shape
+    channels = values.shape[2]
+    weights = np.empty(4, np.float32)
+    for row in range(start, stop):
+        for column in range(coarse_depths.shape[1]):
+            top, left = 2 * row, 2 * column
+            bottom, right = min(top + 1, height - 1), min(left + 1, width - 1)
+            corners = (bias[top, left], bias[top, right], bias[bottom, left], bias[bottom, right])
+            coarse_bias[row, column] = corners[0] / 4 + corners[1] / 4 + corners[2] / 4 + corners[3] / 4
+            mass, depth = np.float32(0), np.float32(0)
             for k in range(4):
-                y, x = 2 * row + k // 2, 2 * column + k % 2
-                coarse_bias[row, column] += bias[min(y, height - 1), min(x, width - 1)] / 4
-                if y >= height or x >= width or not known[y, x]:
-                    continue
-                ratio = max(field[0, y, x] / reference, np.float32(1e-6))
-                exponent = min(max(-bias[y, x] * np.log(ratio), -MAX_EXPONENT), MAX_EXPONENT)
-                weight = np.float32(np.exp(exponent))
-                mass += weight
-                for channel in range(channels):
-                    coarse[channel, row, column] += weight * field[channel, y, x]
-            if mass > 0:
-                coarse_known[row, column] = True
-                for channel in range(channels):
-                    coarse[channel, row, column] /= mass
-    return coarse, coarse_known, coarse_bias
+                y, x = top + k // 2, left + k % 2
+                weights[k] = 0
+                if y < height and x < width and known[y, x]:
+                    weights[k] = _far_weight(depths[y, x] / reference, bias[y, x])
+                    mass += weights[k]
+                    depth += weights[k] * depths[y, x]
+            coarse_known[row, column] = mass > 0
+            if not mass > 0:
+                continue
+            coarse_depths[row, column] = depth / mass
+            for channel in range(channels):
+                total = np.float32(0)
+                for k in range(4):
+                    if weights[k] > 0:
+                        total += weights[k] * values[top + k // 2, left + k % 2, channel]
+                coarse_values[row, column, channel] = total / mass
 
 
 @kernel
-def _guess(field: Any, coarse: Any, holes: Any) -> None:
-    """Bilinear interpolation of the coarser level, at the holes alone."""
-    channels, rows, columns = coarse.shape
+def _far_weight(relative: Any, bias: Any) -> Any:
+    """relative^−bias, kept within single precision."""
+    if bias == 0:
+        return np.float32(1)
+    exponent = -bias * np.log(max(relative, np.float32(1e-6)))
+    if abs(exponent) < MAX_EXPONENT:
+        return np.float32(np.exp(np.float64(exponent)))
+    return HEAVIEST if exponent > 0 else LIGHTEST
+
+
+@kernel
+def _find_holes(known: Any, count: int) -> Any:
+    """The unknown pixels, what is around each of them, and the known ones among that; positions are flat.
+
+    Returns holes [count], their links [count, 4] up, down, left and right, which count the holes first and the rim
+    after them, and the rim. Across the image's border a hole is linked to itself.
+    """
+    height, width = known.shape
+    holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
+    rim = np.empty(min(AROUND * count, height * width - count), np.int32)
+    numbers = np.empty((height, width), np.int32)
+    n = 0
+    for y in range(height):
+        for x in range(width):
+            if known[y, x]:
+                numbers[y, x] = -1
+            else:
+                numbers[y, x] = n
+                holes[n] = y * width + x
+                n += 1
+    met = 0
+    for n in range(count):
+        y, x = holes[n] // width, holes[n] % width
+        for k in range(AROUND):
+            v = min(max(y + (k == 1) - (k == 0), 0), height - 1)
+            u = min(max(x + (k == 3) - (k == 2), 0), width - 1)
+            if numbers[v, u] < 0:
+                numbers[v, u] = count + met
+                rim[met] = v * width + u
+                met += 1
+            links[n, k] = numbers[v, u]
+    return holes, links, rim[:met]
+
+
+@kernel
+def _guess(depths: Any, values: Any, coarse_depths: Any, coarse_values: Any, holes: Any, rim: Any) -> Any:
+    """Samples [holes + rim, 1 + C]: the coarser level interpolated bilinearly, and after that the rim as it is."""
+    width, (rows, columns, channels) = depths.shape[1], coarse_values.shape
+    samples = np.empty((len(holes) + len(rim), 1 + channels), np.float32)
     for n in range(len(holes)):
-        y, x = holes[n, 0], holes[n, 1]
+        y, x = holes[n] // width, holes[n] % width
         # A fine pixel lies a quarter of a coarse one beside its parent's centre.
         y0, x0 = (y - 1) // 2, (x - 1) // 2
         fy = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
         fx = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
         top, bottom = max(y0, 0), min(y0 + 1, rows - 1)
         left, right = max(x0, 0), min(x0 + 1, columns - 1)
+        upper = coarse_depths[top, left] * (1 - fx) + coarse_depths[top, right] * fx
+        lower = coarse_depths[bottom, left] * (1 - fx) + coarse_depths[bottom, right] * fx
+        samples[n, 0] = upper * (1 - fy) + lower * fy
         for channel in range(channels):
-            upper = coarse[channel, top, left] * (1 - fx) + coarse[channel, top, right] * fx
-            lower = coarse[channel, bottom, left] * (1 - fx) + coarse[channel, bottom, right] * fx
-            field[channel, y, x] = upper * (1 - fy) + lower * fy
+            upper = coarse_values[top, left, channel] * (1 - fx) + coarse_values[top, right, channel] * fx
+            lower = coarse_values[bottom, left, channel] * (1 - fx) + coarse_values[bottom, right, channel] * fx
+            samples[n, 1 + channel] = upper * (1 - fy) + lower * fy
+    for m in range(len(rim)):
+        samples[len(holes) + m, 0] = depths[rim[m] // width, rim[m] % width]
+        samples[len(holes) + m, 1:] = values[rim[m] // width, rim[m] % width]
+    return samples
 
 
 @kernel
-def _relax(field: Any, known: Any, bias: Any, holes: Any, sweeps: int) -> None:
-    """Jacobi sweeps on the holes; nothing flows across the image's border."""
-    channels, height, width = field.shape
-    update = np.empty((len(holes), channels), np.float32)
+def _relax(samples: Any, links: Any, bias: Any, sweeps: int) -> None:
+    """Jacobi sweeps on the holes, the first of the samples; nothing flows across the image's border."""
+    count, channels = len(links), samples.shape[1]
+    old, new = samples, samples.copy()
     for _ in range(sweeps):
-        for n in range(len(holes)):
-            y, x = holes[n, 0], holes[n, 1]
-            update[n] = 0
-            mass = np.float32(0)
-            for k in range(4):
-                v = min(max(y + (k == 1) - (k == 0), 0), height - 1)
-                u = min(max(x + (k == 3) - (k == 2), 0), width - 1)
-                conductance = np.float32(1)
-                if known[v, u]:
-                    ratio = min(max(field[0, y, x] / max(field[0, v, u], np.float32(1e-12)), np.float32(1e-6)), 1)
-                    conductance = np.float32(max(np.exp(bias[y, x] * np.log(ratio)), MIN_TRUST))
+        for n in range(count):
+            up, down, left, right = links[n]
+            if bias[n] == 0 or max(up, down, left, right) < count:
+                for channel in range(channels):
+                    both = old[up, channel] + old[down, channel] + old[left, channel] + old[right, channel]
+                    new[n, channel] = both / AROUND
+                continue
+            here, mass = old[n, 0], np.float32(0)
+            new[n] = 0
+            for k in range(AROUND):
+                link = links[n, k]
+                conductance = np.float32(1) if link < count else _conductance(here, old[link, 0], bias[n])
                 mass += conductance
                 for channel in range(channels):
-                    update[n, channel] += conductance * field[channel, v, u]
-            update[n] /= mass
-        for n in range(len(holes)):
+                    new[n, channel] += conductance * old[link, channel]
             for channel in range(channels):
-                field[channel, holes[n, 0], holes[n, 1]] = update[n, channel]
+                new[n, channel] /= mass
+        old, new = new, old
+    if sweeps % 2:
+        samples[:] = old
+
+
+@kernel
+def _conductance(here: Any, there: Any, bias: Any) -> Any:
+    """How much a sample of the rim counts: the less the nearer it is."""
+    if there <= here:
+        return np.float32(1)
+    ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))
+    return np.float32(max(np.exp(bias * np.log(np.float64(ratio))), MIN_TRUST))
+
+
+@kernel
+def _put(depths: Any, values: Any, holes: Any, samples: Any) -> None:
+    """Write what fills the holes to its place."""
+    width = depths.shape[1]
+    for n in range(len(holes)):
+        y, x = holes[n] // width, holes[n] % width
+        depths[y, x] = samples[n, 0]
+        values[y, x] = samples[n, 1:]

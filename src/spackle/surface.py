@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_from_matrix
+from spackle.threads import run_chunks
 
 EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
 CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts
 RAGGED = 0.005  # steepest slope that one side alone is believed; more of it stands out as whiskers from the side
 THICKNESS = 0.05  # third axis, in units of the smaller of the other two
+GRAIN = 64  # rows that a thread takes at a time
 
 
 def surface_gaussians(
@@ -76,18 +82,39 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     even the flatter one is steep, the depth is ragged there and the pixel faces the camera.
 
     Args:
-        inverse_depth: [H, W], positive everywhere.
+        inverse_depth: [H, W], positive everywhere. No gradient goes through.
     """
-    slopes = []
-    for axis in (1, 0):
-        before, after = neighbours(inverse_depth, axis)
-        backward, forward = inverse_depth - before, after - inverse_depth
-        flatter = torch.where(backward.abs() < forward.abs(), backward, forward)
-        smooth = (forward - backward).abs() <= CREASE * inverse_depth
-        slope = torch.where(smooth, (forward + backward) / 2, flatter)
-        steepest = torch.where(smooth, EDGE, RAGGED) * inverse_depth
-        slopes.append(torch.where(slope.abs() <= steepest, slope, torch.zeros_like(slope)))
-    return torch.stack(slopes, dim=-1)
+    image = inverse_depth.detach().cpu().contiguous().numpy()
+    slopes = np.empty((*image.shape, 2), image.dtype)
+    bounds = tuple(image.dtype.type(bound) for bound in (CREASE, EDGE, RAGGED))
+    run_chunks(lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image), GRAIN)
+    return torch.from_numpy(slopes).to(inverse_depth.device)
+
+
+@kernel
+def _slopes(start: int, stop: int, image: Any, crease: Any, edge: Any, ragged: Any, slopes: Any) -> None:
+    """Rows start..stop of the slopes."""
+    height, width = image.shape
+    for y in range(start, stop):
+        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            here, left, right = image[y, x], max(x - 1, 0), min(x + 1, width - 1)
+            # At a border the one difference that there is stands for both.
+            ahead, behind = image[y, right] - here, here - image[y, left]
+            forward, backward = ahead if right > x else behind, behind if left < x else ahead
+            slopes[y, x, 0] = _slope(here, backward, forward, crease, edge, ragged)
+            ahead, behind = image[below, x] - here, here - image[above, x]
+            forward, backward = ahead if below > y else behind, behind if above < y else ahead
+            slopes[y, x, 1] = _slope(here, backward, forward, crease, edge, ragged)
+
+
+@kernel
+def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any, ragged: Any) -> Any:
+    """One axis's, of the differences to both sides."""
+    smooth = abs(forward - backward) <= crease * here
+    flatter = backward if abs(backward) < abs(forward) else forward
+    slope = (forward + backward) / 2 if smooth else flatter
+    return slope if abs(slope) <= (edge if smooth else ragged) * here else 0 * here
 
 
 def neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:

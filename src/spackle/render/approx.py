@@ -39,6 +39,10 @@ MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
 S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
     lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
 )
+# Its inverse is y²·q^1.6, where q is the fourth root of y, to a few 1e-8 of itself.
+ENCODED_KNEE = np.float32(0.04045)
+_low_root = ((float(ENCODED_KNEE) + 0.055) / 1.055) ** 0.25
+D0, D1, D2, D3, D4, D5 = _power_series(lambda q: q**1.6, _low_root, 1.0, 5)
 
 # ln((1 + t) / (1 - t)) is 2t + 2t³/3 + 2t⁵/5 + …; what is left out is below float64's last digit for t² < 0.0295.
 L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
@@ -68,6 +72,16 @@ def encode_srgb(linear: np.float32) -> np.float32:
     t = (np.sqrt(np.sqrt(value)) - MIDDLE) / SPREAD
     curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
     return LINE * value if value <= KNEE else min(curve, ONE)
+
+
+@kernel
+def decode_srgb(encoded: np.float32) -> np.float32:
+    """sRGB to linear light, both clamped to 0..1."""
+    value = min(max(encoded, ZERO), ONE)
+    y = (value + np.float32(0.055)) / np.float32(1.055)
+    q = np.sqrt(np.sqrt(y))
+    curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))
+    return value / LINE if value <= ENCODED_KNEE else min(curve, ONE)
 
 
 @kernel

@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
-from spackle.residual.cues import MASK_THRESHOLD, hole_mask
+from spackle.residual.cues import MASK_THRESHOLD
+from spackle.threads import run_chunks
 
 SHIELD_PX = 4  # radius of the shield's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
 MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
 CLEARANCE = 0.002  # relative distance behind the surface that counts as behind
+GRAIN, ROWS = 1024, 64  # Gaussians, and rows of a shield, that a thread takes at a time
 STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
 
@@ -34,11 +35,33 @@ class Shield:
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> Shield:
         """The shield of a rendered view."""
-        depth = torch.where(hole_mask(rendering.alpha, threshold), 0.0, rendering.depth)[None, None]
-        size = 2 * SHIELD_PX + 1
-        wide = max_pool2d(depth, (size, 1), stride=1, padding=(SHIELD_PX, 0))
-        wide = max_pool2d(wide, (1, size), stride=1, padding=(0, SHIELD_PX))
-        return Shield(camera, wide[0, 0])
+        images = (rendering.depth, rendering.alpha)
+        depth, alpha = (image.detach().to("cpu", torch.float32).contiguous().numpy() for image in images)
+        wide, low = np.empty_like(depth), np.float32(threshold)
+        run_chunks(lambda start, stop: _widest(start, stop, depth, alpha, low, wide), len(depth), ROWS)
+        return Shield(camera, torch.from_numpy(wide).to(rendering.depth.device))
+
+
+@kernel
+def _widest(start: int, stop: int, depth: Any, alpha: Any, threshold: Any, wide: Any) -> None:
+    """Rows start..stop of the farthest depth in the window around each pixel, by columns and then along the row."""
+    height, width = depth.shape
+    above, below = max(start - SHIELD_PX, 0), min(stop + SHIELD_PX, height)
+    seen = np.empty((below - above, width), np.float32)
+    for y in range(above, below):
+        for x in range(width):
+            seen[y - above, x] = np.float32(0) if alpha[y, x] < threshold else depth[y, x]
+    row = np.zeros(width + 2 * SHIELD_PX, np.float32)
+    for y in range(start, stop):
+        row[SHIELD_PX : SHIELD_PX + width] = 0
+        for v in range(max(y - SHIELD_PX, 0), min(y + SHIELD_PX + 1, height)):
+            for x in range(width):
+                row[SHIELD_PX + x] = max(row[SHIELD_PX + x], seen[v - above, x])
+        for x in range(width):
+            wide[y, x] = row[x]
+        for k in range(1, 2 * SHIELD_PX + 1):
+            for x in range(width):
+                wide[y, x] = max(wide[y, x], row[x + k])
 
 
 def push_behind(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> Gaussians:
@@ -56,12 +79,16 @@ def push_behind(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> Gauss
         return aux
     eye = eye.to(aux.means)
     rays = (aux.means - eye).detach().cpu().double().numpy()
-    covariances = aux.covariances().detach().cpu().double().numpy()
+    quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
     lenses = np.stack([_lens(shield.camera) for shield in shields])
     depths = np.concatenate([shield.depth.detach().cpu().float().numpy().ravel() for shield in shields])
     sizes = np.array([[shield.camera.height, shield.camera.width] for shield in shields])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
-    factors = _free_factors(eye.cpu().double().numpy(), rays, covariances, lenses, depths, sizes, starts)
+    place, factors = eye.cpu().double().numpy(), np.empty(len(rays))
+    shown = (lenses, depths, sizes, starts)
+    run_chunks(
+        lambda start, stop: _free_factors(start, stop, place, rays, quats, scales, *shown, factors), len(rays), GRAIN
+    )
     factor = torch.from_numpy(factors).to(aux.means)[:, None]
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
     free = factor[:, 0] > 0
@@ -75,22 +102,44 @@ def _lens(camera: Camera) -> Any:
 
 
 @kernel
-def _free_factors(eye: Any, rays: Any, covariances: Any, lenses: Any, depths: Any, sizes: Any, starts: Any) -> Any:
-    """For each Gaussian the smallest of 1 / (1 − k / STEPS) that no shield blocks; 0 where there is none."""
-    factors = np.zeros(len(rays))
-    for n in range(len(rays)):
+def _free_factors(
+    first: int, last: int, eye: Any, rays: Any, quats: Any, scales: Any,
+    lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
+) -> None:  # fmt: skip
+    """For the Gaussians first..last the least of 1 / (1 − k / STEPS) that no shield blocks; 0 where there is none."""
+    for n in range(first, last):
+        factors[n] = 0
+        covariance = _covariance(quats[n], scales[n])
         for step in range(STEPS):
             factor = 1.0 / (1.0 - step / STEPS)
             x, y, z = eye[0] + factor * rays[n, 0], eye[1] + factor * rays[n, 1], eye[2] + factor * rays[n, 2]
             blocked = False
             for s in range(len(lenses)):
-                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z, covariances[n], factor):
+                if _blocks(lenses[s], depths, starts[s], sizes[s, 0], sizes[s, 1], x, y, z, covariance, factor):
                     blocked = True
                     break
             if not blocked:
                 factors[n] = factor
                 break
-    return factors
+
+
+@kernel
+def _covariance(quat: Any, scale: Any) -> Any:
+    """Σ = R S Sᵀ Rᵀ as its six numbers xx, yy, zz, xy, xz, yz."""
+    length = max(np.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2), 1e-12)
+    w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
+    a, b, c = scale[0] ** 2, scale[1] ** 2, scale[2] ** 2
+    xa, xb, xc = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    ya, yb, yc = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    za, zb, zc = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return (
+        a * xa * xa + b * xb * xb + c * xc * xc,
+        a * ya * ya + b * yb * yb + c * yc * yc,
+        a * za * za + b * zb * zb + c * zc * zc,
+        a * xa * ya + b * xb * yb + c * xc * yc,
+        a * xa * za + b * xb * zb + c * xc * zc,
+        a * ya * za + b * yb * zb + c * yc * zc,
+    )
 
 
 @kernel
@@ -129,6 +178,6 @@ def _reach(lens: Any, row: int, scale: float, tangent: float, covariance: Any) -
     a = scale * (lens[row] - tangent * lens[12])
     b = scale * (lens[row + 1] - tangent * lens[13])
     c = scale * (lens[row + 2] - tangent * lens[14])
-    variance = a * a * covariance[0, 0] + b * b * covariance[1, 1] + c * c * covariance[2, 2]
-    variance += 2 * (a * b * covariance[0, 1] + a * c * covariance[0, 2] + b * c * covariance[1, 2])
+    xx, yy, zz, xy, xz, yz = covariance
+    variance = a * a * xx + b * b * yy + c * c * zz + 2 * (a * b * xy + a * c * xz + b * c * yz)
     return float(min(REACH * np.sqrt(max(variance, 0.0)) + 1.0, MAX_REACH_PX))

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.camera import Camera
-from spackle.residual.cues import CELL, Cues
+from spackle.residual.cues import CELL, GRAIN, Cues
 from spackle.residual.seeds import Seeds
+from spackle.threads import run_chunks
 
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
+SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,42 +41,46 @@ class Rim:
             camera: the view.
             photo_camera: the camera of the photo.
         """
-        direction = _epipolar(seeds.uv, camera, photo_camera).cpu().numpy()
-        fields = (seeds.rgb, seeds.inverse_depth, cues.mask)
-        arrays = (np.ascontiguousarray(t.detach().cpu().numpy()) for t in fields)
-        return Rim(*(torch.from_numpy(a).to(seeds.rgb) for a in _walk(*arrays, direction, SAME_DEPTH)))
+        fields = (seeds.uv, seeds.rgb, seeds.inverse_depth, cues.mask)
+        uv, rgb, depths, mask = (image.detach().cpu().contiguous().numpy() for image in fields)
+        epipole = _epipole(camera, photo_camera)
+        found, mirrored, distance = rgb.copy(), rgb.copy(), np.zeros(mask.shape, np.float32)
+        cells = (found, mirrored, distance)
+        run_chunks(
+            lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *cells), len(mask), GRAIN
+        )
+        return Rim(*(torch.from_numpy(image).to(seeds.rgb) for image in cells))
 
 
-def _epipolar(uv: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
-    """[h, w, 2] unit vectors along the epipolar lines; along the rows where both eyes are one."""
+def _epipole(camera: Camera, photo_camera: Camera) -> Any:
+    """[3] float64, homogeneous, for it may lie at infinity: where the view sees the photo's eye."""
     eye = photo_camera.position.double()
-    epipole = camera.K.double() @ camera.to_camera(eye)  # homogeneous: it may lie at infinity
-    direction = epipole[:2] - epipole[2] * uv.double()
-    length = direction.norm(dim=-1, keepdim=True)
-    rows = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    return torch.where(length > 1e-9 * CELL, direction / length.clamp_min(1e-30), rows)
+    return (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
 
 
 @kernel
-def _walk(rgb: Any, depths: Any, mask: Any, direction: Any, same: float) -> Any:
+def _walk(
+    start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
+    found: Any, mirrored: Any, distance: Any,
+) -> None:  # fmt: skip
+    """The masked cells of the rows start..stop."""
     height, width = depths.shape
-    found, mirrored = rgb.copy(), rgb.copy()
-    distance = np.zeros((height, width), np.float32)
-    for y in range(height):
+    for y in range(start, stop):
         for x in range(width):
             if not mask[y, x]:
                 continue
+            across, down = _line(epipole, uv[y, x, 0], uv[y, x, 1])
             best, steps, side = np.float32(np.inf), 0, 0.0
             for turn in (1.0, -1.0):
-                k = _steps_to_rim(mask, y, x, turn * direction[y, x, 1], turn * direction[y, x, 0])
+                k = _steps_to_rim(mask, y, x, turn * down, turn * across)
                 if k == 0:
                     continue
-                v, u = _cell(y, x, k * turn * direction[y, x, 1], k * turn * direction[y, x, 0])
+                v, u = _cell(y, x, k * turn * down, k * turn * across)
                 if depths[v, u] < best:
                     best, steps, side = depths[v, u], k, turn
             if steps == 0:
                 continue
-            dy, dx = side * direction[y, x, 1], side * direction[y, x, 0]
+            dy, dx = side * down, side * across
             v, u = _cell(y, x, steps * dy, steps * dx)
             found[y, x], mirrored[y, x], distance[y, x] = rgb[v, u], rgb[v, u], steps
             q, p = _cell(y, x, 2 * steps * dy, 2 * steps * dx)
@@ -82,7 +88,16 @@ def _walk(rgb: Any, depths: Any, mask: Any, direction: Any, same: float) -> Any:
                 ratio = depths[q, p] / best
                 if ratio < same and ratio > 1.0 / same:
                     mirrored[y, x] = rgb[q, p]
-    return found, mirrored, distance
+
+
+@kernel
+def _line(epipole: Any, u: float, v: float) -> Any:
+    """The unit vector x, y along a pixel's epipolar line; along the rows where both eyes are one."""
+    x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
+    length = np.sqrt(x * x + y * y)
+    if length > SAME_EYE:
+        return x / length, y / length
+    return 1.0, 0.0
 
 
 @kernel

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
+from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.residual.cues import CELL, Cues
+from spackle.residual.cues import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
+from spackle.threads import run_chunks
 
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 
@@ -32,7 +35,12 @@ class Seeds:
 
     def select(self, cells: Tensor) -> Seeds:
         """The chosen cells, flat: a boolean grid [h, w] gives fields [n, ...]."""
-        return Seeds(self.uv[cells], self.inverse_depth[cells], self.slope[cells], self.rgb[cells], self.unit)
+        index = cells.flatten().nonzero()[:, 0]  # once for all fields
+
+        def pick(field: Tensor) -> Tensor:
+            return field.flatten(0, cells.ndim - 1)[index.to(field.device)]
+
+        return Seeds(pick(self.uv), pick(self.inverse_depth), pick(self.slope), pick(self.rgb), self.unit)
 
 
 def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
@@ -49,24 +57,100 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     known = _sources(cues)
     if not bool(known.any()):
         return _empty_view(cues, camera)
-    uv = cell_centers(camera)
     colors = cues.rgb.permute(2, 0, 1)
-    across, _ = far_fill(cues.inverse_depth, colors, known, far_bias=0.0)
-    bias = torch.where(_inside(camera.unproject(uv, 1.0 / across), photo_camera), FAR_BIAS, 0.0)
+    across, _ = far_fill(cues.inverse_depth, colors[:0], known, far_bias=0.0)
+    bias = FAR_BIAS * _inside(across, camera, photo_camera)
     filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=bias)
-    placed = torch.minimum(filled, cues.farthest_around(RIM_CELLS)) * (1.0 - BEHIND)
-    inverse_depth = torch.where(cues.mask, placed, filled)
+    inverse_depth = placed_behind(filled, cues.mask, cues, RIM_CELLS)
     slope = surface_slope(inverse_depth) / CELL
-    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
+    return Seeds(cell_centers(camera), inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
 
 
 def _sources(cues: Cues) -> Tensor:
     """[h, w] bool: cells to start from. Specks are none: a stray far one would colour a whole hole."""
-    share = avg_pool2d(cues.covered.float()[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
-    for known in (cues.covered & (share > 0.5), cues.covered):
-        if bool(known.any()):
-            return known
-    return cues.inverse_depth > 0
+    mask = cues.mask.cpu().contiguous().numpy()
+    solid = np.empty(mask.shape, np.bool_)
+    run_chunks(lambda start, stop: _solid(start, stop, mask, solid), len(mask), GRAIN)
+    known = torch.from_numpy(solid).to(cues.mask.device)
+    if bool(known.any()):
+        return known
+    return cues.covered if bool(cues.covered.any()) else cues.inverse_depth > 0
+
+
+@kernel
+def _solid(start: int, stop: int, mask: Any, solid: Any) -> None:
+    """In the rows start..stop the cells that are covered as most cells around them are."""
+    height, width = mask.shape
+    masked = np.zeros(width + 2, np.uint8)  # in each column's three rows, and beyond the sides none
+    for y in range(start, stop):
+        top, bottom = max(y - 1, 0), min(y + 1, height - 1)
+        masked[1:-1] = 0
+        for v in range(top, bottom + 1):
+            for x in range(width):
+                masked[1 + x] += mask[v, x]
+        for x in range(width):
+            cells = (bottom + 1 - top) * (min(x + 1, width - 1) + 1 - max(x - 1, 0))
+            solid[y, x] = not mask[y, x] and 2 * (masked[x] + masked[x + 1] + masked[x + 2]) < cells
+
+
+def _inside(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
+    """[h, w] bool: which cells' points lie in the photo's frame."""
+    image = inverse_depth.cpu().contiguous().numpy()
+    inside = np.empty(image.shape, np.bool_)
+    lens, photo_lens = (view.K.detach().cpu().double().numpy() for view in (camera, photo_camera))
+    here, there = (view.world_to_camera.detach().cpu().double() for view in (camera, photo_camera))
+    views = (lens, photo_lens, (there @ here.inverse()).numpy(), photo_camera.width, photo_camera.height)
+    run_chunks(lambda start, stop: _look(start, stop, image, *views, inside), len(image), GRAIN)
+    return torch.from_numpy(inside).to(inverse_depth.device)
+
+
+@kernel
+def _look(
+    start: int, stop: int, inverse_depth: Any, lens: Any, photo_lens: Any, motion: Any, width: int, height: int,
+    inside: Any,
+) -> None:  # fmt: skip
+    """The rows start..stop of `_inside`; points come multiplied by their inverse depth, which spares divisions."""
+    for row in range(start, stop):
+        down = (CELL * (row + 0.5) - lens[1, 2]) / lens[1, 1]
+        for column in range(inverse_depth.shape[1]):
+            across, inverse = (CELL * (column + 0.5) - lens[0, 2]) / lens[0, 0], np.float64(inverse_depth[row, column])
+            x = motion[0, 0] * across + motion[0, 1] * down + motion[0, 2] + motion[0, 3] * inverse
+            y = motion[1, 0] * across + motion[1, 1] * down + motion[1, 2] + motion[1, 3] * inverse
+            z = motion[2, 0] * across + motion[2, 1] * down + motion[2, 2] + motion[2, 3] * inverse
+            u, v = photo_lens[0, 0] * x + photo_lens[0, 2] * z, photo_lens[1, 1] * y + photo_lens[1, 2] * z
+            inside[row, column] = z > 0 and u >= 0 and u < width * z and v >= 0 and v < height * z
+
+
+def placed_behind(filled: Tensor, chosen: Tensor, cues: Cues, radius: int) -> Tensor:
+    """Inverse depth [h, w] that fills some cells, there behind everything that is seen close by.
+
+    Args:
+        filled: [h, w]; stays as it is elsewhere.
+        chosen: [h, w] bool, the cells.
+        cues: what is seen.
+        radius: cells to all sides that are close by.
+    """
+    seen, cells = (image.cpu().contiguous().numpy() for image in (cues.inverse_depth, chosen))
+    placed = filled.cpu().clone(memory_format=torch.contiguous_format)
+    share = np.float32(1.0 - BEHIND)
+    run_chunks(lambda start, stop: _place(start, stop, seen, cells, radius, share, placed.numpy()), len(cells), GRAIN)
+    return placed.to(filled.device)
+
+
+@kernel
+def _place(start: int, stop: int, seen: Any, chosen: Any, radius: int, share: Any, placed: Any) -> None:
+    """The rows start..stop of `placed_behind`, in place."""
+    height, width = chosen.shape
+    for y in range(start, stop):
+        for x in range(width):
+            if not chosen[y, x]:
+                continue
+            farthest = placed[y, x]
+            for v in range(max(y - radius, 0), min(y + radius + 1, height)):
+                for u in range(max(x - radius, 0), min(x + radius + 1, width)):
+                    if seen[v, u] > 0:
+                        farthest = min(farthest, seen[v, u])
+            placed[y, x] = farthest * share
 
 
 def cell_centers(camera: Camera) -> Tensor:
@@ -75,13 +159,6 @@ def cell_centers(camera: Camera) -> Tensor:
         camera, width=camera.width + camera.width % CELL, height=camera.height + camera.height % CELL
     )
     return even.pixel_centers(stride=CELL)
-
-
-def _inside(points: Tensor, camera: Camera) -> Tensor:
-    """Which points [..., 3] lie in a camera's frame."""
-    uv, z = camera.project(points)
-    size = torch.tensor([camera.width, camera.height]).to(uv)
-    return ((uv >= 0) & (uv < size)).all(-1) & (z > 0)
 
 
 def _empty_view(cues: Cues, camera: Camera) -> Seeds:

@@ -13,7 +13,7 @@ from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.residual.compose import compose
 from spackle.residual.cues import CELL, Cues
-from spackle.residual.seeds import BEHIND, RIM_CELLS, Seeds
+from spackle.residual.seeds import RIM_CELLS, Seeds, placed_behind
 from spackle.surface import surface_slope
 
 REACH_CELLS = 6  # how far beneath the rim
@@ -33,8 +33,7 @@ def tucked(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
     """
     rim = _around(cues.mask, REACH_CELLS) & ~cues.mask
     inverse_depth, rgb = far_fill(seeds.inverse_depth, seeds.rgb.permute(2, 0, 1), ~rim)
-    hidden = torch.minimum(inverse_depth, cues.farthest_around(COARSE * RIM_CELLS)) * (1.0 - BEHIND)
-    field = torch.where(rim, hidden, seeds.inverse_depth)
+    field = placed_behind(inverse_depth, rim, cues, COARSE * RIM_CELLS)
     slope = surface_slope(field) / CELL
     chosen = torch.zeros_like(rim)
     chosen[::COARSE, ::COARSE] = rim[::COARSE, ::COARSE]
