@@ -100,17 +100,18 @@ class Completer:
         order = farthest_first(cameras, self.photo_camera)
         shields = self._first_shields(cameras, order)
         visits = Visits(len(cameras))
+        allowed, enough = (0.0, CLOSED_HAR) if exact else (QUIET_HAR, QUIET_HAR)
         aux = Gaussians.empty()
         for count, index in enumerate(order):
             if exact or not visits.known(index):
                 camera = cameras[index]
                 before = self.renderer.render([self.base, aux], camera)
                 holes = hole_area_ratio(before.alpha, self.threshold)
-                quiet = holes <= (0.0 if exact else QUIET_HAR)
+                quiet = holes <= allowed
                 if not quiet:
                     others = [shield for of, shield in shields.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
-                    new, after = chosen._fill(camera, others, [self.base, aux], before, tuck=True)
+                    new, after = chosen._fill(camera, others, [self.base, aux], before, enough, tuck=True)
                     aux = Gaussians.cat([aux, new])
                     shields[index] = Shield.of(after, camera, self.threshold)
                 visits.looked(index, quiet)
@@ -132,9 +133,10 @@ class Completer:
         shields: Sequence[Shield],
         there: Sequence[Gaussians],
         rendering: Rendering,
+        enough: float = CLOSED_HAR,
         tuck: bool = False,
     ) -> tuple[Gaussians, Rendering]:
-        """New aux Gaussians for a view, and the view with them."""
+        """New aux Gaussians for a view, and the view with them; with `tuck` also beneath the rims of its holes."""
         added = [Gaussians.empty()]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
@@ -145,7 +147,7 @@ class Completer:
             added.append(new)
             tiles = touched_tiles(new, camera)  # the others keep what they show
             rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
-            if hole_area_ratio(rendering.alpha, self.threshold) < CLOSED_HAR:
+            if hole_area_ratio(rendering.alpha, self.threshold) < enough:
                 break
         return Gaussians.cat(added), rendering
 

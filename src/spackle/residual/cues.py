@@ -30,7 +30,7 @@ def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
     """HAR = 1 − coverage (paper, section 4.2): the share of hole pixels."""
     hole = hole_mask(alpha, threshold)
     # Of what counts bits, numpy is the fastest by far.
-    count = np.count_nonzero(hole.numpy()) if hole.device.type == "cpu" else int(hole.count_nonzero())
+    count = int(np.count_nonzero(hole.numpy()) if hole.device.type == "cpu" else hole.count_nonzero())
     return count / hole.numel()
 
 

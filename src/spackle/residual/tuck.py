@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -31,16 +30,28 @@ def tucked(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
         seeds: of all cells; those of the masked ones are what goes on.
         camera: the view.
     """
-    rim = _around(cues.mask, REACH_CELLS) & ~cues.mask
-    inverse_depth, rgb = far_fill(seeds.inverse_depth, seeds.rgb.permute(2, 0, 1), ~rim)
-    field = placed_behind(inverse_depth, rim, cues, COARSE * RIM_CELLS)
-    slope = surface_slope(field) / CELL
-    chosen = torch.zeros_like(rim)
-    chosen[::COARSE, ::COARSE] = rim[::COARSE, ::COARSE]
-    fine = compose(Seeds(seeds.uv, field, slope, rgb.permute(1, 2, 0), seeds.unit).select(chosen), None, camera)
+    every = (slice(None, None, COARSE),) * 2
+    rim = (_around(cues.mask, REACH_CELLS) & ~cues.mask)[every]
+    known, rgb = ~rim, seeds.rgb[every].permute(2, 0, 1)
+    if not bool(rim.any()) or not bool(known.any()):
+        return Gaussians.empty()
+    depth, rgb = far_fill(seeds.inverse_depth[every], rgb, known)
+    placed = _behind(depth, rim, cues, seeds)
+    slope = surface_slope(placed) / (COARSE * CELL)
+    there = Seeds(seeds.uv[every], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
+    fine = compose(there, None, camera)
     return dataclasses.replace(fine, scales=COARSE * fine.scales)
+
+
+def _behind(coarse: Tensor, rim: Tensor, cues: Cues, seeds: Seeds) -> Tensor:
+    """The inverse depth of every COARSE-th cell, at the rim behind all that is seen as far around as a blob reaches."""
+    every = (slice(None, None, COARSE),) * 2
+    field, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
+    field[every], chosen[every] = coarse, rim
+    return placed_behind(field, chosen, cues, COARSE * RIM_CELLS)[every]
 
 
 def _around(mask: Tensor, radius: int) -> Tensor:
     """[h, w] bool: all cells within `radius` of the chosen ones, along rows and columns."""
-    return max_pool2d(mask.float()[None, None], 2 * radius + 1, stride=1, padding=radius)[0, 0] > 0
+    wide = max_pool2d(mask.float()[None, None], (2 * radius + 1, 1), stride=1, padding=(radius, 0))
+    return max_pool2d(wide, (1, 2 * radius + 1), stride=1, padding=(0, radius))[0, 0] > 0
