@@ -25,7 +25,8 @@ from spackle.camera import Camera
 from spackle.formats import load_ply, load_ply_camera, save_ply
 from spackle.formats.spz import decode_spz
 from spackle.gaussians import Gaussians
-from spackle.jobs.export import WRITERS, Scene
+from spackle.jobs.export import WRITERS
+from spackle.jobs.scene_file import SceneFile
 from spackle.render import CpuRenderer
 from spackle.trajectory import DepthRange, max_offset
 
@@ -98,10 +99,10 @@ def main() -> None:
         else:
             gaussians, camera = grid_scene(options.count)
             save_ply(gaussians, path, camera=camera, base_count=len(gaussians))
-        report(Scene.load(path), camera, Path(folder), options.runs, options.side)
+        report(SceneFile.load(path), camera, Path(folder), options.runs, options.side)
 
 
-def report(scene: Scene, camera: Camera, folder: Path, runs: int, side: int) -> None:
+def report(scene: SceneFile, camera: Camera, folder: Path, runs: int, side: int) -> None:
     """One line a format."""
     factor = min(1.0, side / max(camera.width, camera.height))
     camera = camera.resized(round(camera.width * factor), round(camera.height * factor))

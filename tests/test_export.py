@@ -43,9 +43,9 @@ from spackle.formats.sog import codebook, encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LIMIT, decode_spz, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
-from spackle.jobs import export as job
 from spackle.jobs.export import WRITERS, export_scene
 from spackle.jobs.progress import Reporter
+from spackle.jobs.scene_file import SceneFile
 from spackle.render import CpuRenderer
 
 CPU = CpuRenderer()
@@ -472,9 +472,16 @@ def test_something_far_away_does_not_shuffle_what_is_near() -> None:
 
 
 def test_a_camera_elsewhere_is_no_comment(tmp_path: Path) -> None:
-    loaded = job.Scene(tmp_path / "a.ply", ONE, moved(), None)
+    loaded = SceneFile(tmp_path / "a.ply", ONE, moved(), None)
     WRITERS[".ply"](loaded, tmp_path / "b.ply")
     assert load_ply_camera(tmp_path / "b.ply") is None
+
+
+def test_a_scene_is_read_once_for_all_formats(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+    monkeypatch.setattr("spackle.jobs.scene_file.load_ply", lambda path: (read.append(path), load_ply(path))[1])
+    export_scene(scene, [tmp_path / "a.html", tmp_path / "a.ply", tmp_path / "a.glb"], told()[0])
+    assert read == [scene]
 
 
 def test_what_is_drawn_nearer_is_said(tmp_path: Path) -> None:

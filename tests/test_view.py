@@ -26,7 +26,8 @@ import spackle
 from spackle.formats import save_ply
 from spackle.image import film_to_pixels
 from spackle.jobs.options import PredictOptions
-from spackle.jobs.view_scene import load_page_scene
+from spackle.jobs.scene_file import SceneFile
+from spackle.jobs.view_scene import page_of
 
 # The command line in a process of its own; a photo takes for ever.
 DEAF = """
@@ -142,7 +143,7 @@ def test_the_page_goes_as_far_as_the_scene_was_completed(tmp_path: Path) -> None
     for stored, count, free in ((0.2, 10, 0.2), (None, 10, 0.3), (None, 0, 0.6), (5.0, 10, 1.0)):
         base = len(scene.base()) - count
         save_ply(scene.base(), tmp_path / "a.ply", camera=scene.camera, base_count=base, disparity=stored)
-        orbit: Any = load_page_scene(tmp_path / "a.ply", PredictOptions()).description["orbit"]
+        orbit: Any = page_of(SceneFile.load(tmp_path / "a.ply"), PredictOptions()).description["orbit"]
         assert (orbit["free"], orbit["limit"]) == (free, pytest.approx(1.3 * free))
 
 

@@ -2,64 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
 from rich.filesize import decimal
 
-from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats import (
-    atomic_path,
-    check_writable,
-    load_ply,
-    load_ply_base_count,
-    load_ply_camera,
-    load_ply_disparity,
-    save_ply,
-)
+from spackle.formats import atomic_path, check_writable, save_ply
 from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb
 from spackle.formats.ply_header import read_header
 from spackle.formats.sog import encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LARGEST, encode_spz, spz_grid
-from spackle.gaussians import Gaussians
 from spackle.jobs.progress import Reporter
+from spackle.jobs.scene_file import SceneFile
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """What a PLY holds."""
-
-    path: Path
-    gaussians: Gaussians
-    camera: Camera | None  # the photo's
-    base_count: int | None
-    disparity: float | None = None  # how far it was completed
-
-    @staticmethod
-    def load(path: Path) -> Scene:
-        """Read a PLY of ours, of INRIA's or of SHARP's.
-
-        Raises:
-            InputError: a file that is no scene.
-        """
-        return Scene(path, load_ply(path), load_ply_camera(path), load_ply_base_count(path), load_ply_disparity(path))
-
-    @property
-    def untilted_camera(self) -> Camera | None:
-        """The camera where it stands at the world's origin, which is all that a comment of a PLY can say."""
-        camera = self.camera
-        still = camera is not None and torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera))
-        return camera if still else None
-
-
-def _ply(scene: Scene, path: Path) -> None:
+def _ply(scene: SceneFile, path: Path) -> None:
     save_ply(
         scene.gaussians,
         path,
@@ -69,36 +31,36 @@ def _ply(scene: Scene, path: Path) -> None:
     )
 
 
-def _compressed_ply(scene: Scene, path: Path) -> None:
+def _compressed_ply(scene: SceneFile, path: Path) -> None:
     path.write_bytes(encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
 
 
-def _spz(scene: Scene, path: Path) -> None:
+def _spz(scene: SceneFile, path: Path) -> None:
     path.write_bytes(encode_spz(scene.gaussians))
 
 
-def _splat(scene: Scene, path: Path) -> None:
+def _splat(scene: SceneFile, path: Path) -> None:
     path.write_bytes(encode_splat(scene.gaussians))
 
 
-def _sog(scene: Scene, path: Path) -> None:
+def _sog(scene: SceneFile, path: Path) -> None:
     path.write_bytes(encode_sog(scene.gaussians))
 
 
-def _glb(scene: Scene, path: Path) -> None:
+def _glb(scene: SceneFile, path: Path) -> None:
     path.write_bytes(encode_glb(scene.gaussians, scene.camera, scene.base_count))
 
 
-def _html(scene: Scene, path: Path) -> None:
+def _html(scene: SceneFile, path: Path) -> None:
     from spackle.jobs.options import PredictOptions
-    from spackle.jobs.view_scene import load_page_scene
+    from spackle.jobs.view_scene import page_of
     from spackle.viewer.page import single_html
 
-    path.write_bytes(single_html(load_page_scene(scene.path, PredictOptions())))
+    path.write_bytes(single_html(page_of(scene, PredictOptions())))
 
 
 # By the end of a name; the first that fits counts.
-WRITERS: dict[str, Callable[[Scene, Path], None]] = {
+WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
     ".compressed.ply": _compressed_ply,
     ".ply": _ply,
     ".spz": _spz,
@@ -123,7 +85,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
         raise InputError(f"{twice[0]}: named twice: give each output once")
     if os.path.realpath(scene) in map(str, targets):
         raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
-    loaded = Scene.load(scene)
+    loaded = SceneFile.load(scene)
     size = os.path.getsize(scene)
     if rest := _harmonics(scene):
         reporter.say(
@@ -146,7 +108,7 @@ def _harmonics(scene: Path) -> int:
     return sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields)
 
 
-def writer_of(output: Path) -> Callable[[Scene, Path], None]:
+def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:
     """What writes a file of this name.
 
     Raises:
@@ -158,7 +120,7 @@ def writer_of(output: Path) -> Callable[[Scene, Path], None]:
     raise InputError(f"{output}: which format? Give a name that ends in {', '.join(WRITERS)}")
 
 
-def _say(reporter: Reporter, scene: Scene, output: Path, before: int, seconds: float) -> None:
+def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, seconds: float) -> None:
     """One line about a file, and one about what its format could not hold."""
     size = os.path.getsize(output)
     factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"

@@ -14,10 +14,11 @@ from spackle.jobs.bases import AUTO
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.predict import complete_photo
 from spackle.jobs.progress import Reporter, Step
+from spackle.jobs.scene_file import SceneFile
 from spackle.jobs.setup import Tools, make_base, set_up
 from spackle.jobs.stopping import asked_to_stop
 from spackle.jobs.view_open import announce
-from spackle.jobs.view_scene import is_scene, load_page_scene
+from spackle.jobs.view_scene import is_scene, page_of
 from spackle.viewer import PageScene, page_files, page_scene
 from spackle.viewer.events import Tell
 from spackle.viewer.server import HOST, ViewerServer
@@ -64,7 +65,7 @@ def _first(target: Path, options: PredictOptions, uploads: Uploads, reporter: Re
         if options.depth is not None:
             raise InputError(f"--depth {options.depth}: {target.name} is a scene already: leave the option out")
         with reporter.stage("load", seconds):
-            scene = load_page_scene(target, options)
+            scene = page_of(SceneFile.load(target), options)
         return lambda server: server.show(scene)
     tools = set_up(options)
     if options.depth is None:

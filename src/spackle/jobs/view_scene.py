@@ -10,11 +10,11 @@ import torch
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.render import DEFAULT_SIZE
+from spackle.jobs.scene_file import SceneFile, at_origin
 from spackle.viewer import PageScene, page_scene
 
 MAGIC = b"ply"
@@ -34,21 +34,19 @@ def is_scene(path: Path) -> bool:
         return path.suffix.lower() == ".ply" or file.read(len(MAGIC)) == MAGIC
 
 
-def load_page_scene(path: Path, options: PredictOptions) -> PageScene:
-    """A PLY of ours, or of others: where no camera is stored, a usual lens looks along z.
+def page_of(scene: SceneFile, options: PredictOptions) -> PageScene:
+    """A loaded scene, of ours or of others: where no camera is stored, a usual lens looks along z.
 
     Raises:
-        InputError: a file that is no scene, or that cannot be seen from its camera.
+        InputError: a scene that cannot be seen from its camera.
     """
-    gaussians = load_ply(path)
-    camera = _lens(load_ply_camera(path), options)
-    if not torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera)):
+    path, gaussians, camera = scene.path, scene.gaussians, _lens(scene.camera, options)
+    if not at_origin(camera):
         gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin
         camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-    count = load_ply_base_count(path)
-    base, aux = _parts(gaussians, len(gaussians) if count is None else count)
+    base, aux = _parts(gaussians, len(gaussians) if scene.base_count is None else scene.base_count)
     try:
-        return page_scene(name_of(path), base, aux, camera, load_ply_disparity(path))
+        return page_scene(name_of(path), base, aux, camera, scene.disparity)
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{name_of(path)}: ')}") from error
     except ValueError as error:
