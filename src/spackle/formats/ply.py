@@ -118,13 +118,11 @@ def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
     Raises:
         InputError: a broken file, or a camera that makes no sense.
     """
-    size = check_file(path, "PLY file")
+    header, words = _comment(path, CAMERA_COMMENT)
+    if words is not None:
+        return _commented_camera(words, path)
     with open(path, "rb") as file:
-        header = read_header(file, path)
-        header.check_size(size)
         extras = read_extras(file, header)
-    if CAMERA_COMMENT in header.comments:
-        return _commented_camera(header)
     if "intrinsic" not in extras:
         return None
     intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", np.eye(4).ravel())
@@ -152,13 +150,10 @@ def load_ply_base_count(path: str | os.PathLike[str]) -> int | None:
     Raises:
         InputError: a broken file, or a number that makes no sense.
     """
-    size = check_file(path, "PLY file")
-    with open(path, "rb") as file:
-        header = read_header(file, path)
-    header.check_size(size)
-    if BASE_COMMENT not in header.comments:
+    header, words = _comment(path, BASE_COMMENT)
+    if words is None:
         return None
-    words, (vertex, _) = header.comments[BASE_COMMENT], _vertex(header)
+    vertex, _ = _vertex(header)
     if len(words) != 1 or not re.fullmatch(r"[0-9]{1,12}", words[0]) or int(words[0]) > vertex.count:
         raise InputError(f"{path}: the stored number of base Gaussians makes no sense: {' '.join(words)[:80]}")
     return int(words[0])
@@ -170,9 +165,7 @@ def load_ply_disparity(path: str | os.PathLike[str]) -> float | None:
     Raises:
         InputError: a broken file, or a number that makes no sense.
     """
-    check_file(path, "PLY file")
-    with open(path, "rb") as file:
-        words = read_header(file, path).comments.get(DISPARITY_COMMENT)
+    _, words = _comment(path, DISPARITY_COMMENT)
     if words is None:
         return None
     try:
@@ -197,10 +190,23 @@ def header_comments(camera: Camera | None, base_count: int | None, disparity: fl
     return lines
 
 
-def _commented_camera(header: Header) -> Camera:
-    where = f"{header.path}: the stored camera"
+def _comment(path: str | os.PathLike[str], name: str) -> tuple[Header, list[str] | None]:
+    """The header of a file that is long enough for it, and the words of its comment of that name; None without one.
+
+    Raises:
+        InputError: a missing, broken or cut file.
+    """
+    size = check_file(path, "PLY file")
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+    header.check_size(size)
+    return header, header.comments.get(name)
+
+
+def _commented_camera(words: list[str], path: str | os.PathLike[str]) -> Camera:
+    where = f"{path}: the stored camera"
     try:
-        fx, fy, cx, cy, width, height = (float(word) for word in header.comments[CAMERA_COMMENT])
+        fx, fy, cx, cy, width, height = (float(word) for word in words)
         K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return checked_camera(K, torch.eye(4), int(width), int(height), where)
     except (ValueError, OverflowError) as error:
