@@ -15,7 +15,9 @@ import torch
 from command import names_in, run
 
 from spackle.cli.options import INTERRUPTED
+from spackle.errors import InputError
 from spackle.evaluation.suite.tables import TITLES
+from spackle.jobs.evaluate_store import KINDS, begin
 
 SIDE = 64
 
@@ -64,6 +66,26 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
     assert run(*words).code == 0
     assert (output / "sections" / "limits.json").read_text() == first
     assert "suite.md" in names_in(output)
+
+
+def config_of(kind: str | None, runs: int = 1) -> dict[str, Any]:
+    return {"runs": runs} | ({} if kind is None else {"kind": kind})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, kind: str | None) -> None:
+    command, results = KINDS[kind]
+    for _ in range(2):  # the second one goes on
+        begin(tmp_path, config_of(kind), "parts")
+    assert names_in(tmp_path) == {"config.json", "parts"}
+    with pytest.raises(InputError, match=rf"holds {results} of another kind \(runs: 1 -> 2\): choose another -o"):
+        begin(tmp_path, config_of(kind, runs=2), "parts")
+    for other in KINDS.keys() - {kind}:
+        with pytest.raises(InputError, match=rf"config\.json: not of `spackle {KINDS[other][0]}`: choose another -o"):
+            begin(tmp_path, config_of(other), "parts")
+    (tmp_path / "config.json").write_text("[]")
+    with pytest.raises(InputError, match=f"not of `spackle {command}`"):
+        begin(tmp_path, config_of(kind), "parts")
 
 
 def test_no_gpu_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

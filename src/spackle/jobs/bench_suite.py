@@ -23,16 +23,14 @@ from spackle.evaluation.table import to_markdown
 from spackle.jobs.bench_suite_options import SuiteOptions, check_suite_options
 from spackle.jobs.bench_suite_sections import Sections
 from spackle.jobs.dataset_options import weights_digest
-from spackle.jobs.evaluate_store import read_json, write_json, write_text
-from spackle.jobs.inputs import alone_in, make_folder, remove_half_written, results_folder
+from spackle.jobs.evaluate_store import begin, write_json, write_text
+from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions, without_nan
 from spackle.jobs.progress import Reporter
 from spackle.jobs.stopping import asked_to_stop
-from spackle.pseudo.manifest import differences
 
-SECTIONS, CONFIG = "sections", "config.json"
+SECTIONS = "sections"
 RESULTS, MARKDOWN, PLOT = "suite.json", "suite.md", "scaling.svg"
-FORMAT = 1
 
 
 def bench_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
@@ -53,7 +51,7 @@ def bench_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
     check_suite_options(options)
     config = _configuration(options)
     with results_folder(output, (RESULTS, MARKDOWN, PLOT)), alone_in(output, "benchmark"):
-        _begin(output, config)
+        begin(output, config, SECTIONS)
         return _Suite(options, output, reporter, config).run()
 
 
@@ -172,21 +170,6 @@ def _head(config: Mapping[str, Any]) -> str:
     machine = ", ".join(f"{key} {value}" for key, value in config["hardware"].items())
     version = ", ".join(f"{key} {value}" for key, value in config["versions"].items())
     return f"# Speed\n\n{machine}; commit {config['commit']}; {version}; {config['runs']} runs.\n\n"
-
-
-def _begin(output: Path, config: Mapping[str, Any]) -> None:
-    """Make the folder this configuration's, or check that it is."""
-    make_folder(output / SECTIONS)
-    remove_half_written(output, output / SECTIONS)
-    path = output / CONFIG
-    if not path.exists():
-        write_json({"format": FORMAT, **config}, path)
-        return
-    old = read_json(path)
-    if not isinstance(old, dict) or old.get("kind") != "suite" or old.pop("format", None) != FORMAT:
-        raise InputError(f"{path}: not of `spackle bench --suite`: choose another -o")
-    if lines := differences(old, json.loads(json.dumps(config))):
-        raise InputError(f"{output}: holds a suite of another kind ({'; '.join(lines)}): choose another -o")
 
 
 def _load(path: Path, inputs: Mapping[str, Any] | None) -> Found | None:

@@ -1,4 +1,4 @@
-"""An evaluation's folder: one file for each finished image, so that a killed run goes on where it stopped."""
+"""A folder of figures: one file for each finished part, so that a killed run goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -18,25 +18,36 @@ IMAGES = "images"
 CONFIG, RESULTS, TIMES = "config.json", "results.json", "times.json"
 MARKDOWN, LATEX, WORST, BEST = "tables.md", "tables.tex", "worst.png", "best.png"
 FORMAT = 1
+KINDS = {  # of a configuration: the command, and what its folder holds
+    None: ("evaluate", "an evaluation"),
+    "bench": ("bench", "a benchmark"),
+    "suite": ("bench --suite", "a suite"),
+}
 
 
-def begin(output: Path, config: Mapping[str, Any]) -> None:
+def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
     """Make the folder this configuration's, or check that it is.
+
+    Args:
+        output: the folder.
+        config: its "kind" says whose results there are, see `KINDS`.
+        parts: the folder in it for what is finished.
 
     Raises:
         InputError: it holds another one, and says where they differ.
     """
-    make_folder(output / IMAGES)
-    remove_half_written(output, output / IMAGES)
-    path = output / CONFIG
+    make_folder(output / parts)
+    remove_half_written(output, output / parts)
+    path, kind = output / CONFIG, config.get("kind")
     if not path.exists():
         write_json({"format": FORMAT, **config}, path)
         return
+    command, results = KINDS[kind]
     old = read_json(path)
-    if not isinstance(old, dict) or old.pop("format", None) != FORMAT:
-        raise InputError(f"{path}: not of `spackle evaluate`: choose another -o")
+    if not isinstance(old, dict) or old.pop("format", None) != FORMAT or old.get("kind") != kind:
+        raise InputError(f"{path}: not of `spackle {command}`: choose another -o")
     if lines := differences(old, json.loads(json.dumps(config))):
-        raise InputError(f"{output}: holds an evaluation of another kind ({'; '.join(lines)}): choose another -o")
+        raise InputError(f"{output}: holds {results} of another kind ({'; '.join(lines)}): choose another -o")
 
 
 def stem_of(index: int, name: str) -> str:
