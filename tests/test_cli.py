@@ -96,7 +96,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert report["merged"] == merged
     assert report["residual"] == {"weights": "shipped"}
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.3)
-    assert report["views"] == "rotate_forward"
+    assert report["views"] == "rotate-forward"
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
     assert report["photo"] == {"file": "photo.png", "width": WIDTH, "height": HEIGHT}
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.3", "+0.3"]
@@ -189,11 +189,11 @@ def test_no_render_writes_no_video(tmp_path: Path) -> None:
     assert "video" not in report_of(tmp_path / "photo")["seconds"]
 
 
-@pytest.mark.parametrize("kind", ["swipe", "shake", "rotate", "rotate-forward"])
+@pytest.mark.parametrize("kind", ["swipe", "shake", "rotate", "rotate_forward"])
 def test_every_path_closes_its_holes(tmp_path: Path, kind: str) -> None:
     predict(*write_pair(tmp_path), tmp_path, "--trajectory", kind, "--disparity", "0.5")
     report = report_of(tmp_path / "photo")
-    assert report["views"] == kind.replace("-", "_")
+    assert report["views"] == kind.replace("_", "-")
     assert [view["view"] for view in report["hole_area_ratio"]] == ["-0.5", "+0.5"]
     assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
 
@@ -680,6 +680,14 @@ def test_usage_errors(tmp_path: Path, pair: tuple[Path, Path], options: tuple[st
     assert result.code == 2
     assert options[0] in result.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", [("predict", "-o", "out"), ("dataset", "build", "--photos", "x", "-o", "out")])
+def test_a_path_of_another_name_is_told_those_there_are(command: tuple[str, ...]) -> None:
+    result = run(*command, "--trajectory", "rotate_back")
+    assert "--trajectory': 'rotate_back' is not one of 'swipe', 'shake', 'rotate', 'rotate-forward'" in result.err
+    shown = " ".join(run(*command, "--help").out.split())
+    assert "--trajectory [swipe|shake|rotate|rotate-forward]" in shown
 
 
 @pytest.mark.parametrize("content", [b"not weights", b"", (2**60).to_bytes(8, "little") + b"{}"])

@@ -426,6 +426,16 @@ def test_info_and_preview(whole: tuple[Path, Run], tmp_path: Path) -> None:
         assert sheet.size == (3 * 72, 2 * 3 * 54)
 
 
+def test_info_spells_the_path_as_the_option_does(tmp_path: Path) -> None:
+    write_inputs(tmp_path, count=1)
+    for spelling in ("rotate_forward", "rotate-forward"):  # the same build, which is done the second time
+        done = build(tmp_path, tmp_path / "out", "--trajectory", spelling, "--inpainter", "none")
+        assert done.code == 0, done.err
+    shown = run("dataset", "info", tmp_path / "out").out
+    assert '"trajectory": "rotate-forward"' in shown
+    assert PseudoFiles(tmp_path / "out").group(0).facts["trajectory"]["kind"] == "rotate_forward"  # as Python has it
+
+
 # Readers ------------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,15 @@ from typing import Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, Device, DeviceOption, PrecisionChoice, Trajectory, VerboseOption
+from spackle.cli.options import (
+    INTERRUPTED,
+    Device,
+    DeviceOption,
+    PrecisionChoice,
+    Trajectory,
+    VerboseOption,
+    trajectory_option,
+)
 
 dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
 
@@ -45,7 +53,7 @@ def dataset_build(
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: Annotated[PrecisionChoice, typer.Option(help="Of the base's network.")] = PrecisionChoice.auto,
     views: Annotated[int, typer.Option(help="Views of a photo, its own among them.")] = 20,
-    trajectory: Annotated[Trajectory | None, typer.Option(help="Camera path; default: drawn for each photo.")] = None,
+    trajectory: Annotated[Trajectory | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
     disparity: Annotated[
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),

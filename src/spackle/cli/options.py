@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,6 +23,9 @@ class Trajectory(str, Enum):
     shake = "shake"
     rotate = "rotate"
     rotate_forward = "rotate-forward"
+
+
+SPELLINGS = [kind.value for kind in Trajectory]
 
 
 class PrecisionChoice(str, Enum):
@@ -74,9 +77,28 @@ class StereoChoice(str, Enum):
     anaglyph = "anaglyph"
 
 
+def trajectory_named(text: str) -> Trajectory:
+    """A trajectory as the command line or as Python spells it; BadParameter where there is none."""
+    spelled = text.replace("_", "-")
+    if spelled not in SPELLINGS:
+        raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, SPELLINGS))}.")
+    return Trajectory(spelled)
+
+
+def trajectory_option(words: str, default: str | None = None) -> Any:
+    """The option --trajectory; `default` is what the help shows."""
+    return typer.Option(
+        help=words,
+        show_default=default or False,
+        parser=trajectory_named,
+        metavar=f"[{'|'.join(SPELLINGS)}]",
+        autocompletion=lambda: SPELLINGS,
+    )
+
+
 # Of a video: `predict` and `render` have the same.
 TrajectoryOption = Annotated[
-    Trajectory | None, typer.Option(help="Camera path of the video.", show_default="rotate-forward")
+    Trajectory | None, trajectory_option("Camera path of the video.", Trajectory.rotate_forward.value)
 ]
 PathOption = Annotated[
     Path | None,

@@ -17,6 +17,7 @@ from spackle.formats.clip_writer import ClipWriter
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.jobs.clip_frames import FIGURES, ClipChoices, ClipCompleter, Drawn
 from spackle.jobs.inputs import results_folder
+from spackle.jobs.names import spelled
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.report import focal_source, write_report
@@ -179,7 +180,7 @@ class _Run:
             "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
             "residual": {"weights": self._tools.residual},
             "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # for each frame, on the mean
-            "views": self._options.trajectory,
+            "views": spelled(self._options.trajectory),
             "disparity": self._options.disparity,
             "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
             "flicker": _flicker(notes),

@@ -14,6 +14,7 @@ from spackle.errors import InputError
 from spackle.image import MAX_SIDE
 from spackle.jobs.bases import kind_of, public_name
 from spackle.jobs.inputs import find_depth
+from spackle.jobs.names import spelled
 from spackle.jobs.options import PredictOptions, check_has_depth, check_options
 from spackle.jobs.request import digest_of, fingerprint
 from spackle.precision import Precision
@@ -106,7 +107,7 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
     """
     base = options.base
     inputs = digest_of([inputs_of(photo, base) for photo in photos])
-    choices = dataclasses.asdict(options.choices)
+    choices, kind = dataclasses.asdict(options.choices), options.choices.trajectory
     return {
         "spackle": spackle.__version__,
         "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
@@ -116,7 +117,7 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
             "precision": base.precision,
             "device": base.device,
         },
-        "views": choices | {"disparity": list(options.choices.disparity)},
+        "views": choices | {"disparity": list(options.choices.disparity), "trajectory": kind and spelled(kind)},
         "inpainter": {"name": inpainter.name, "version": inpainter.version} | _inpainter_weights(options),
         "shard_size": options.shard_size,
         "threads": options.threads,

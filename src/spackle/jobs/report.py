@@ -12,6 +12,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.choose import Choice
 from spackle.formats import atomic_path
 from spackle.image import Photo
+from spackle.jobs.names import spelled
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.setup import Tools
 from spackle.jobs.views import Completed
@@ -49,7 +50,7 @@ def make_report(
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
         "mode": options.mode,
-        "views": given.name if given else options.trajectory,
+        "views": given.name if given else spelled(options.trajectory),
         "disparity": None if given else options.disparity,
         "video": video,
         "hole_area_ratio": holes,
