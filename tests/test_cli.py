@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -50,9 +50,14 @@ COMMAND = [str(SCRIPT)] if SCRIPT.exists() else [sys.executable, "-c", "from spa
 SHORT = ("--frames", "3")
 
 
+def shortened(options: Sequence[object]) -> tuple[object, ...]:
+    """Options of three frames, but where views are given: these are the frames."""
+    return tuple(options) if "--cameras" in options else (*SHORT, *options)
+
+
 def predict(photo: Path, depth: Path, out: Path, *options: object) -> Run:
     """`spackle predict` that has to succeed, three frames long."""
-    result = run("predict", "-i", photo, "--depth", depth, "-o", out, *SHORT, *options)
+    result = run("predict", "-i", photo, "--depth", depth, "-o", out, *shortened(options))
     assert result.code == 0, result.err
     return result
 
@@ -556,7 +561,7 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
 def expect_refusal(tmp_path: Path, *arguments: object, named: object) -> None:
     """`spackle predict` that must fail before it leaves anything in a new folder."""
     out = tmp_path / "new" / "out"
-    refuses(run("predict", "-o", out, *SHORT, *arguments), named)
+    refuses(run("predict", "-o", out, *shortened(arguments)), named)
     assert not out.parent.exists()
 
 
@@ -889,12 +894,13 @@ def test_files_that_are_no_scenes(tmp_path: Path, content: bytes) -> None:
         ("--frames", "0"),
         ("--device", "cuda"),
         ("--cameras", "nowhere.json"),
+        ("--focal-px", "9", "--cameras", "nowhere.json"),
     ],
     ids=" ".join,
 )
-def test_bad_render_options(tmp_path: Path, scene: Path, options: tuple[str, str]) -> None:
+def test_bad_render_options(tmp_path: Path, scene: Path, options: tuple[str, ...]) -> None:
     named = options[1] if options[0] == "--cameras" else options[0]
-    refuses(run("render", "-i", scene, "-o", tmp_path / "out", *SHORT, *options), named)
+    refuses(run("render", "-i", scene, "-o", tmp_path / "out", *shortened(options)), named)
     assert not (tmp_path / "out").exists()
 
 

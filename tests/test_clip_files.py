@@ -180,6 +180,8 @@ def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None
         ("--depth", "a.npy"),
         ("--format", "gif"),
         ("--stereo", "sbs"),
+        ("--fps", "30"),
+        ("--path", "p.json"),
     ],
 )
 def test_an_option_that_a_clip_has_no_use_for_is_one_line(tmp_path: Path, options: tuple[str, ...]) -> None:

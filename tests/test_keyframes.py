@@ -240,7 +240,14 @@ def test_the_command_line_refuses_before_anything_is_loaded(tmp_path: Path) -> N
     cases = (
         (("--path", bad), "bad.json: keyframe 1: eye and target coincide"),
         (("--path", good, "--trajectory", "swipe"), "--trajectory swipe"),
+        (
+            ("--path", good, "--disparity", 0.2),
+            "a camera path of its own: leave --disparity 0.2 out",
+        ),
         (("--path", good, "--cameras", bad), "--cameras"),
+        (("--cameras", bad, "--disparity", 0.3), "gives the views themselves: leave --disparity 0.3 out"),
+        (("--cameras", bad, "--trajectory", "rotate_forward"), "leave --trajectory rotate-forward out"),
+        (("--cameras", bad, "--frames", 9), "leave --frames 9 out"),
         (("--path", tmp_path / "none.json"), "none.json: no such path file"),
     )
     for command in ("predict", "render"):

@@ -12,7 +12,9 @@ from spackle.errors import InputError
 
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.jobs.video_options import VideoOptions
+    from spackle.trajectory import TrajectoryKind
 
+DEFAULT_DISPARITY = 0.3
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 
 
@@ -104,7 +106,10 @@ PathOption = Annotated[
     Path | None,
     typer.Option("--path", metavar="FILE.json", help="A camera path of your own: keyframes, see docs/video.md."),
 ]
-DisparityOption = Annotated[float, typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.")]
+DisparityOption = Annotated[
+    float | None,
+    typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.", show_default="0.3"),
+]
 CamerasOption = Annotated[
     Path | None, typer.Option(metavar="FILE.json", help="Exactly these views in place of a path.")
 ]
@@ -112,7 +117,7 @@ FramesOption = Annotated[
     int | None, typer.Option(help="Frames of the path.", show_default="60, or the keyframes' seconds")
 ]
 FormatOption = Annotated[FormatChoice | None, typer.Option("--format", help="Kind of video.", show_default="mp4")]
-FpsOption = Annotated[float, typer.Option(help="Frames a second.")]
+FpsOption = Annotated[float | None, typer.Option(help="Frames a second.", show_default="30")]
 LoopOption = Annotated[
     int | None,
     typer.Option(metavar="N", help="Show the video N times; 0: for ever.", show_default="0 for gif and webp, else 1"),
@@ -141,7 +146,7 @@ VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how lo
 
 def video_options(
     kind: FormatChoice | None,
-    fps: float,
+    fps: float | None,
     loop: int | None,
     size: str | None,
     show: ShowChoice,
@@ -164,8 +169,21 @@ def video_options(
     )
 
 
-def chosen_trajectory(given: Trajectory | None, path: Path | None) -> Trajectory:
-    """The trajectory, given or not; InputError where --path gives another way."""
-    if given is not None and path is not None:
-        raise InputError(f"--path {path}: is a camera path of its own: leave --trajectory {given.value} out")
-    return given or Trajectory.rotate_forward
+def chosen_way(
+    trajectory: Trajectory | None, disparity: float | None, frames: int | None, path: Path | None, cameras: Path | None
+) -> tuple[TrajectoryKind, float]:
+    """The trajectory and how far it goes, given or not.
+
+    Raises:
+        InputError: --path or --cameras gives other views, to which an option would mean nothing.
+    """
+    given = {"--trajectory": trajectory and trajectory.value, "--disparity": disparity}
+    says = f"--path {path}: is a camera path of its own"
+    if cameras is not None and path is None:
+        given["--frames"] = frames
+        says = f"--cameras {cameras}: gives the views themselves"
+    for option, value in given.items():
+        if value is not None and (path is not None or cameras is not None):
+            raise InputError(f"{says}: leave {option} {value} out")
+    kind = (trajectory or Trajectory.rotate_forward).name
+    return kind, DEFAULT_DISPARITY if disparity is None else disparity  # type: ignore[return-value]  # named as paths are

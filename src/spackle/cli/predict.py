@@ -28,7 +28,7 @@ from spackle.cli.options import (
     StereoOption,
     TrajectoryOption,
     VerboseOption,
-    chosen_trajectory,
+    chosen_way,
     video_options,
 )
 
@@ -73,12 +73,12 @@ def predict(
     ] = None,
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     trajectory: TrajectoryOption = None,
-    disparity: DisparityOption = 0.3,
+    disparity: DisparityOption = None,
     path: PathOption = None,
     cameras: CamerasOption = None,
     frames: FramesOption = None,
     video_format: FormatOption = None,
-    fps: FpsOption = 30,
+    fps: FpsOption = None,
     loop: LoopOption = None,
     size: SizeOption = None,
     show: ShowOption = ShowChoice.color,
@@ -104,6 +104,7 @@ def predict(
     from spackle.jobs.predict import predict_all
     from spackle.jobs.progress import Reporter
 
+    kind, far = chosen_way(trajectory, disparity, frames, path, cameras)
     options = PredictOptions(
         base=base,
         depth=depth,
@@ -113,8 +114,8 @@ def predict(
         low_memory=low_memory,
         residual=residual,
         render=render,
-        trajectory=chosen_trajectory(trajectory, path).name,  # type: ignore[arg-type]  # named as the paths are
-        disparity=disparity,
+        trajectory=kind,
+        disparity=far,
         cameras=cameras,
         path=path,
         frames=frames,

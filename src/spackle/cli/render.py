@@ -26,7 +26,7 @@ from spackle.cli.options import (
     StereoOption,
     TrajectoryOption,
     VerboseOption,
-    chosen_trajectory,
+    chosen_way,
     video_options,
 )
 
@@ -35,12 +35,12 @@ def render(
     scene: Annotated[Path, typer.Option("-i", "--input", metavar="SCENE.ply", help="A 3D Gaussian scene.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
     trajectory: TrajectoryOption = None,
-    disparity: DisparityOption = 0.3,
+    disparity: DisparityOption = None,
     path: PathOption = None,
     cameras: CamerasOption = None,
     frames: FramesOption = None,
     video_format: FormatOption = None,
-    fps: FpsOption = 30,
+    fps: FpsOption = None,
     loop: LoopOption = None,
     size: SizeOption = None,
     show: ShowOption = ShowChoice.color,
@@ -56,9 +56,10 @@ def render(
     from spackle.jobs.progress import Reporter
     from spackle.jobs.render import RenderOptions, render_scene
 
+    kind, far = chosen_way(trajectory, disparity, frames, path, cameras)
     options = RenderOptions(
-        trajectory=chosen_trajectory(trajectory, path).name,  # type: ignore[arg-type]
-        disparity=disparity,
+        trajectory=kind,
+        disparity=far,
         cameras=cameras,
         path=path,
         frames=frames,

@@ -56,7 +56,7 @@ class Film:
         return {
             "file": name,
             "frames": len(cameras),
-            "fps": options.fps,
+            "fps": options.rate,
             "plays": options.plays,  # 0: for ever
             "width": width,
             "height": height,
@@ -131,7 +131,7 @@ def fly(
         ValueError: no such path through this scene.
     """
     if isinstance(kind, KeyframePath):
-        count = frames or kind.frame_count(options.fps)
+        count = frames or kind.frame_count(options.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{kind.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
         return kind.cameras(even_camera(camera), count, DepthRange.of(gaussians))

@@ -58,6 +58,8 @@ def render_scene(scene: Path, output: Path, options: RenderOptions, reporter: Re
         raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
     check_path_options(options.disparity, options.frames)
     check_view_options(options.cameras, options.path, options.video)
+    if options.cameras is not None and options.focal_px is not None:
+        raise InputError(f"--focal-px: the views of --cameras {options.cameras} have lenses of their own: leave it out")
     renderer = get_renderer(options.device)
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
@@ -79,7 +81,7 @@ def render_scene(scene: Path, output: Path, options: RenderOptions, reporter: Re
             for _ in frames:
                 pass
         else:
-            save_video(frames, target, options.video.fps, options.video.loop)
+            save_video(frames, target, options.video.rate, options.video.loop)
     result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds["video"]}
     if problem:
         reporter.say(f"{options.cameras}: {problem}: pictures only, no video")

@@ -15,6 +15,7 @@ VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
 MAX_VIDEO_SIDE = 8192
 MAX_IPD = 1e6
+DEFAULT_FPS = 30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +23,7 @@ class VideoOptions:
     """The choices that every video has."""
 
     format: VideoFormat | None = None  # mp4 where None
-    fps: float = 30
+    fps: float | None = None  # 30 where None; a clip keeps its own, and takes none
     loop: int | None = None  # the format's where None: gif and webp for ever, the others once
     size: tuple[int, int] | None = None  # width and height of one eye's view; the photo's where None
     show: Show = "color"
@@ -36,6 +37,11 @@ class VideoOptions:
         return f".{self.format or 'mp4'}"
 
     @property
+    def rate(self) -> float:
+        """Frames a second."""
+        return DEFAULT_FPS if self.fps is None else self.fps
+
+    @property
     def plays(self) -> int:
         """How often the video is shown; 0: for ever."""
         return FORMATS[self.suffix].loop if self.loop is None else self.loop
@@ -43,8 +49,8 @@ class VideoOptions:
 
 def check_video_options(options: VideoOptions) -> None:
     """InputError for a choice that no video can have."""
-    _named(f"--fps {options.fps:g}", options.fps, None, options)
-    _named(f"--loop {options.loop}", options.fps, options.loop, options)
+    _named(f"--fps {options.rate:g}", options.rate, None, options)
+    _named(f"--loop {options.loop}", options.rate, options.loop, options)
     for option, value in {"--ipd": options.ipd, "--convergence": options.convergence}.items():
         if value is None:
             continue

@@ -135,7 +135,7 @@ def save_plan_video(path: Path, plan: Plan, completed: Completed, renderer: Rend
                 yield film.frame(views)
             step(index + 1, len(plan.shots))
 
-    save_video(frames(), path, film.options.fps, film.options.loop)
+    save_video(frames(), path, film.options.rate, film.options.loop)
 
 
 def describe_video(plan: Plan, name: str) -> dict[str, object]:
