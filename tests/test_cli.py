@@ -548,7 +548,7 @@ def refuses(result: Run, *named: object) -> None:
     assert result.code == 2, result.err
     assert result.out == ""
     assert len(result.lines) == 1, result.err
-    assert result.lines[0].startswith("spackle: ")
+    assert result.lines[0].startswith("error: ")
     for name in named:
         assert str(name) in result.lines[0]
 
@@ -949,7 +949,7 @@ def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch
     monkeypatch.setattr("spackle.jobs.predict.complete", interrupted)
     result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", *SHORT)
     assert result.code == 130
-    assert result.lines[-1] == "spackle: interrupted"
+    assert result.lines[-1] == "interrupted"
     assert not (tmp_path / "new").exists()
 
 

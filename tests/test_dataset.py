@@ -411,7 +411,7 @@ def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) 
     (copy / "manifest.json").unlink()
     (copy / "manifest.json").mkdir()
     done = run("dataset", "info", copy)
-    assert (done.code, done.lines) == (2, [f"spackle: {copy}/manifest.json: cannot be read: Is a directory"])
+    assert (done.code, done.lines) == (2, [f"error: {copy}/manifest.json: cannot be read: Is a directory"])
 
 
 def test_info_and_preview(whole: tuple[Path, Run], tmp_path: Path) -> None:

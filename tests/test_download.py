@@ -578,7 +578,7 @@ def run(*arguments: object) -> Run:
 
 def refuses(result: Run, *words: object) -> None:
     assert (result.code, result.out, len(result.err.splitlines())) == (2, "", 1), result.err
-    assert result.err.startswith("spackle: ")
+    assert result.err.startswith("error: ")
     for word in words:
         assert str(word) in result.err
 

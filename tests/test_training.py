@@ -283,7 +283,7 @@ def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, o
     done = run(*arguments(place, tmp_path / "out", *filled), f"data.cache={tmp_path}/cache")
     assert done.code == 2
     assert said in done.lines[-1]
-    assert len([line for line in done.lines if line.startswith("spackle: ")]) == 1
+    assert len([line for line in done.lines if line.startswith("error: ")]) == 1
     assert "Traceback" not in done.err
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 

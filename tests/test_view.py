@@ -130,7 +130,7 @@ def test_a_scene_of_ours_keeps_its_two_parts_and_its_camera(tmp_path: Path, visi
         seen.update(get(url, get(url, "/scene.json")["scene"]))
 
     result = visit(browse, tmp_path / "scene.ply")
-    assert (result.code, result.lines[-1]) == (130, "spackle: interrupted")
+    assert (result.code, result.lines[-1]) == (130, "interrupted")
     assert b"<html" in seen["page"]
     assert seen["name"] == tmp_path.name  # every scene of ours is called scene.ply
     assert counts(seen) == {"base": len(scene.base()) - 10, "aux": 10}
@@ -349,5 +349,5 @@ def test_it_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:
         assert process.wait(10) == 130
         assert time.monotonic() - start < 5  # a second, where nobody else wants the processor
         assert process.stderr is not None
-        assert process.stderr.read().splitlines()[-1] == "spackle: interrupted"
+        assert process.stderr.read().splitlines()[-1] == "interrupted"
         assert not os.listdir(tmp_path / "temporary")

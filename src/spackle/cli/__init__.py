@@ -59,7 +59,7 @@ def main() -> None:
     except TyperException as error:  # an unknown option, a number that is none
         _fail(error.format_message())
     if code == INTERRUPTED:
-        print("spackle: interrupted", file=sys.stderr)
+        print("interrupted", file=sys.stderr)
     sys.exit(code)
 
 
@@ -68,7 +68,7 @@ def _fail(message: str) -> NoReturn:
         print(message, file=sys.stderr)
         sys.exit(2)
     line = " ".join(message.splitlines())
-    print(f"spackle: {line}", file=sys.stderr)
+    print(f"error: {line}", file=sys.stderr)
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))
     sys.exit(2)

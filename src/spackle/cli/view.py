@@ -58,6 +58,6 @@ def view(
         raise typer.Exit(INTERRUPTED)
     # A step of a network cannot be interrupted, and Python would wait for it, or fall over it, on its way out.
     reporter.console.show_cursor()
-    print("spackle: interrupted", file=sys.stderr, flush=True)
+    print("interrupted", file=sys.stderr, flush=True)
     sys.stdout.flush()
     os._exit(INTERRUPTED)
