@@ -583,6 +583,19 @@ def refuses(result: Run, *words: object) -> None:
         assert str(word) in result.err
 
 
+def test_get_tells_scripts_where_the_file_lies(site: Site, weights: Path) -> None:
+    known = hashlib.sha256(CONTENT).hexdigest()
+    for digest, new in ((known, True), (known, False), (None, False)):
+        if digest is None:
+            (weights / f"{FILE}.json").unlink()
+        result = run("get", "sharp", "--url", site.url, "--json")
+        assert result.code == 0, result.err
+        told = {"name": "sharp", "file": str(weights / FILE), "bytes": len(CONTENT)}
+        assert json.loads(result.out) == {**told, "sha256": digest, "downloaded": new}
+    failed = run("get", "blunt", "--json")
+    assert (failed.code, list(json.loads(failed.out))) == (2, ["error"])
+
+
 def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Path) -> None:
     assert installed("sharp") is None
     first = run("get", "sharp", "--url", site.url)

@@ -29,12 +29,13 @@ def weights_get(
     ] = None,
     url: Annotated[str | None, typer.Option(help="Download from this mirror.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Download what is there already.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Download weights and record their SHA-256; a broken download goes on where it stopped."""
     from spackle.jobs.progress import Reporter
     from spackle.jobs.weights import get_weights
 
-    get_weights(name, output, Reporter(), url=url, force=force)
+    get_weights(name, output, Reporter(as_json=as_json), url=url, force=force)
 
 
 @weights.command("make")

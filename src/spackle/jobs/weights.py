@@ -48,12 +48,14 @@ def get_weights(
     known = known_weights(name)
     path = _place(known, output)
     if os.path.isfile(path) and not force:
-        _say_present(known, path, reporter)
+        record = _say_present(known, path, reporter)
+        _result(known, path, record, reporter, new=False)
         return path
     with results_folder(path.parent, [path.name]):
         record = _download(known, known.url if url is None else url, path, reporter)
     hint = "" if output is None else "; --checkpoint names it to predict"
     reporter.say(f"{_summary(known, record)} -> {path}{hint}")
+    _result(known, path, record, reporter, new=True)
     return path
 
 
@@ -107,13 +109,22 @@ def _place(known: KnownWeights, output: Path | None) -> Path:
     return output if named else output / known.file
 
 
-def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> None:
+def _result(known: KnownWeights, path: Path, record: Record | None, reporter: Reporter, *, new: bool) -> None:
+    """For scripts; no digest where there is no record of the download."""
+    sha256 = None if record is None else record.sha256
+    size = os.path.getsize(path)
+    reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
+
+
+def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> Record | None:
+    """What is said of a file that is there; its record, if any."""
     with reporter.stage("check", {}):
         record = check_recorded(path)
     if record is None:
         reporter.say(f"{known.name}: there already, unchecked for want of a record; --force downloads it again: {path}")
     else:
         reporter.say(f"{_summary(known, record)}, there already and intact: {path}")
+    return record
 
 
 def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> Record:
