@@ -29,7 +29,7 @@ from training_runs import killed_at, started, state
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import expected_shapes, load_network
 from spackle.bases.sharp.config import CONFIGS
-from spackle.bases.sharp.decoder_file import NOTE, PARTS, Owner, decoder_bytes
+from spackle.bases.sharp.decoder_file import NOTE, PARTS, Owner, decoder_bytes, link_owner
 from spackle.bases.sharp.recipe import deterministic_weights
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.camera import Camera
@@ -426,6 +426,8 @@ def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
 ) -> None:
     owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
     (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
+    for _ in range(2):
+        link_owner(owner, tmp_path)
     same, learned = gaussians_from(tmp_path / "same.safetensors"), gaussians_from(whole[0] / "best.safetensors")
     before = gaussians_from(owner.path)
     assert all(map(torch.equal, same.tensors, before.tensors))
@@ -455,16 +457,20 @@ def test_a_decoder_finds_its_checkpoint_beside_it_and_holds_it_to_its_digest(
     best = tmp_path / "best.safetensors"
     with safe_open(whole[0] / "best.safetensors", framework="pt") as opened:
         notes, tensors = opened.metadata(), {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    assert json.loads(notes[NOTE])["checkpoint"] == "sharp.safetensors"  # and not where it lies here
     moved = {**json.loads(notes[NOTE]), "checkpoint": "/elsewhere/sharp.safetensors"}
     save_file(tensors, best, {NOTE: json.dumps(moved)})
-    with pytest.raises(InputError, match=r"trained on sharp\.safetensors, which is neither at /elsewhere/sharp\.safet"):
+    with pytest.raises(InputError, match=r"trained on sharp\.safetensors, which is not beside it: put"):
         SharpBase.load(best)
+    assert str(place) not in str(notes)
     (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
     assert all(map(torch.equal, gaussians_from(best).tensors, gaussians_from(whole[0] / "best.safetensors").tensors))
     (tmp_path / "sharp.safetensors").unlink()
     save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")
     with pytest.raises(InputError, match="trained on a checkpoint with the SHA-256"):
         SharpBase.load(best)
+    (tmp_path / "sharp.safetensors").unlink()
+    (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
     name = min(tensors)
     save_file({key: value for key, value in tensors.items() if key != name}, best, notes)
     with pytest.raises(InputError, match=f"1 names differ, e.g. {name}"):

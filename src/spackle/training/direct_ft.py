@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from spackle.bases.device import enough_memory
-from spackle.bases.sharp.decoder_file import Owner, decoder_bytes
+from spackle.bases.sharp.decoder_file import Owner, decoder_bytes, link_owner
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.formats import atomic_path
 from spackle.pseudo import PseudoSample
@@ -132,9 +132,10 @@ class DirectFt(ViewMethod):
                 temporary.write_text(text + "\n", encoding="utf-8")
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """The decoder in full precision, for `spackle predict --base sharp -c`."""
+        """The decoder in full precision, for `spackle predict --base sharp -c`, and a link to its checkpoint."""
         with atomic_path(path) as temporary:
             temporary.write_bytes(decoder_bytes(network, self.owner))
+        link_owner(self.owner, path.parent)
 
 
 def _reduced(row: Tensor, pictures: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -24,8 +25,13 @@ BLOCK = 1 << 20  # bytes of a file read at once
 class Owner:
     """The checkpoint that a decoder was trained on, and needs for all that was not trained."""
 
-    path: Path  # where it lay
+    path: Path  # where it lies; of one that a decoder's file names, the name alone
     sha256: str
+
+    @property
+    def places(self) -> tuple[str, str]:
+        """What it, or a link to it, is called beside a decoder: its own name, and the link of `link_owner`."""
+        return self.path.name, f"trained-on-{plain_text(Path(self.sha256).name, 12)}.link"
 
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
@@ -36,7 +42,13 @@ def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
         owner: its checkpoint.
     """
     tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
-    return save(tensors, {NOTE: json.dumps({"checkpoint": str(owner.path.absolute()), "sha256": owner.sha256})})
+    return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
+
+
+def link_owner(owner: Owner, folder: Path) -> None:
+    """Let decoders in a folder find their checkpoint; the link's name is one that nothing is ever written to."""
+    with contextlib.suppress(OSError):  # it is there, or this place has no links: then a person puts it there
+        (folder / owner.places[1]).symlink_to(owner.path.absolute())
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
@@ -53,7 +65,7 @@ def owner_of(path: str | os.PathLike[str]) -> Owner | None:
         return None
     try:
         facts = json.loads(note)
-        return Owner(Path(str(facts["checkpoint"])), str(facts["sha256"]))
+        return Owner(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: does not say which checkpoint it was trained on: train it again") from error
 
@@ -61,7 +73,7 @@ def owner_of(path: str | os.PathLike[str]) -> Owner | None:
 def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
     """A whole checkpoint: the owner's tensors, with the decoder's in place of those of the same names.
 
-    The owner is looked for where it lay in training, then beside the decoder under the same name.
+    The owner is looked for beside the decoder.
 
     Args:
         decoder: the tensors of the decoder's file.
@@ -71,13 +83,12 @@ def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owne
     Raises:
         InputError: the owner is not there, cannot be read or has changed, or the decoder is another network's.
     """
-    beside = Path(path).absolute().parent / owner.path.name
-    home = next((place for place in (owner.path, beside) if os.path.isfile(place)), None)
+    beside = Path(path).absolute().parent
+    home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
     name = plain_text(owner.path.name)
     if home is None:
         raise InputError(
-            f"{path}: a decoder trained on {name}, which is neither at {plain_text(str(owner.path), 300)} "
-            "nor beside it: put that checkpoint, or a link to it, beside it"
+            f"{path}: a decoder trained on {name}, which is not beside it: put that checkpoint, or a link to it, there"
         )
     if _sha256(home) != owner.sha256:
         raise InputError(
