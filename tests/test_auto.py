@@ -399,6 +399,38 @@ def test_a_folder_is_done_again_when_better_weights_come(
     assert [base(), base()] == ["lite", "done already"]
 
 
+def test_results_of_sharp_that_give_way_to_lite_are_named(
+    tmp_path: Path, made: dict[str, Path], sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.png", "b.png"):
+        write_photo(tmp_path / "photos" / name)
+
+    def warned() -> list[str]:
+        result = predict(tmp_path, "-i", tmp_path / "photos")
+        assert result.code == 0, result.err
+        return [line for line in result.lines if "warning" in line]
+
+    assert warned() == []
+
+    def bad(path: Path, **options: Any) -> None:
+        raise InputError(f"{path}: cut off")
+
+    sharp.write_bytes(b"cut")
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase, "load", bad)
+        lines = warned()
+        assert lines == [
+            f"{name}.png: warning: {tmp_path / 'out' / name} was made by sharp and is made again by lite: "
+            f"{NO_DEPTH}, SHARP cannot be used ({sharp})"
+            for name in "ab"
+        ]
+        assert warned() == []  # done already
+    shutil.copy(made["sharp"], sharp)
+    assert warned() == []
+    sharp.unlink()
+    assert [line.endswith(f"by lite: {NO_DEPTH}, {NO_SHARP}") for line in warned()] == [True, True]
+
+
 def test_with_depth_no_network_counts(tmp_path: Path, made: dict[str, Path]) -> None:
     write_photo(tmp_path / "photos" / "a.png")
     words = ("-i", tmp_path / "photos", "--depth", write_depth(tmp_path / "d.npy"))

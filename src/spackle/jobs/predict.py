@@ -6,18 +6,21 @@ import contextlib
 import dataclasses
 from pathlib import Path
 
+from spackle.bases.lite.base import LiteBase
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.sharp import SharpBase
 from spackle.choose import BaseError, Choice, all_finite
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo, resize_photo
+from spackle.jobs.bases import AUTO
 from spackle.jobs.clip import check_clip_options, predict_clip
 from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter
-from spackle.jobs.report import focal_source, is_done, make_report, summary, write_report
+from spackle.jobs.report import base_before, focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.request import request_of
 from spackle.jobs.setup import Tools, search_base, set_up
 from spackle.jobs.views import (
@@ -112,6 +115,7 @@ def _predict_loaded(
     name = photo.path.name
     done = complete_photo(photo, name, options, tools, reporter, seconds)
     photo, prediction, choice, plan, completed = done.photo, done.prediction, done.choice, done.plan, done.completed
+    _warn_of_lite(name, folder, choice, options, reporter)
     with reporter.stage("write", seconds):
         (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
         count = len(completed.base)
@@ -133,6 +137,16 @@ def _predict_loaded(
     write_report(report, folder / "report.json")
     reporter.say(f"{name}: {summary(report)} -> {folder}")
     reporter.result({"folder": folder, **report})
+
+
+def _warn_of_lite(name: str, folder: Path, choice: Choice, options: PredictOptions, reporter: Reporter) -> None:
+    """A line where SHARP's results are about to give way to rough ones, because its weights are damaged or gone."""
+    if options.named == AUTO and choice.base == LiteBase.name and base_before(folder) == SharpBase.name:
+        file = options.base_files.get("checkpoint")
+        reporter.say(
+            f"{name}: warning: {folder} was made by sharp and is made again by lite: "
+            f"{choice.why}{'' if file is None else f' ({file})'}"
+        )
 
 
 def complete_photo(

@@ -70,11 +70,22 @@ def is_done(folder: Path, results: Sequence[str], request: str) -> bool:
     """Whether an earlier run with the same files and options has finished, and its results are there still."""
     if not all((folder / name).is_file() for name in results):
         return False
+    return _earlier(folder).get("request") == request
+
+
+def base_before(folder: Path) -> str | None:
+    """The base of an earlier run's results; None where there are none."""
+    base = _earlier(folder).get("base")
+    return str(base["name"]) if isinstance(base, dict) and "name" in base else None
+
+
+def _earlier(folder: Path) -> dict[str, Any]:
+    """An earlier run's report; empty without a whole one."""
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        return bool(report["request"] == request)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}
 
 
 def write_report(report: dict[str, Any], path: Path) -> None:
