@@ -19,9 +19,10 @@ from stand_in import StandIn, base_of, predict, refuses, write_lite
 from spackle.bases.device import MemoryShort
 from spackle.bases.hf import HfBase
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.image import Photo
-from spackle.jobs.bases import base_files, public_name
+from spackle.jobs.bases import KINDS, base_files, public_name, says_of
 from spackle.jobs.bench_options import BenchOptions
 from spackle.jobs.evaluate_options import EvaluateOptions
 from spackle.jobs.options import PredictOptions
@@ -238,6 +239,17 @@ def test_an_evaluation_of_lite_and_of_a_model(
         assert "not SHARP, so not the paper's base" in said["says"]
         assert f"| {title} alone |" in (folder / "out" / "tables.md").read_text()
     assert hub == [{"model": "me/small", "precision": "fp32", "device": None}]
+
+
+def test_tables_call_weights_apples_where_they_came_from_apple(tmp_path: Path) -> None:
+    file, record = tmp_path / "my_sharp.pt", tmp_path / "my_sharp.pt.json"
+    file.write_bytes(b"weights")
+    unknown = "a network of SHARP's shape, from the photo alone, by weights of unknown origin: my_sharp.pt"
+    assert says_of("sharp", file) == unknown
+    for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].says)):
+        record.write_text(json.dumps({"url": url, "size": 7, "sha256": sha256(file)}))
+        assert says_of("sharp", file) == says
+    assert says_of("lite", file) == KINDS["lite"].says
 
 
 def test_a_benchmark_of_a_model_times_it_each_run(tmp_path: Path, stereo: Path, hub: list[dict[str, Any]]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from spackle.bases.hf_hub import SETTINGS, WEIGHTS
 from spackle.bases.lite import base as lite
 from spackle.choose import sharp_here
-from spackle.downloads import installed
+from spackle.downloads import installed, known_weights, read_record
 from spackle.errors import InputError
 from spackle.jobs.names import check_name
 
@@ -76,6 +76,19 @@ def kind_of(name: str) -> BaseKind:
 def title_of(name: str) -> str:
     """What tables call a base."""
     return public_name(name) if name.startswith(HF) else kind_of(name).title
+
+
+def says_of(name: str, checkpoint: Path | None) -> str:
+    """What tables say of a base with these weights: Apple's are those that were downloaded from Apple.
+
+    Raises:
+        InputError: there is no such base, or the record of a download cannot be read.
+    """
+    file = base_files(name, checkpoint).get("checkpoint") if name == "sharp" else None
+    record = None if file is None else read_record(file)
+    if file is None or (record is not None and record.url == known_weights("sharp").url):
+        return kind_of(name).says
+    return f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {file.name}"
 
 
 def public_name(name: str) -> str:

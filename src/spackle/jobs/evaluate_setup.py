@@ -18,7 +18,7 @@ from spackle.evaluation.figures import OWN
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import Gauges
 from spackle.evaluation.pyiqa_metrics import DEFINITIONS, open_metrics
-from spackle.jobs.bases import NETWORKS, kind_of, public_name, title_of
+from spackle.jobs.bases import NETWORKS, kind_of, public_name, says_of, title_of
 from spackle.jobs.dataset_options import base_digest, weights_digest
 from spackle.jobs.evaluate_case import Bench
 from spackle.jobs.evaluate_options import EvaluateOptions, for_base
@@ -74,7 +74,7 @@ def configuration(
     """Everything that decides the figures, ready for JSON; nothing of where files lie."""
     base = options.base
     names = digest_of([case.name for case in cases])
-    about = {"name": public_name(base.base), "title": title_of(base.base), "says": kind_of(base.base).says}
+    about = {"name": public_name(base.base), "title": title_of(base.base), "says": says_of(base.base, base.checkpoint)}
     weights = {"weights": base_digest(base), "precision": base.precision}
     residual = base.residual_file and weights_digest(base.residual_file)
     return {
