@@ -547,6 +547,24 @@ def test_second_views_are_the_nearest_that_are_neither_the_same_nor_far(tmp_path
     assert first.bounds == (3.0, 6.0)
 
 
+def test_a_broken_photo_costs_its_own_case_and_no_others(tmp_path: Path) -> None:
+    eyes = [Eye((x, 0, 0)) for x in (0.0, 0.3, 0.6, 3.0, 3.3)]  # at a middle depth of 4: 0.2 to 1 is near
+    llff(tmp_path / "fern", eyes)
+    broken = tmp_path / "fern/images_4/image001.png"
+    broken.write_bytes(broken.read_bytes()[:60])
+    first, own, third, *others = cases("llff", tmp_path)
+    for case, left in ((first, "fern/image002"), (third, "fern/image000")):
+        loaded = load_case(case)
+        assert [view.name for view in loaded.seconds] == [left]
+        assert [str(broken) in lack for lack in loaded.lacks] == [True]
+    for case in others:
+        loaded = load_case(case)
+        assert (len(loaded.seconds), loaded.lacks) == (1, ())
+    for case in (own, dataclasses.replace(first, seconds=first.seconds[:1])):  # itself, or all that there is
+        with pytest.raises(InputError, match=r"image001\.png"):
+            load_case(case)
+
+
 def test_llff_reads_images_4_first_and_matches_by_name_where_it_can(tmp_path: Path) -> None:
     scene = llff(tmp_path / "fern", sparse=True)
     photo(scene / "images/IMG_4026.JPG")

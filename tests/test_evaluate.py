@@ -27,6 +27,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case
+from spackle.evaluation.load import LoadedCase, load_case
 from spackle.evaluation.methods import Shot, make_method
 from spackle.evaluation.metrics import psnr, reduction, ssim, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
@@ -531,6 +532,24 @@ def test_a_photo_without_a_header_is_passed_over_too(content: bytes, scenes: Pat
         (scene / "left.png").write_bytes(content)
     done = evaluate(root, tmp_path / "none", "--methods", "base", "--metrics", "none")
     assert (done.code, len(done.lines), "none of 3 images gave figures" in done.err) == (2, 4, True)
+
+
+def test_a_second_photo_that_is_broken_is_a_remark(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = load_case
+
+    def lacking(case: Case) -> LoadedCase:
+        lack = f"{scenes}/Chair/third.png: not\nan image"
+        return dataclasses.replace(load(case), lacks=(lack,) if case.name == "Chair" else ())
+
+    monkeypatch.setattr("spackle.jobs.evaluate_case.load_case", lacking)
+    done = evaluate(scenes, tmp_path, "--protocol", "near-view", "--methods", "base", "--metrics", "none")
+    assert done.code == 0, done.err
+    remark = "without one of its second photos: Chair/third.png: not an image"
+    assert f"Chair: {remark}" in done.lines
+    records = json.loads((tmp_path / "results.json").read_text())["images"]
+    assert {record["name"]: record["remarks"] for record in records if record["remarks"]} == {"Chair": [remark]}
 
 
 def test_what_is_passed_over_is_named_whichever_photo_is_broken(tmp_path: Path) -> None:

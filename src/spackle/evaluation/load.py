@@ -36,6 +36,7 @@ class LoadedCase:
     photo: Photo  # the input at the working size
     camera: Camera  # of `photo`, at the world's origin: the dataset's, or the photo's own where that has none
     seconds: tuple[LoadedView, ...]
+    lacks: tuple[str, ...] = ()  # why second photos of the case are not among them
 
     @property
     def cells(self) -> int:
@@ -54,8 +55,11 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     Photos are brought to `working_size`, as everywhere, and cameras with them. The last row or column of a second
     photo with an odd side is cut off: views have even sides, and there are no true pixels to add.
 
+    A second photo that cannot be used is left out: the others are as true without it.
+
     Raises:
-        InputError: a file that is missing or no image, or one of another shape than its camera.
+        InputError: a file that is missing or no image, or one of another shape than its camera; of second photos,
+            where that is so of all.
     """
     if case.problem is not None:
         raise InputError(case.problem)
@@ -66,8 +70,9 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
         full = dataclasses.replace(full, focal_px=focal, focal_source=LENS_SOURCE)
     photo = resize_photo(full, max_side)
     camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
-    seconds = tuple(_load_view(view.name, view.photo, view.camera, max_side) for view in case.seconds)
-    return LoadedCase(case, full, photo, dataclasses.replace(camera, world_to_camera=torch.eye(4)), seconds)
+    seconds, lacks = _load_views(case, max_side)
+    camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+    return LoadedCase(case, full, photo, camera, tuple(seconds), tuple(lacks))
 
 
 def known_depth(case: Case) -> DepthMap:
@@ -98,6 +103,19 @@ def check_shape(path: Path, photo: Photo, camera: Camera) -> None:
             f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
             f"{camera.width}×{camera.height}: the photo was cropped or turned, unpack it again"
         )
+
+
+def _load_views(case: Case, max_side: int) -> tuple[list[LoadedView], list[str]]:
+    """The second photos, and what is wrong with those that cannot be used; InputError where that is all."""
+    seconds, lacks = [], []
+    for view in case.seconds:
+        try:
+            seconds.append(_load_view(view.name, view.photo, view.camera, max_side))
+        except InputError as error:
+            lacks.append(str(error))
+    if lacks and not seconds:
+        raise InputError(lacks[0])
+    return seconds, lacks
 
 
 def _load_view(name: str, path: Path, camera: Camera, max_side: int) -> LoadedView:

@@ -20,7 +20,7 @@ from spackle.evaluation.pyiqa_metrics import NOTICE
 from spackle.evaluation.results import Record, Run
 from spackle.evaluation.sheets import CASES, rank, sheet, strip
 from spackle.formats import atomic_path, save_png
-from spackle.jobs.evaluate_case import Bench, examine
+from spackle.jobs.evaluate_case import Bench, examine, from_root
 from spackle.jobs.evaluate_options import EvaluateOptions, check_evaluate_options
 from spackle.jobs.evaluate_pictures import find_bench, picture_suffix, save_picture, source_of, write_report
 from spackle.jobs.evaluate_setup import check_cases, configuration, metrics_device, open_bench
@@ -182,7 +182,7 @@ class _Evaluation:
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:
     """Why a case is passed over, in one line that begins with its name: a photo may be the second one of several."""
-    problem = " ".join(str(error).replace(f"{root}/", "").splitlines())
+    problem = from_root(str(error), root)
     return problem if problem.startswith(case.name) else f"{case.name}: {problem}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -78,9 +79,15 @@ def examine(case: Case, bench: Bench) -> tuple[Record, dict[str, Tensor]]:
         "alignment": dataclasses.asdict(alignment) if alignment else None,
         "shown": {"setting": measured.shown.setting, "view": measured.shown.name},
     }
-    record = Record(case.name, facts, tuple(measured.rows), remarks=tuple(measured.remarks))
+    lacks = [f"without one of its second photos: {from_root(lack, bench.options.root)}" for lack in loaded.lacks]
+    record = Record(case.name, facts, tuple(measured.rows), remarks=(*lacks, *measured.remarks))
     truth = {} if measured.shown.truth is None else {TRUTH: measured.shown.truth}
     return record, measured.pictures | truth
+
+
+def from_root(problem: str, root: Path) -> str:
+    """A line about a file of a dataset, whose name does not say where that was unpacked."""
+    return " ".join(problem.replace(f"{root}/", "").splitlines())
 
 
 def _moves(bench: Bench) -> tuple[float, ...]:
