@@ -75,7 +75,7 @@ def run_ours(weights: Path, photo: Path, output: Path, device: str, options: dic
     clock = Clock()
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does
     import spackle
-    from spackle.bases.sharp.base import to_metric
+    from spackle.bases.sharp.base import to_metric, to_processor
 
     clock.lap("import")
     base = spackle.SharpBase.load(weights, device=device, **options)
@@ -84,7 +84,7 @@ def run_ours(weights: Path, photo: Path, output: Path, device: str, options: dic
     output_of_network = base.look(picture)
     _wait(device)
     clock.lap("network")
-    gaussians = to_metric(output_of_network, picture).to("cpu")
+    gaussians = to_processor(to_metric(output_of_network, picture))
     clock.lap("post-processing")
     spackle.save_ply(gaussians, output, camera=picture.camera)
     clock.lap("save")

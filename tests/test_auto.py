@@ -154,12 +154,13 @@ def test_a_machine_without_a_home_has_no_sharp(tmp_path: Path, monkeypatch: pyte
     spackle.predict(photo, network=None)
 
 
-def test_precision_and_memory_are_for_sharp_if_it_is_taken(
+def test_precision_and_speed_are_for_sharp_if_it_is_taken(
     tmp_path: Path, sharp: Path, quick: list[dict[str, Any]]
 ) -> None:
-    words = ("--precision", "fp32", "--low-memory")
+    words = ("--precision", "fp32", "--windows", 9, "--compile")
     assert base_of(tmp_path, "-i", write_photo(tmp_path / "photo.png"), *words)[0]["name"] == "sharp"
-    assert quick == [{"path": sharp, "precision": "fp32", "low_memory": True, "device": None}]
+    speed = {"windows": 9, "compiled": True}
+    assert quick == [{"path": sharp, "precision": "fp32", "low_memory": False, **speed, "device": None}]
     assert base_of(tmp_path, "-i", portrait(tmp_path / "p.jpg"), *words)[0]["name"] == "rgbd"
     sharp.unlink()
     assert base_of(tmp_path, "-i", tmp_path / "photo.png", *words)[0]["name"] == "lite"

@@ -116,11 +116,12 @@ def test_a_folder_goes_on_and_other_weights_do_it_again(tmp_path: Path) -> None:
     assert "done already" not in run(*arguments).err
 
 
-def test_less_memory_gives_the_same_result_and_so_is_not_done_again(tmp_path: Path, weights: Path) -> None:
+def test_less_memory_or_time_gives_the_same_result_and_so_is_not_done_again(tmp_path: Path, weights: Path) -> None:
     write_photo(tmp_path / "photos" / "a.png")
     arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
     assert "done already" in run(*arguments, "--low-memory").err
+    assert "done already" in run(*arguments, "--windows", 9, "--compile").err
 
 
 def test_weights_that_change_before_they_are_read_stop_the_whole_folder(

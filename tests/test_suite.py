@@ -28,6 +28,7 @@ from spackle.evaluation.suite.plot import scaling_svg
 from spackle.evaluation.suite.renderer import CALL, band, renderer_section
 from spackle.evaluation.suite.scaling import GAUSSIANS, PIXELS, exponent, scaling_section
 from spackle.evaluation.suite.scenes import holed_scene, photo_scene
+from spackle.evaluation.suite.sharp import COMPILED as SHARP_COMPILED
 from spackle.evaluation.suite.sharp import FORWARD, sharp_section
 from spackle.evaluation.suite.tables import suite_tables, targets
 from spackle.evaluation.suite.training import RATE, STEP, training_section
@@ -312,6 +313,23 @@ def test_sharp_in_its_stages() -> None:
     assert need is not None
     assert need.operations["fp32"] > 1e9
     assert found.row("photo to scene").median >= found.row(FORWARD).median
+    assert any("--compile" in note for note in found.notes)
+
+
+def test_sharp_in_other_ways_where_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: network)
+    found = sharp_section(1, SharpBase(micro_network()), compiled=True, windows=(35, 9))
+    names = [f"{FORWARD}, 35 windows at once", f"{FORWARD}, 9 windows at once", SHARP_COMPILED]
+    assert [row.name for row in found.rows][-3:] == names
+    assert all(found.row(name).need == found.row(FORWARD).need for name in names)
+
+    def no_compiler(*arguments: object) -> Any:
+        raise RuntimeError("no compiler\nanywhere")
+
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
+    found = sharp_section(1, SharpBase(micro_network()), compiled=True)
+    assert found.notes[-1] == f"{SHARP_COMPILED}: not run: no compiler anywhere"
+    assert SHARP_COMPILED not in [row.name for row in found.rows]
 
 
 def test_training_steps_a_second() -> None:

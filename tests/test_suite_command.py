@@ -111,6 +111,9 @@ def test_no_gpu_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         (("--suite", "--precision", "fp8", "--base", "sharp"), "--precision fp8"),
         (("--suite", "--residual", "gone.safetensors"), "--residual gone.safetensors: no such file"),
         (("--suite", "--device", "tpu"), "--device tpu"),
+        (("--suite", "--windows", "5,all"), "--windows 5,all: give whole numbers"),
+        (("--suite", "--windows", "1,0"), "--windows must be between 1 and 35, got 0"),
+        (("--dataset", "middlebury", "--root", ".", "--windows", "7"), "--windows is for --suite alone"),
         (("--suite", "words"), "a word of no option"),
     ],
 )

@@ -176,11 +176,15 @@ def load_sharp(
     *,
     precision: Precision = "auto",
     low_memory: bool = False,
+    windows: int | None = None,
+    compiled: bool = False,
     device: str | None = None,
 ) -> SharpBase:
     """SHARP as `SharpBase.load` has it; a download is held to its record first."""
     check_recorded(path)  # where there is a record
-    return SharpBase.load(path, precision=precision, low_memory=low_memory, device=device)
+    return SharpBase.load(
+        path, precision=precision, low_memory=low_memory, windows=windows, compiled=compiled, device=device
+    )
 
 
 class OwnDepthBase(RgbdBase):

@@ -130,8 +130,12 @@ def bench(
         str | None, typer.Option(metavar="A,B,…", help="Of the suite's sections: an unknown one lists all.")
     ] = None,
     compiled: Annotated[
-        bool, typer.Option("--compile", help="In the suite: time the residual's network through torch.compile, too.")
+        bool, typer.Option("--compile", help="In the suite: time the networks through torch.compile, too.")
     ] = False,
+    windows: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,…", help="In the suite: time SHARP with so many windows at once, too; 1 to 35."),
+    ] = None,
     side: Annotated[
         int | None, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
     ] = None,
@@ -177,7 +181,7 @@ def bench(
     disparities = parse_disparities(_with_words(context, disparity))
     bases = _base_options(base, checkpoint, precision, low_memory, residual, device)
     if dataset is None or root is None:
-        asked = suite_options(bases, given, only, runs, base_runs, compiled, side)
+        asked = suite_options(bases, given, only, runs, base_runs, compiled, windows, side)
         end = bench_suite(asked, output or Path("bench-suite"), Reporter(verbose, as_json=as_json))
     else:
         options = BenchOptions(dataset, root, disparities, bases, limit, runs, base_runs)

@@ -64,6 +64,16 @@ def predict(
         PrecisionChoice, typer.Option(help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
     ] = PrecisionChoice.auto,
     low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for sharp.")] = False,
+    windows: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Of sharp: so many of its 35 windows at once. Default: 5, on a GPU all."),
+    ] = None,
+    compiled: Annotated[
+        bool,
+        typer.Option(
+            "--compile", help="Sharp through torch.compile, on a GPU as one CUDA graph: minutes once, for many photos."
+        ),
+    ] = False,
     residual: Annotated[
         str | None,
         typer.Option(
@@ -112,6 +122,8 @@ def predict(
         checkpoint=checkpoint,
         precision=precision.value,
         low_memory=low_memory,
+        windows=windows,
+        compiled=compiled,
         residual=residual,
         render=render,
         trajectory=kind,

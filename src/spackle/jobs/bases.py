@@ -32,24 +32,28 @@ class BaseKind:
 
 
 _OWN_DEPTH = {"--depth": "finds depth itself", "--calib": "finds depth itself"}
+_SHARPS_SPEED = ("--windows", "--compile")
 KINDS = {
     "rgbd": BaseKind(
         "rgbd",
         f"the dataset's own depth, map or points, lifted; {NOT_SHARP}",
-        {"-c": "has no checkpoint", "--precision": "has no network", "--low-memory": "has no network"},
+        {"-c": "has no checkpoint"} | dict.fromkeys(("--precision", "--low-memory", *_SHARPS_SPEED), "has no network"),
         network=False,
     ),
     "sharp": BaseKind("SHARP", "Apple's network, from the photo alone", _OWN_DEPTH, slow=True),
     "lite": BaseKind(
         "lite",
         f"Spackle's own small depth network, from the photo alone, lifted; {NOT_SHARP}",
-        {**_OWN_DEPTH, "--precision": "always computes in fp32", "--low-memory": "takes little as it is"},
+        _OWN_DEPTH
+        | {"--precision": "always computes in fp32", "--low-memory": "takes little as it is"}
+        | dict.fromkeys(_SHARPS_SPEED, "is fast as it is"),
     ),
     ANY_HF: BaseKind(
         "hf",
         f"a depth model of transformers, from the photo alone, lifted; {NOT_SHARP}",
         {
             **_OWN_DEPTH,
+            **dict.fromkeys(_SHARPS_SPEED, "is not SHARP, whose speed it is about"),
             "-c": "has no checkpoint but the model that --base names",
             "--low-memory": "cannot do with less: name a smaller model",
         },

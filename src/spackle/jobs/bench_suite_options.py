@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 
 import torch
 
+from spackle.bases.sharp.base import check_windows
 from spackle.errors import InputError
 from spackle.evaluation.suite.scenes import SIDE
 from spackle.evaluation.suite.tables import TITLES
@@ -27,7 +28,8 @@ class SuiteOptions:
     base_runs: int = 1  # of SHARP
     base: PredictOptions = BASE  # of SHARP's sections, the residual's weights, the device
     sharp: bool = False  # its sections were asked for
-    compiled: bool = False  # time the residual's network through torch.compile, too
+    compiled: bool = False  # time the networks through torch.compile, too
+    windows: Sequence[int] = ()  # time SHARP with so many at once, too
     side: int = SIDE  # pixels along the synthetic scenes
 
     @property
@@ -52,6 +54,8 @@ def check_suite_options(options: SuiteOptions) -> None:
             raise InputError(f"{option} must be between 1 and {most}, got {value}")
     if not (SIDES[0] <= options.side <= SIDES[1] and options.side % 2 == 0):
         raise InputError(f"--side must be an even number between {SIDES[0]} and {SIDES[1]}, got {options.side}")
+    for windows in options.windows:
+        check_windows("--windows", windows, False)
     if options.base.device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {options.base.device}: unknown device; use auto, cpu or cuda")
     if options.base.device == "cuda" and not torch.cuda.is_available():
@@ -75,6 +79,7 @@ def suite_options(
     runs: int,
     base_runs: int | None,
     compiled: bool,
+    windows: str | None,
     side: int | None,
 ) -> SuiteOptions:
     """The command line's choices; SHARP is timed where `given` names it or its weights."""
@@ -85,8 +90,16 @@ def suite_options(
         base=base,
         sharp=bool({"--base", "--checkpoint"} & set(given)),
         compiled=compiled,
+        windows=() if windows is None else _whole_numbers("--windows", windows),
         side=SIDE if side is None else side,
     )
+
+
+def _whole_numbers(option: str, words: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in split_words(words))
+    except ValueError:
+        raise InputError(f"{option} {words}: give whole numbers with commas between them") from None
 
 
 def check_choice(suite: bool, given: Collection[str]) -> None:
@@ -97,7 +110,7 @@ def check_choice(suite: bool, given: Collection[str]) -> None:
         given: the options that were given, by their long names.
     """
     of_dataset = ("--dataset", "--root", "--limit", "--disparity")
-    of_suite = ("--only", "--compile", "--side")
+    of_suite = ("--only", "--compile", "--windows", "--side")
     if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):
         raise InputError(f"{' and '.join(missing)} missing: give --dataset NAME --root DIR, or --suite")
     for name in of_dataset if suite else of_suite:

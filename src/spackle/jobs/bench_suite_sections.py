@@ -79,7 +79,8 @@ class Sections:
                 return None
             base = self.options.base
             settings = {"precision": base.precision, "low_memory": base.low_memory, "runs": self.options.base_runs}
-            return {"weights": weights_digest(self._checkpoint), **settings}
+            variants = {"compiled": self.options.compiled, "windows": list(self.options.windows)}
+            return {"weights": weights_digest(self._checkpoint), **settings, **variants}
         if name in ("completion", "photo", "gpu-completion"):
             return {"compiled": self.options.compiled}
         return {}
@@ -128,7 +129,8 @@ class Sections:
             raise InputError(NO_SHARP)
         base = self.options.base
         loaded = SharpBase.load(path, precision=base.precision, low_memory=base.low_memory, device=device)
-        return sharp_section(self.options.base_runs, loaded, device)
+        compiled, windows = self.options.compiled, self.options.windows
+        return sharp_section(self.options.base_runs, loaded, device, compiled=compiled, windows=windows)
 
     def _training(self, device: torch.device) -> Found:
         batch, cells = (BATCH, CELLS) if not self._small else (2, 32)

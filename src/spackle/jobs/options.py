@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from spackle.bases.sharp.base import check_windows
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.jobs.bases import AUTO, HF, KINDS, NETWORKS, base_files, kind_of
@@ -31,6 +32,8 @@ class PredictOptions:
     checkpoint: Path | None = None  # weights of the base
     precision: Precision = "auto"  # of the base's network
     low_memory: bool = False
+    windows: int | None = None  # of SHARP, at once
+    compiled: bool = False
     residual: str | None = None  # a file, "seeds", "none", or None for the shipped weights if any
     render: bool = True
     trajectory: TrajectoryKind = "rotate_forward"
@@ -93,6 +96,7 @@ def check_base_options(options: PredictOptions) -> None:
         if option in refuses:
             who = options.named.partition(":")[0]
             raise InputError(f"{option}{value}: the {who} base {refuses[option]}; leave the option out")
+    check_windows("--windows", options.windows, options.low_memory)
     if options.calib is not None and options.depth is None:
         raise InputError(f"--calib {options.calib}: is for a disparity map: give that with --depth")
     if options.named == "sharp" and not options.base_files:
@@ -112,12 +116,17 @@ def check_has_depth(options: PredictOptions) -> None:
 
 def _given(options: PredictOptions) -> dict[str, str]:
     """What was given of the options that not every base has a use for, by their names."""
-    values = {"--depth": options.depth, "--calib": options.calib, "-c": options.checkpoint}
+    values = {
+        "--depth": options.depth,
+        "--calib": options.calib,
+        "-c": options.checkpoint,
+        "--windows": options.windows,
+    }
     given = {name: f" {value}" for name, value in values.items() if value is not None}
     if options.precision != "auto":
         given["--precision"] = f" {options.precision}"
-    if options.low_memory:
-        given["--low-memory"] = ""
+    flags = {"--low-memory": options.low_memory, "--compile": options.compiled}
+    given |= {name: "" for name, value in flags.items() if value}
     return given
 
 

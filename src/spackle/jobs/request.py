@@ -15,7 +15,8 @@ from spackle.jobs.inputs import find_depth
 from spackle.jobs.options import PredictOptions
 
 MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed
-IRRELEVANT = ("overwrite", "residual", "low_memory")  # options that change no result, or stand there in other words
+# Options that change no result but by its last bits, or stand there in other words.
+IRRELEVANT = ("overwrite", "residual", "low_memory", "windows", "compiled")
 
 
 def shared_digest(options: PredictOptions) -> str:

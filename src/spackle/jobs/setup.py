@@ -100,7 +100,14 @@ def _network(name: str, options: PredictOptions) -> Base:
     path = options.base_files.get("checkpoint")
     if path is None:  # there were some when the options were checked
         raise InputError("SHARP's weights have gone while this was running: start again")
-    return load_sharp(path, precision=options.precision, low_memory=options.low_memory, device=device)
+    return load_sharp(
+        path,
+        precision=options.precision,
+        low_memory=options.low_memory,
+        windows=options.windows,
+        compiled=options.compiled,
+        device=device,
+    )
 
 
 def make_base(photo: Photo, options: PredictOptions, tools: Tools) -> Base:

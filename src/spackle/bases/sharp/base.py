@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 
@@ -9,19 +10,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.device import enough_memory, own_arithmetic, pick_device
+from spackle.bases.device import enough_memory, memory_is_short, own_arithmetic, pick_device
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
+from spackle.bases.sharp.compiled import Forward, compile_forward
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput
+from spackle.bases.sharp.pyramid import WINDOWS
 from spackle.bases.sharp.start import compose
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
+from spackle.errors import InputError, reason_in_a_line
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
 from spackle.precision import Precision, pick_dtype
 
+LOG = logging.getLogger("spackle")
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
-WINDOWS_AT_ONCE_GPU = 35
 
 
 class SharpBase:
@@ -29,11 +33,27 @@ class SharpBase:
 
     name = "sharp"
 
-    def __init__(self, network: SharpNetwork, *, low_memory: bool = False, weights: str = "") -> None:
-        """Use a network that is loaded already; `weights` is what the report calls it."""
+    def __init__(
+        self,
+        network: SharpNetwork,
+        *,
+        low_memory: bool = False,
+        windows: int | None = None,
+        compiled: bool = False,
+        weights: str = "",
+    ) -> None:
+        """Use a network that is loaded already, on its device; `weights` is what the report calls it.
+
+        Raises:
+            InputError: `windows` that cannot be.
+        """
+        check_windows("windows", windows, low_memory)
         self.network = network
-        self.low_memory = low_memory
+        self.windows = 1 if low_memory else windows or usual_windows(self.device)
         self.weights = weights
+        self.compiled = compiled  # as long as nothing comes between
+        self.compile_problem = ""  # what came
+        self._translation: Forward | None = None
 
     @staticmethod
     def load(
@@ -41,6 +61,8 @@ class SharpBase:
         *,
         precision: Precision = "auto",
         low_memory: bool = False,
+        windows: int | None = None,
+        compiled: bool = False,
         device: torch.device | str | None = None,
     ) -> SharpBase:
         """Read a checkpoint.
@@ -51,17 +73,28 @@ class SharpBase:
             precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively. In either,
                 the last bits of the Gaussians depend on the number of threads, because sums run in another order;
                 bf16's last bits are coarser.
-            low_memory: take less memory and a little more time to predict.
+            low_memory: take less memory and a little more time to predict: one window at a time.
+            windows: of the 35 of a photo, how many go through the transformer at once; None: 5 on a processor, all on
+                a GPU. Only the last bits depend on it.
+            compiled: let `torch.compile` translate the network with the first photo, which takes minutes, and replay
+                it as one CUDA graph on a GPU. Where that cannot be done, a warning says why, and it runs as it is.
             device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:
-            InputError: a device that is not there, a file that is not SHARP's weights, or too little memory.
-                Nothing in the file is executed.
+            InputError: a device that is not there, a file that is not SHARP's weights, windows that cannot be, or too
+                little memory. Nothing in the file is executed.
             ValueError: an unknown precision.
         """
+        check_windows("windows", windows, low_memory)  # before anything is read
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
-        return SharpBase(network, low_memory=low_memory, weights=Path(path).name)
+        name = Path(path).name
+        return SharpBase(network, low_memory=low_memory, windows=windows, compiled=compiled, weights=name)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network lies."""
+        return next(self.network.parameters()).device
 
     @property
     def precision(self) -> str:
@@ -78,9 +111,9 @@ class SharpBase:
         Raises:
             InputError: too little memory.
         """
-        advice = [] if self.low_memory else ["try --low-memory"]
+        advice = [] if self.windows == 1 else ["try --low-memory"]
         with enough_memory(*advice):
-            gaussians = to_metric(self.look(photo, progress), photo).to("cpu")
+            gaussians = to_processor(to_metric(self.look(photo, progress), photo))
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
@@ -88,14 +121,36 @@ class SharpBase:
     @torch.no_grad()
     def look(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
         """What the network says about a photo; `to_metric` makes Gaussians of it."""
-        device = next(self.network.parameters()).device
-        batch = WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
-        image = to_square(photo.rgb.to(device), self.network.config.side)
-        with own_arithmetic(device):
-            output: SharpOutput = self.network(
-                image, photo.focal_px / photo.width, 1 if self.low_memory else batch, progress
-            )
+        image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
+        with own_arithmetic(self.device):
+            return self._forward(image, photo.focal_px / photo.width, progress)
+
+    def _forward(self, image: Tensor, disparity_factor: float, progress: Progress | None) -> SharpOutput:
+        """By the compiled network, if it was asked for and can be had."""
+        if self.compiled:
+            try:
+                self._translation = self._translation or compile_forward(self.network)
+                return self._translation(image, disparity_factor, self.windows, progress)
+            except RuntimeError as error:  # no compiler, or one that cannot do it
+                if memory_is_short(error):
+                    raise
+                self.compiled, self._translation, self.compile_problem = False, None, reason_in_a_line(error)
+                LOG.warning("SHARP runs without --compile: %s", self.compile_problem)
+        output: SharpOutput = self.network(image, disparity_factor, self.windows, progress)
         return output
+
+
+def usual_windows(device: torch.device) -> int:
+    """How many windows go through the transformer at once, where nobody says it."""
+    return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS
+
+
+def check_windows(option: str, windows: int | None, low_memory: bool) -> None:
+    """InputError for a number of windows that cannot be; `option` is what the person calls it."""
+    if windows is not None and not 1 <= windows <= WINDOWS:
+        raise InputError(f"{option} must be between 1 and {WINDOWS}, got {windows}")
+    if windows is not None and low_memory:
+        raise InputError(f"{option} {windows}: low memory means one window at a time: leave one of the two out")
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
@@ -103,6 +158,15 @@ def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
     stretch = (photo.width / (2 * photo.focal_px), photo.height / (2 * photo.focal_px), 1.0)
     with own_arithmetic(output.deltas.device):
         return stretch_gaussians(compose(output.start, output.deltas), stretch)
+
+
+def to_processor(gaussians: Gaussians) -> Gaussians:
+    """The same on the processor; from a GPU in one copy, the only one that waits for it: five would wait five times."""
+    if gaussians.means.device.type == "cpu":
+        return gaussians
+    flat = torch.cat([t.flatten() for t in gaussians.tensors]).to("cpu")
+    parts = torch.split(flat, [t.numel() for t in gaussians.tensors])
+    return Gaussians(*(part.view(t.shape) for part, t in zip(parts, gaussians.tensors, strict=True)))
 
 
 def to_square(rgb: Tensor, side: int) -> Tensor:

@@ -48,13 +48,13 @@ class SharpNetwork(nn.Module):
         self.prediction_head = PredictionHead(config.feature_width)
 
     def forward(
-        self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
+        self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
     ) -> SharpOutput:
         """Predict from a picture [1, 3, side, side] of sRGB in 0..1, float32.
 
         Args:
             image: the photo, stretched to the square.
-            disparity_factor: focal length over width, both in the photo's pixels.
+            disparity_factor: focal length over width, both in the photo's pixels; a tensor without an axis counts, too.
             batch: windows that go through the transformer at once; more are no faster on a processor.
             progress: called as the transformer advances, with windows done and all of them.
         """
@@ -62,12 +62,15 @@ class SharpNetwork(nn.Module):
         deltas: Tensor = self.gaussian_decoder()(seen.picture, seen.maps)
         return SharpOutput(seen.start, deltas)
 
-    def see(self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None) -> Seen:
+    def see(
+        self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
+    ) -> Seen:
         """Everything before the Gaussian decoder; the arguments are `forward`'s."""
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
-        start = make_start(image, disparity_factor / disparity.clamp(*DISPARITY_RANGE))
+        # What PyTorch makes of a number over a tensor, for a tensor over a tensor too: the same bits.
+        start = make_start(image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor)
         return Seen(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
     def gaussian_decoder(self) -> GaussianDecoder:

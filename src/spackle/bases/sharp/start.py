@@ -31,12 +31,12 @@ class Start:
     disparity_map: Tensor  # [1, 2, side, side] of the scaled depths, an input of the feature network
     disparity: Tensor  # [2, side/2, side/2] of the nearest pixel in each cell
     color: Tensor  # [3, side/2, side/2] sRGB, the cell's mean
-    unscale: float  # multiplies means and scales to undo the scaling of the depths
+    unscale: Tensor  # float64 without an axis: multiplies means and scales to undo the scaling of the depths
 
 
 def make_start(image: Tensor, depth: Tensor) -> Start:
     """Where the Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side] begin."""
-    factor = NEAREST / (float(depth.min()) + SMALLEST_INVERSE)
+    factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device: nobody waits for it
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
     return Start(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
 
@@ -47,14 +47,14 @@ def compose(start: Start, deltas: Tensor) -> Gaussians:
     Means are (x·z, y·z, z), where x and y run from -1 to 1 over the picture.
     """
     height, width = deltas.shape[-2:]
-    x, y = (_centers(n).to(deltas) for n in (width, height))
+    x, y = (_centers(n, deltas) for n in (width, height))
     inverse = softplus(_inverse_softplus(start.disparity) + Z_GAIN * deltas[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)
     means = torch.stack([z * (x + XY_GAIN * deltas[0]), z * (y[:, None] + XY_GAIN * deltas[1]), z])
     # A cell's width at that depth, times a factor between 0 and MAX_SCALE: 1 at zero, and so is its slope.
     slope, shift = MAX_SCALE / (MAX_SCALE - 1), -math.log(MAX_SCALE - 1)
     scales = (2.0 / width) * z * (MAX_SCALE * torch.sigmoid(slope * deltas[3:6] + shift))
-    quats = deltas[6:10] + torch.tensor([1.0, 0, 0, 0]).to(deltas)[:, None, None, None]
+    quats = torch.cat([deltas[6:7] + 1, deltas[7:10]])
     color = start.color.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN)
     colors = srgb_to_linear(torch.sigmoid(torch.logit(color)[:, None] + COLOR_GAIN * deltas[10:13]))
     opacities = torch.sigmoid(deltas[13])
@@ -63,9 +63,9 @@ def compose(start: Start, deltas: Tensor) -> Gaussians:
     )
 
 
-def _centers(count: int) -> Tensor:
+def _centers(count: int, like: Tensor) -> Tensor:
     """Cell centres in -1..1."""
-    return (2 * torch.arange(count) + 1) / count - 1
+    return ((2 * torch.arange(count, device=like.device) + 1) / count - 1).to(like.dtype)
 
 
 def _inverse_softplus(y: Tensor) -> Tensor:

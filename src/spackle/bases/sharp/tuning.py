@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from spackle.bases.device import own_arithmetic
-from spackle.bases.sharp.base import WINDOWS_AT_ONCE, WINDOWS_AT_ONCE_GPU, to_square
+from spackle.bases.sharp.base import to_square, usual_windows
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.network import Seen, SharpNetwork
 from spackle.bases.sharp.precision import set_precision
@@ -50,10 +50,9 @@ class TunableSharp:
             photo_camera: its camera, of the same size.
         """
         device = next(self.network.parameters()).device
-        batch = WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS_AT_ONCE_GPU
         image = to_square(rgb.to(device), self.network.config.side)
         with own_arithmetic(device):
-            return self.network.see(image, photo_camera.focal[0] / photo_camera.width, batch)
+            return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
     def gaussians(self, decoder: nn.Module, seen: Seen) -> Gaussians:
         """Two layers of Gaussians in SHARP's normalised space, on the processor, with gradients to a decoder.

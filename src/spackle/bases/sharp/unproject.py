@@ -35,7 +35,7 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
     plain = any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (quats, scales))
     quats, scales = (plain_stretch if plain else _fast_stretch)(quats, scales, stretch)
     means = gaussians.means.detach()
-    return Gaussians(means * means.new_tensor(stretch), quats, scales, gaussians.opacities, gaussians.colors)
+    return Gaussians(means * _vector(stretch, means), quats, scales, gaussians.opacities, gaussians.colors)
 
 
 def _fast_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
@@ -48,14 +48,14 @@ def _fast_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, fl
 
 
 def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """The same sweeps as batched operations, for any device and floating dtype.
+    """The same sweeps as batched operations, for any device and floating dtype; on a GPU nobody waits for them.
 
     Takes and returns quats [N, 4] and scales [N, 3], as `stretch_gaussians` describes them.
     """
     dtype = torch.promote_types(scales.dtype, torch.float32)
     # In units of each Gaussian's largest scale no square overflows, and none that matters underflows.
     unit = scales.abs().amax(1, keepdim=True).to(dtype).clamp(min=torch.finfo(dtype).tiny)
-    matrix = quat_to_matrix(quats.to(dtype)) * (scales / unit)[:, None] * unit.new_tensor(stretch)[:, None]
+    matrix = quat_to_matrix(quats.to(dtype)) * (scales / unit)[:, None] * _vector(stretch, unit)[:, None]
     columns = list(matrix.unbind(2))
     for _ in range(SWEEPS):
         for i, j in PAIRS:
@@ -65,6 +65,11 @@ def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, fl
     a, b, _ = matrix.gather(2, order[:, None].expand_as(matrix)).unbind(2)
     rotation = _plain_frame(a, b)
     return quat_from_matrix(rotation).to(quats.dtype), (sizes * unit).to(scales.dtype)
+
+
+def _vector(numbers: tuple[float, float, float], like: Tensor) -> Tensor:
+    """`like.new_tensor(numbers)` without a copy to the device, for which the processor would wait."""
+    return torch.stack([like.new_full((), number) for number in numbers])
 
 
 def _plain_turn(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,7 +85,7 @@ def _plain_turn(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
 
 def _plain_frame(a: Tensor, b: Tensor) -> Tensor:
     """Rotations [N, 3, 3] with the first axis along a and the second nearly along b, any where they are zero."""
-    axes = torch.eye(3).to(a)
+    axes = torch.eye(3, dtype=a.dtype, device=a.device)
     a, b = normalize(a, dim=1, eps=torch.finfo(a.dtype).tiny), normalize(b, dim=1, eps=torch.finfo(a.dtype).tiny)
     a = torch.where(a.any(1, keepdim=True), a, axes[0])
     c = torch.linalg.cross(a, b)
