@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from spackle._numba import kernel
 from spackle.render.approx import HALF, ONE, ZERO, alpha_of, encode_srgb
-from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
+from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RECORD, RED, SLOPE, X, Y
 from spackle.render.protocol import ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
 Array = npt.NDArray[Any]
@@ -20,7 +20,7 @@ Array = npt.NDArray[Any]
 # Alpha has a sum of its own: as 1 - light a faint one would lose digits, and depth, its quotient, too.
 PLANE = TILE * TILE
 STATE = 6 * PLANE
-CHECK_EVERY = 16  # Gaussians between two looks at whether the whole tile is full
+CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
 
 STOP = np.float32(TRANSMITTANCE_STOP)
 INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row that peaks below this shows nothing
@@ -135,14 +135,27 @@ def blend_tiles(
 
     The colour before sRGB goes to `linear` [H, W, 3], unless that is empty.
     """
-    state = np.empty(STATE, np.float32)
+    state, near = np.empty(STATE, np.float32), np.empty((CHECK_EVERY, RECORD), np.float32)
     for k in range(first, last):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         for i in range(STATE):
             state[i] = ONE if i < PLANE else ZERO
-        for entry in range(starts[tile], starts[tile + 1]):
-            blend_splat(state, records, ids[entry], left, top)
-            if (entry - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_full(state):
+        end = starts[tile + 1]
+        for begin in range(starts[tile], end, CHECK_EVERY):
+            count = min(CHECK_EVERY, end - begin)
+            fetch(records, ids, begin, count, near)
+            for n in range(count):
+                blend_splat(state, near, n, left, top)
+            if count == CHECK_EVERY and is_full(state):
                 break
         store_tile(state, left, top, rgb, depth, alpha, linear)
+
+
+@kernel
+def fetch(records: Array, ids: Array, begin: int, count: int, near: Array) -> None:
+    """Bring records close: they lie anywhere, and waiting for all of them at once is shorter than for each in turn."""
+    for n in range(count):
+        record = records[ids[begin + n]]
+        for field in range(RECORD):
+            near[n, field] = record[field]
