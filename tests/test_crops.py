@@ -63,6 +63,15 @@ def test_holes_far_apart_are_looked_at_apart_and_a_full_mask_at_once() -> None:
     assert crops_around(~mask, STRIDE) == [(Crop(0, 0, 768, 768),) * 2]
 
 
+def test_a_frame_of_holes_is_cut_into_its_sides() -> None:
+    mask = torch.zeros(768, 768, dtype=torch.bool)
+    mask[:, :12] = mask[:10, :400] = mask[758:, :400] = True
+    mask[160:310, 190:230] = mask[270:420, 560:615] = True
+    pairs = crops_around(mask, STRIDE)
+    assert len(pairs) >= 5
+    assert sum(outer.area for _, outer in pairs) < 0.52 * mask.numel()
+
+
 class Counting(nn.Module):
     """A network that keeps how many cells it was shown."""
 

@@ -273,6 +273,8 @@ def test_a_compiled_network_says_the_same() -> None:
     for weight in wild.parameters():
         torch.nn.init.normal_(weight, std=0.05)
     twin = compile_network(wild, backend="eager")
+    assert twin.compiled
+    assert not wild.compiled
     features = torch.rand(1, IN_CHANNELS, 33, 17)
     with torch.no_grad():
         torch.testing.assert_close(twin(features), wild(features), rtol=1e-4, atol=1e-4)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 Cells = NDArray[np.bool_]
-Edges = tuple[int, int, int, int]
+Edges = NDArray[np.int64]
 
-# What a cell's delta depends on reaches 205 cells far, but fades: from 64 cells on it is some thousandths with the
-# shipped weights, a tenth of what bfloat16 rounds away. See tests/test_residual.py.
+# What a cell's delta depends on reaches 205 cells far, but fades: what lies beyond 64 cells changes it, with the shipped
+# weights, by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
+# See tests/test_crops.py.
 MARGIN = 64
 WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
+NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much
+CALL_BLOCKS = 8  # what a crop costs by itself, in blocks of 16×16 cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,47 +70,74 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
     Returns:
         Pairs (inner, outer): the inner ones cover each masked cell exactly once, or are the whole grid.
     """
-    cells = mask.cpu().numpy()
+    cells: Cells = mask.cpu().numpy()
     whole = Crop(0, 0, *cells.shape)
-    rows, columns = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
-    if not len(rows):
+    if not cells.any():
         return []
-    tight = Crop(*(int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1)))
-    found = [(inner, inner.grown(margin, step, *cells.shape)) for inner in _cut(cells, tight, step, margin)]
+    rest = [(0, -size % step) for size in cells.shape]
+    tall, wide = (-(-size // step) for size in cells.shape)
+    blocks: Cells = np.logical_or.reduce(np.pad(cells, rest).reshape(tall, step, wide, step), axis=(1, 3))
+    found = []
+    for part in _cut(blocks, _tight(blocks, Crop(0, 0, tall, wide)), -(-margin // step)):
+        inner = _tight(cells, Crop(*(step * edge for edge in dataclasses.astuple(part))))
+        found.append((inner, inner.grown(margin, step, *cells.shape)))
     if sum(outer.area for _, outer in found) > WHOLE * whole.area:
         return [(whole, whole)]
     return found
 
 
-def _cut(cells: Cells, crop: Crop, step: int, margin: int) -> list[Crop]:
-    """A rectangle that its masked cells fill to all four sides, cut in two as long as that saves something."""
-
-    def cost(*parts: Crop) -> int:
-        return sum(part.grown(margin, step, *cells.shape).area for part in parts)
-
-    best = min(_halves(cells, crop, step), key=lambda pair: cost(*pair), default=None)
-    if best is None or cost(*best) >= cost(crop):
-        return [crop]
-    return [piece for half in best for piece in _cut(cells, half, step, margin)]
+def _tight(cells: Cells, crop: Crop) -> Crop:
+    """Shrunk to its masked cells; there are some."""
+    rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
+    edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
+    return Crop(*edges).moved(crop.top, crop.left)
 
 
-def _halves(cells: Cells, crop: Crop, step: int) -> Iterator[tuple[Crop, Crop]]:
-    """All ways to cut such a rectangle in two at multiples of `step`; each half shrunk to its masked cells."""
-    inside = cells[crop.slices]
-    for above, below in _row_halves(inside, range(step - crop.top % step, len(inside), step)):
-        yield Crop(*above).moved(crop.top, crop.left), Crop(*below).moved(crop.top, crop.left)
-    for (top, left, bottom, right), other in _row_halves(
-        inside.T, range(step - crop.left % step, inside.shape[1], step)
-    ):
-        first, second = Crop(left, top, right, bottom), Crop(other[1], other[0], other[3], other[2])
-        yield first.moved(crop.top, crop.left), second.moved(crop.top, crop.left)
+def _cut(blocks: Cells, crop: Crop, reach: int) -> list[Crop]:
+    """A rectangle that its masked blocks fill to all four sides, cut in two as long as that saves something.
 
-
-def _row_halves(inside: Cells, cuts: range) -> Iterator[tuple[Edges, Edges]]:
-    """Top, left, bottom and right of the masked cells above and below each cut; the outermost rows have some.
-
-    Every cut's edges come from one pass over the cells: this runs for each view that is completed.
+    A cut that costs something may be the way to others that save more, so it is judged by what comes of it.
     """
+    own = crop.grown(reach, 1, *blocks.shape).area
+    if own <= NEARLY * _least(blocks, crop, reach):
+        return [crop]
+    halves = _halves(blocks[crop.slices]) + (crop.top, crop.left) * 2
+    if not len(halves):
+        return [crop]
+    best = halves[_looked_at(halves, reach, blocks.shape).sum(1).argmin()]
+    parts = [part for half in best for part in _cut(blocks, Crop(*map(int, half)), reach)]
+    cost = sum(part.grown(reach, 1, *blocks.shape).area + CALL_BLOCKS for part in parts)
+    return parts if cost < own + CALL_BLOCKS else [crop]
+
+
+def _least(blocks: Cells, crop: Crop, reach: int) -> int:
+    """Blocks that are looked at however a rectangle is cut."""
+    near = np.zeros_like(blocks)
+    near[crop.slices] = blocks[crop.slices]
+    for _ in range(2):
+        grown = near.copy()
+        for far in range(1, reach + 1):
+            grown[far:] |= near[:-far]
+            grown[:-far] |= near[far:]
+        near = grown.T
+    return int(near.sum())
+
+
+def _looked_at(edges: Edges, reach: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Blocks in each rectangle with its surroundings: [..., 4] to [...]."""
+    low, high = np.maximum(edges[..., :2] - reach, 0), np.minimum(edges[..., 2:] + reach, shape)
+    area: NDArray[np.int64] = (high - low).prod(-1)
+    return area
+
+
+def _halves(inside: Cells) -> Edges:
+    """All ways to cut a rectangle in two: [cuts, 2, 4], each half shrunk to its masked blocks."""
+    across = _row_halves(inside.T)[..., [1, 0, 3, 2]]
+    return np.concatenate([_row_halves(inside), across])
+
+
+def _row_halves(inside: Cells) -> Edges:
+    """Top, left, bottom and right of the masked blocks above and below each cut, [cuts, 2, 4]."""
     height, width = inside.shape
     row, filled = np.arange(height), inside.any(1)
     left = np.where(filled, inside.argmax(1), width)
@@ -118,6 +147,6 @@ def _row_halves(inside: Cells, cuts: range) -> Iterator[tuple[Edges, Edges]]:
     rights = [np.maximum.accumulate(right[way])[way] for way in (upper, lower)]
     last = np.maximum.accumulate(np.where(filled, row, 0))
     first = np.minimum.accumulate(np.where(filled, row, height)[::-1])[::-1]
-    for cut in cuts:
-        above = (0, int(lefts[0][cut - 1]), int(last[cut - 1]) + 1, int(rights[0][cut - 1]))
-        yield above, (int(first[cut]), int(lefts[1][cut]), height, int(rights[1][cut]))
+    above = [np.zeros(height - 1, np.int64), lefts[0][:-1], last[:-1] + 1, rights[0][:-1]]
+    below = [first[1:], lefts[1][1:], np.full(height - 1, height), rights[1][1:]]
+    return np.stack([np.stack(above, 1), np.stack(below, 1)], 1)

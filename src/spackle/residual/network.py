@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import itertools
 import math
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +18,7 @@ from spackle.residual.crops import crops_around
 from spackle.residual.cues import Cues
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds
+from spackle.residual.sparse import Cells, conv_rows, point_rows, relu_rows, upsampled
 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 NEAR = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
@@ -26,7 +29,12 @@ RIM_CELLS = 16.0  # a typical distance to the rim
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
+REACH = 2  # how many cells around its own a block looks at, and so a head
+FEW = 0.5  # of a level's cells: where more are wanted, the convolution of all is faster than that of those
 STEM_GAIN = 3.0  # the features are of order 0.3
+
+
+Grids = TypeVar("Grids", Cues, Seeds, Rim)
 
 
 class ResidualBlock(nn.Module):
@@ -42,8 +50,16 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, h, w] to the same shape."""
-        out: Tensor = x + self.second(torch.relu(self.first(torch.relu(x))))
-        return out
+        # In place where no gradient needs what was there: at this size fresh memory costs as much as the arithmetic.
+        out: Tensor = self.second(self.first(torch.relu(x)).relu_())
+        return out.add_(x)
+
+    def at(self, table: Tensor, there: Cells, wanted: Cells) -> Tensor:
+        """The same at some cells: the table of `wanted`, from one of `there`, which reaches two cells farther."""
+        between = wanted.grown(1)
+        inner = conv_rows(self.first, relu_rows(table), there.around(between))
+        change = conv_rows(self.second, relu_rows(inner), between.around(wanted))
+        return change.add_(table.index_select(0, there.rows_at(*wanted.places)))
 
 
 class ResidualNet(nn.Module):
@@ -51,6 +67,8 @@ class ResidualNet(nn.Module):
 
     The last layers start at zero, so an untrained network returns the seeds unchanged.
     """
+
+    compiled = False  # see `compile_network`
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,21 +85,64 @@ class ResidualNet(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Features [B, 17, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
-        height, width = features.shape[-2:]
-        x = self.stem(pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate"))
+        x, skips = self._encoded(features)
+        for level in reversed(range(len(skips))):
+            x = self._decoded(x, skips[level], level)
+        return self._deltas(x, features)
+
+    def deltas_at(self, features: Tensor, mask: Tensor) -> Tensor:
+        """`forward` at some cells; what only the others need is not computed.
+
+        Args:
+            features: [1, 17, h, w] of `network_input`.
+            mask: [h, w] bool, the cells.
+
+        Returns:
+            [n, 14], in the mask's order.
+        """
+        x, skips = self._encoded(features)
+        masked = Cells(pad(mask, _completion(mask)))
+        wanted = [masked.grown(REACH)]  # of each level's decoder, the finest first
+        seen = [wanted[0].grown(REACH)]
+        for _ in skips[1:]:
+            wanted.append(seen[-1].halved())
+            seen.append(wanted[-1].grown(REACH))
+        levels = len(skips)
+        while levels and seen[levels - 1].share > FEW:
+            levels -= 1
+            x = self._decoded(x, skips[levels], levels)
+        if not levels and wanted[0].share > FEW:
+            return _rows(self._deltas(x, features))[mask.view(-1)]
+        table, there = _rows(x), Cells(mask.new_ones(x.shape[-2:]))
+        for level in reversed(range(levels)):
+            fine = upsampled(point_rows(cast(nn.Conv2d, self.up[level]), table), there, seen[level])
+            fine += _rows(skips[level])[seen[level].grid.view(-1)]
+            decode = cast(ResidualBlock, self.decode[level])
+            table, there = decode.at(fine, seen[level], wanted[level]), wanted[level]
+        heads = [_head_at(head, table, there, masked) for head in (self.geometry, self.texture)]
+        return _with_copies(torch.cat(heads, dim=1), _rows(features)[mask.view(-1)])
+
+    def _encoded(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The coarsest features, and those of each finer level; the grid completed to multiples of STRIDE."""
+        x = self.stem(pad(features, _completion(features), mode="replicate"))
         skips = []
         for encode, down in zip(self.encode, self.down, strict=True):
             x = encode(x)
             skips.append(x)
             x = down(x)
-        x = self.coarse(x)
-        for up, decode, skip in reversed(list(zip(self.up, self.decode, skips, strict=True))):
-            x = decode(skip + interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False))
-        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
-        deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
-        # Colours that are there need not be learnt: it is enough to say how much of them to take.
-        taken = copies[:, :1] * features[:, NEAR] + copies[:, 1:] * features[:, MIRRORED]
-        return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
+        return self.coarse(x), skips
+
+    def _decoded(self, x: Tensor, skip: Tensor, level: int) -> Tensor:
+        """One level finer."""
+        fine = interpolate(self.up[level](x), scale_factor=2, mode="bilinear", align_corners=False)
+        out: Tensor = self.decode[level](fine.add_(skip))
+        return out
+
+    def _deltas(self, x: Tensor, features: Tensor) -> Tensor:
+        """What the heads make of the finest grid."""
+        height, width = features.shape[-2:]
+        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)
+        return _with_copies(heads[..., :height, :width], features)
 
 
 def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
@@ -89,10 +150,12 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
-    own = color_logit(seeds.rgb)
-    channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5]
-    channels += [color_logit(rim.rgb) - own, color_logit(rim.mirrored) - own]
-    channels += [(rim.distance / RIM_CELLS).log1p()[..., None]]
+    # Elsewhere the rim is the cell itself.
+    own, near, mirrored = (color_logit(colors[cues.mask]) for colors in (seeds.rgb, rim.rgb, rim.mirrored))
+    distance = (rim.distance[cues.mask] / RIM_CELLS).log1p()[..., None]
+    far = seeds.rgb.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
+    far[cues.mask] = torch.cat([near - own, mirrored - own, distance], dim=-1)
+    channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
 
@@ -102,7 +165,8 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells; nothing of use at the others.
 
-    The network looks only around the masked cells, see `spackle.residual.crops`.
+    The network looks only around the masked cells, see `spackle.residual.crops`; and on a processor it computes
+    what only the others need nowhere, see `ResidualNet.deltas_at`.
 
     Args:
         network: a `ResidualNet`.
@@ -110,14 +174,20 @@ def predict_deltas(
         precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
         dense: deltas of all cells.
     """
-    features = network_input(cues, seeds, rim).contiguous(memory_format=torch.channels_last)
-    dtype = pick_dtype(precision, features.device)
-    field = features.new_zeros(*features.shape[-2:], DELTA_CHANNELS)
-    for inner, outer in crops_around(torch.ones_like(cues.mask) if dense else cues.mask, STRIDE):
-        rows, columns = outer.slices
-        with torch.autocast(features.device.type, dtype, enabled=dtype != torch.float32):
-            seen: Tensor = network(features[..., rows, columns])[0].permute(1, 2, 0)
-        field[inner.slices] = seen[inner.within(outer).slices].float()
+    device = cues.mask.device
+    dtype = pick_dtype(precision, device)
+    chosen = torch.ones_like(cues.mask) if dense else cues.mask
+    able = isinstance(network, ResidualNet) and not network.compiled and device.type == "cpu" and not dense
+    few = cast(ResidualNet, network) if able else None
+    field = cues.alpha.new_zeros(*cues.mask.shape, DELTA_CHANNELS)
+    for inner, outer in crops_around(chosen, STRIDE):
+        there = outer.slices
+        features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
+        own = torch.zeros_like(chosen[there])
+        own[inner.within(outer).slices] = chosen[inner.slices]
+        with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+            found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
+        field[there][own] = found.float()
     return field
 
 
@@ -132,8 +202,44 @@ def compile_network(network: ResidualNet, backend: str = "inductor") -> Residual
         backend: one of PyTorch's; "eager" translates nothing.
     """
     twin = copy.copy(network)
+    twin.compiled = True
     twin.compile(dynamic=True, backend=backend)
     return twin
+
+
+def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
+    """The same of some rows and columns."""
+    fields = {field.name: getattr(grids, field.name) for field in dataclasses.fields(grids)}
+    parts: dict[str, Any] = {name: value[where] for name, value in fields.items() if isinstance(value, Tensor)}
+    return dataclasses.replace(grids, **parts)
+
+
+def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
+    """Deltas [B, 14, ...] of what the heads say [B, 16, ...].
+
+    Colours that are there need not be learnt: it is enough to say how much of them to take.
+    """
+    deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
+    taken = copies[:, :1] * features[:, NEAR] + copies[:, 1:] * features[:, MIRRORED]
+    return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
+
+
+def _completion(grid: Tensor) -> tuple[int, int, int, int]:
+    """What `pad` has to add to a grid [..., h, w] so that each level's sides are twice the next one's."""
+    height, width = grid.shape[-2:]
+    return 0, -width % STRIDE, 0, -height % STRIDE
+
+
+def _rows(x: Tensor) -> Tensor:
+    """[1, C, h, w] to a table [h · w, C]."""
+    return x[0].permute(1, 2, 0).flatten(0, 1)
+
+
+def _head_at(head: nn.Sequential, table: Tensor, there: Cells, wanted: Cells) -> Tensor:
+    block, _, last = head
+    assert isinstance(block, ResidualBlock)
+    assert isinstance(last, nn.Conv2d)
+    return point_rows(last, block.at(table, there, wanted).relu_())
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
