@@ -76,7 +76,7 @@ def test_cells_grow_to_all_sides_and_stay_in_the_grid() -> None:
 # The network
 
 
-@pytest.mark.parametrize("few", [0.0, 0.5, 2.0])  # all by convolutions, as it comes, all by rows
+@pytest.mark.parametrize("few", [0.0, 0.45, 2.0])  # all by convolutions, as it comes, all by rows
 @pytest.mark.parametrize(("height", "width", "share"), [(37, 53, 0.002), (64, 48, 0.03), (1, 1, 1.0), (20, 90, 0.4)])
 def test_some_cells_get_the_deltas_that_all_would_get(
     network: ResidualNet, monkeypatch: pytest.MonkeyPatch, height: int, width: int, share: float, few: float

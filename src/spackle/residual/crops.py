@@ -11,8 +11,8 @@ from torch import Tensor
 Cells = NDArray[np.bool_]
 Edges = NDArray[np.int64]
 
-# What a cell's delta depends on reaches 205 cells far, but fades: what lies beyond 64 cells changes it, with the shipped
-# weights, by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
+# What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
+# changes it by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
 # See tests/test_crops.py.
 MARGIN = 64
 WHOLE = 0.8  # crops that cover more than this share are not worth the trouble

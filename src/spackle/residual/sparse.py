@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad
 
-CHUNK = 2048  # cells whose surroundings are gathered at once: they should stay in the cache
+CHUNK = 8192  # cells whose surroundings are gathered at once: they should stay in the cache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +28,15 @@ class Cells:
         return float(self.grid.float().mean())
 
     @functools.cached_property
+    def flat(self) -> Tensor:
+        """Where each is in the grid's rows laid end to end, [n] int64."""
+        return self.grid.reshape(-1).nonzero()[:, 0]
+
+    @property
     def places(self) -> tuple[Tensor, Tensor]:
         """Row and column of each, [n] int64."""
-        rows, columns = self.grid.nonzero(as_tuple=True)
-        return rows, columns
+        width = self.grid.shape[1]
+        return self.flat.div(width, rounding_mode="floor"), self.flat % width
 
     def grown(self, radius: int) -> Cells:
         """With all that are up to `radius` rows and columns away."""
@@ -54,14 +59,15 @@ class Cells:
 
     def rows_at(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Where in the table the cells at these places of the grid lie, [...] int64; n for those that are not there."""
-        return self._numbers[rows + 1, columns + 1]
+        return self._numbers.view(-1).index_select(0, (rows + 1) * self._numbers.shape[1] + columns + 1)
 
     def around(self, centres: Cells) -> Tensor:
         """Where in the table the 3×3 cells around each centre lie, [m, 9] int64; n for those that are not there."""
         rows, columns = centres.places
         width = self._numbers.shape[1]
         steps = torch.tensor([down * width + right for down in range(3) for right in range(3)], device=rows.device)
-        return self._numbers.view(-1)[(rows * width + columns)[:, None] + steps]
+        near = (rows * width + columns)[:, None] + steps
+        return self._numbers.view(-1).index_select(0, near.view(-1)).view(-1, 9)
 
     @functools.cached_property
     def _numbers(self) -> Tensor:
