@@ -23,7 +23,7 @@ from spackle.evaluation.suite.sharp import sharp_section
 from spackle.evaluation.suite.tables import GPU_LIMITS, LIMITS
 from spackle.evaluation.suite.training import BATCH, CELLS, training_section
 from spackle.evaluation.suite.values import Found
-from spackle.evaluation.suite.video import FRAMES, SAMPLE, video_section
+from spackle.evaluation.suite.video import FRAMES, video_section
 from spackle.jobs.bench_suite_options import SuiteOptions
 from spackle.jobs.dataset_options import weights_digest
 from spackle.jobs.demo import load_motorcycle
@@ -119,9 +119,9 @@ class Sections:
 
     def _video(self) -> Found:
         pair = load_motorcycle()
-        frames, sample = (FRAMES, SAMPLE) if not self._small else (4, 2)
+        frames = FRAMES if not self._small else 4
         lifting = functools.partial(lift, pair.left, pair.depth, pair.left_camera)
-        return video_section(self.options.runs, lifting, CpuRenderer(), self._network, frames, sample)
+        return video_section(self.options.runs, lifting, CpuRenderer(), self._network, frames)
 
     def _sharp(self, device: torch.device) -> Found:
         path = self._checkpoint
