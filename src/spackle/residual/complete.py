@@ -111,7 +111,7 @@ class Completer:
                 if not quiet:
                     others = [shield for of, shield in shields.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
-                    new, after = chosen._fill(camera, others, [self.base, aux], before, enough, tuck=True)
+                    new, after = chosen._fill(camera, others, [self.base, aux], before, enough, len(cameras) > 1)
                     aux = Gaussians.cat([aux, new])
                     shields[index] = Shield.of(after, camera, self.threshold)
                 visits.looked(index, quiet)
