@@ -323,7 +323,7 @@ def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> Non
     change = (filled - base).abs().amax(dim=-1)
     assert float(change[hole].quantile(0.05)) > 0.3
     assert float(change[rest].max()) < 0.04  # where the base lets 2 % through, no more
-    assert float(change[rest].mean()) < 0.002
+    assert float(change[rest].mean()) < 0.004  # and that around the hole, beneath whose rim the fill goes on
     assert float(base[hole].mean()) < 0.1
 
 

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import http.client
 import json
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -106,7 +107,7 @@ def eventually(condition: Callable[[], object], within: float = 10.0) -> None:
 
 
 def uploads_of(server: ViewerServer) -> list[Path]:
-    return [path for path in Path(server.uploads.name).rglob("*") if path.is_file()]
+    return [Path(folder) / name for folder, _, names in os.walk(server.uploads.name) for name in names]
 
 
 def raw_status(server: ViewerServer, path: str) -> bytes:
