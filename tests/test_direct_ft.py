@@ -440,6 +440,17 @@ def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
     }
 
 
+def test_the_link_to_a_checkpoint_is_renewed_and_counts_more_than_a_name(
+    place: Path, base: TunableSharp, tmp_path: Path
+) -> None:
+    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
+    (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
+    link_owner(Owner(tmp_path / "where it lay once", owner.sha256), tmp_path)
+    link_owner(owner, tmp_path)
+    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")  # another of that name
+    assert len(gaussians_from(tmp_path / "same.safetensors")) > 0
+
+
 def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
     write_photo(tmp_path / "photo.png")
     options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)

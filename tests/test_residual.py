@@ -41,7 +41,7 @@ from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.cues import CELL
 from spackle.residual.network import IN_CHANNELS, network_input
 from spackle.residual.rim import Rim
-from spackle.residual.seeds import BEHIND, OPACITY, RIM_CELLS, cell_centers
+from spackle.residual.seeds import BEHIND, BLOB_CELLS, OPACITY, cell_centers
 from spackle.residual.visits import farthest_first
 from spackle.surface import surface_slope
 from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
@@ -152,7 +152,7 @@ def plain_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     inside = ((place >= 0) & (place < size)).all(-1) & (z > 0)
     filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=torch.where(inside, FAR_BIAS, 0.0))
     seen = torch.where(cues.inverse_depth > 0, cues.inverse_depth, torch.inf)
-    close = -max_pool2d(-seen[None, None], 2 * RIM_CELLS + 1, stride=1, padding=RIM_CELLS)[0, 0]
+    close = -max_pool2d(-seen[None, None], 2 * BLOB_CELLS + 1, stride=1, padding=BLOB_CELLS)[0, 0]
     inverse_depth = torch.where(cues.mask, torch.minimum(filled, close) * (1.0 - BEHIND), filled)
     slope = surface_slope(inverse_depth) / CELL
     return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))

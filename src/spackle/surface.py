@@ -82,7 +82,7 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     even the flatter one is steep, the depth is ragged there and the pixel faces the camera.
 
     Args:
-        inverse_depth: [H, W], positive everywhere. No gradient goes through.
+        inverse_depth: [H, W] float32 or float64, positive everywhere. No gradient goes through.
     """
     image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)

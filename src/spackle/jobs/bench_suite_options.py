@@ -54,6 +54,8 @@ def check_suite_options(options: SuiteOptions) -> None:
             raise InputError(f"{option} must be between 1 and {most}, got {value}")
     if not (SIDES[0] <= options.side <= SIDES[1] and options.side % 2 == 0):
         raise InputError(f"--side must be an even number between {SIDES[0]} and {SIDES[1]}, got {options.side}")
+    if options.windows and not options.sharp:
+        raise InputError("--windows is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")
     for windows in options.windows:
         check_windows("--windows", windows, False)
     if options.base.device not in ("auto", "cpu", "cuda"):

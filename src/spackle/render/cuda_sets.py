@@ -49,7 +49,12 @@ class Projection:
         """Of several sets, one after the other."""
         if len(parts) == 1:
             return parts[0]
-        return Projection(*(torch.cat(tensors, 1) for tensors in zip(*map(_tensors, parts), strict=True)))
+        return Projection(*(torch.cat(tensors, 1) for tensors in zip(*(part.tensors for part in parts), strict=True)))
+
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All fields."""
+        return self.radii, self.means2d, self.depths, self.conics
 
 
 @dataclasses.dataclass
@@ -81,7 +86,8 @@ class SetStore:
         if entry is None or key is None:
             return make(self.material(part))
         if entry.projection is None or entry.key != key:
-            entry.key, entry.projection = key, make(entry.material)
+            with torch.inference_mode(False):
+                entry.key, entry.projection = key, make(entry.material)
         return entry.projection
 
     def _entry(self, part: Gaussians) -> _Entry | None:
@@ -90,10 +96,7 @@ class SetStore:
             return None
         entry: _Entry | None = self._entries.get(part.means)  # type: ignore[no-untyped-call]
         if entry is None or not entry.snapshot.shows(part.tensors):
-            entry = _Entry(Snapshot(part.tensors), Material.of(part, self.device))
+            with torch.inference_mode(False):  # who asks next may want gradients of something drawn with it
+                entry = _Entry(Snapshot(part.tensors), Material.of(part, self.device))
             self._entries[part.means] = entry
         return entry
-
-
-def _tensors(projection: Projection) -> tuple[Tensor, ...]:
-    return projection.radii, projection.means2d, projection.depths, projection.conics

@@ -56,7 +56,8 @@ def count_entries(
             i = np.uint64(order[k])
             left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
             sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
-            # Of bounds that it cannot keep, the compiler makes plain loops: vectors for two tiles cost more.
+            # Read back on purpose: of bounds that it cannot keep in registers the compiler makes plain loops, and
+            # vectors for two tiles cost more.
             for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
                 for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
                     tile = np.uint64(row * columns + column)

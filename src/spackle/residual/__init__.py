@@ -1,4 +1,4 @@
-"""The paper's contribution: a few more Gaussians where the base shows holes, and nowhere else."""
+"""The paper's contribution: a few more Gaussians where the base shows holes, and none that hides what it shows."""
 
 from spackle.residual.complete import Completer
 from spackle.residual.cues import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, hole_mask

@@ -24,7 +24,7 @@ from spackle.residual.visits import Visits, farthest_first
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
-QUIET_HAR = 1e-3  # fewer holes than this may stay open in a view of a path
+QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
 WIDEST = 8  # views of a path whose own content stays in front from the first
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
@@ -90,11 +90,13 @@ class Completer:
         """One set of aux Gaussians for a whole path, the same from every frame.
 
         Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
-        added, and may add only behind what the photo, the widest views and the views before it show.
+        added, and may add only behind what the photo, the widest views and the views before it show:
+        in its holes, and beneath their rims.
 
         Args:
-            cameras: the frames of a path, in their order.
-            exact: complete every view that has a hole; else what nobody would see may stay open.
+            cameras: the frames of a path, in their order; with `exact` any views.
+            exact: look at every view and complete it where it has a hole; else frames beside one that needs
+                nothing are passed over, and what nobody would see may stay open.
             progress: called with (views visited, views in all).
         """
         order = farthest_first(cameras, self.photo_camera)
@@ -121,11 +123,11 @@ class Completer:
 
     def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> dict[int, Shield]:
         """What stays in front from the first: the photo (-1), and what the base shows from the widest views."""
-        if not order:
-            return {}
-        wide = {index: self.renderer.render(self.base, cameras[index]) for index in order[:WIDEST]}
-        shields = {index: Shield.of(view, cameras[index], self.threshold) for index, view in wide.items()}
-        return {-1: self.photo_shield(), **shields}
+        shields = {-1: self.photo_shield()} if order else {}
+        for index in order[:WIDEST] if len(order) > 1 else ():  # the only view has no other's content to cover
+            view = self.renderer.render(self.base, cameras[index])
+            shields[index] = Shield.of(view, cameras[index], self.threshold)
+        return shields
 
     def _fill(
         self,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-Cells = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 Edges = NDArray[np.int64]
 
 # What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
@@ -70,13 +70,13 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
     Returns:
         Pairs (inner, outer): the inner ones cover each masked cell exactly once, or are the whole grid.
     """
-    cells: Cells = mask.cpu().numpy()
+    cells: Mask = mask.cpu().numpy()
     whole = Crop(0, 0, *cells.shape)
     if not cells.any():
         return []
     rest = [(0, -size % step) for size in cells.shape]
     tall, wide = (-(-size // step) for size in cells.shape)
-    blocks: Cells = np.logical_or.reduce(np.pad(cells, rest).reshape(tall, step, wide, step), axis=(1, 3))
+    blocks: Mask = np.logical_or.reduce(np.pad(cells, rest).reshape(tall, step, wide, step), axis=(1, 3))
     found = []
     for part in _cut(blocks, _tight(blocks, Crop(0, 0, tall, wide)), -(-margin // step)):
         inner = _tight(cells, Crop(*(step * edge for edge in dataclasses.astuple(part))))
@@ -86,14 +86,14 @@ def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Cr
     return found
 
 
-def _tight(cells: Cells, crop: Crop) -> Crop:
+def _tight(cells: Mask, crop: Crop) -> Crop:
     """Shrunk to its masked cells; there are some."""
     rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
     edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
     return Crop(*edges).moved(crop.top, crop.left)
 
 
-def _cut(blocks: Cells, crop: Crop, reach: int) -> list[Crop]:
+def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
     """A rectangle that its masked blocks fill to all four sides, cut in two as long as that saves something.
 
     A cut that costs something may be the way to others that save more, so it is judged by what comes of it.
@@ -110,7 +110,7 @@ def _cut(blocks: Cells, crop: Crop, reach: int) -> list[Crop]:
     return parts if cost < own + CALL_BLOCKS else [crop]
 
 
-def _least(blocks: Cells, crop: Crop, reach: int) -> int:
+def _least(blocks: Mask, crop: Crop, reach: int) -> int:
     """Blocks that are looked at however a rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
@@ -130,13 +130,13 @@ def _looked_at(edges: Edges, reach: int, shape: tuple[int, ...]) -> NDArray[np.i
     return area
 
 
-def _halves(inside: Cells) -> Edges:
+def _halves(inside: Mask) -> Edges:
     """All ways to cut a rectangle in two: [cuts, 2, 4], each half shrunk to its masked blocks."""
     across = _row_halves(inside.T)[..., [1, 0, 3, 2]]
     return np.concatenate([_row_halves(inside), across])
 
 
-def _row_halves(inside: Cells) -> Edges:
+def _row_halves(inside: Mask) -> Edges:
     """Top, left, bottom and right of the masked blocks above and below each cut, [cuts, 2, 4]."""
     height, width = inside.shape
     row, filled = np.arange(height), inside.any(1)

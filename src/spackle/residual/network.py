@@ -21,11 +21,11 @@ from spackle.residual.seeds import Seeds
 from spackle.residual.sparse import Cells, conv_rows, point_rows, relu_rows, upsampled
 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
-NEAR = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
-MIRRORED = slice(NEAR.stop, NEAR.stop + 3)  # and into the one mirrored at the rim
+FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
+MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
 IN_CHANNELS = MIRRORED.stop + 1  # and the distance to the rim
 COPIES = 2  # channels that say how much of each to take
-RIM_CELLS = 16.0  # a typical distance to the rim
+TYPICAL_DISTANCE = 16.0  # of a cell to the rim
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
@@ -152,7 +152,7 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
     # Elsewhere the rim is the cell itself.
     own, near, mirrored = (color_logit(colors[cues.mask]) for colors in (seeds.rgb, rim.rgb, rim.mirrored))
-    distance = (rim.distance[cues.mask] / RIM_CELLS).log1p()[..., None]
+    distance = (rim.distance[cues.mask] / TYPICAL_DISTANCE).log1p()[..., None]
     far = seeds.rgb.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
     far[cues.mask] = torch.cat([near - own, mirrored - own, distance], dim=-1)
     channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
@@ -220,7 +220,7 @@ def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
     Colours that are there need not be learnt: it is enough to say how much of them to take.
     """
     deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
-    taken = copies[:, :1] * features[:, NEAR] + copies[:, 1:] * features[:, MIRRORED]
+    taken = copies[:, :1] * features[:, FAR_RIM] + copies[:, 1:] * features[:, MIRRORED]
     return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
 
 

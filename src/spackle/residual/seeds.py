@@ -17,8 +17,7 @@ from spackle.surface import surface_slope
 from spackle.threads import run_chunks
 
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
-
-RIM_CELLS = 2  # "close by": as far as a blob reaches
+BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 
@@ -61,7 +60,7 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     across, _ = far_fill(cues.inverse_depth, colors[:0], known, far_bias=0.0)
     bias = FAR_BIAS * _inside(across, camera, photo_camera)
     filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=bias)
-    inverse_depth = placed_behind(filled, cues.mask, cues, RIM_CELLS)
+    inverse_depth = placed_behind(filled, cues.mask, cues, BLOB_CELLS)
     slope = surface_slope(inverse_depth) / CELL
     return Seeds(cell_centers(camera), inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
 

@@ -12,7 +12,7 @@ from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.residual.compose import compose
 from spackle.residual.cues import CELL, Cues
-from spackle.residual.seeds import RIM_CELLS, Seeds, placed_behind
+from spackle.residual.seeds import BLOB_CELLS, Seeds, placed_behind
 from spackle.surface import surface_slope
 
 REACH_CELLS = 6  # how far beneath the rim
@@ -48,7 +48,7 @@ def _behind(coarse: Tensor, rim: Tensor, cues: Cues, seeds: Seeds) -> Tensor:
     every = (slice(None, None, COARSE),) * 2
     field, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
     field[every], chosen[every] = coarse, rim
-    return placed_behind(field, chosen, cues, COARSE * RIM_CELLS)[every]
+    return placed_behind(field, chosen, cues, COARSE * BLOB_CELLS)[every]
 
 
 def _around(mask: Tensor, radius: int) -> Tensor:

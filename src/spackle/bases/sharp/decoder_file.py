@@ -30,8 +30,8 @@ class Owner:
 
     @property
     def places(self) -> tuple[str, str]:
-        """What it, or a link to it, is called beside a decoder: its own name, and the link of `link_owner`."""
-        return self.path.name, f"trained-on-{plain_text(Path(self.sha256).name, 12)}.link"
+        """What it, or a link to it, is called beside a decoder: the link of `link_owner`, and its own name."""
+        return f"trained-on-{plain_text(Path(self.sha256).name, 12)}.link", self.path.name
 
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
@@ -47,8 +47,12 @@ def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
 
 def link_owner(owner: Owner, folder: Path) -> None:
     """Let decoders in a folder find their checkpoint; the link's name is one that nothing is ever written to."""
-    with contextlib.suppress(OSError):  # it is there, or this place has no links: then a person puts it there
-        (folder / owner.places[1]).symlink_to(owner.path.absolute())
+    link = folder / owner.places[0]
+    with contextlib.suppress(OSError):  # this place has no links: then a person puts the checkpoint there
+        if link.is_symlink() and not link.exists():  # to where it lay once
+            link.unlink()
+        if not link.exists():
+            link.symlink_to(owner.path.absolute())
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:

@@ -90,7 +90,8 @@ def video_section(
         "frames": frames,
         "disparity": DISPARITY,
     }
-    return Found(tuple(rows), facts)
+    note = "Frame by frame is from scratch, so each frame makes the photo's shield; `--mode view` makes it once."
+    return Found(tuple(rows), facts, (note,))
 
 
 def _path(prediction: BasePrediction, frames: int) -> list[Camera]:
