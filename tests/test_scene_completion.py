@@ -145,6 +145,13 @@ def test_few_frames_of_a_path_are_looked_at_and_all_of_them_are_closed(kind: Tra
     assert sum(left) / FRAMES <= 5e-4
 
 
+@pytest.mark.parametrize(("height", "width", "speck"), [(4, 5, True), (3, 3, False), (1, 60, False)])
+def test_few_holes_are_a_speck_where_they_lie_together(height: int, width: int, speck: bool) -> None:
+    alpha = torch.ones(120, 160)
+    alpha[120 - height :, 160 - width :] = 0.3
+    assert subject()._has_speck(Rendering(torch.zeros(120, 160, 3), alpha, alpha)) is speck
+
+
 def test_an_exact_path_is_looked_at_frame_by_frame() -> None:
     counting = Counting()
     completer = dataclasses.replace(subject(), renderer=counting)  # type: ignore[arg-type]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
@@ -25,6 +26,7 @@ from spackle.residual.visits import Visits, farthest_first
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
+SPECK_PX = 4  # a square of holes as wide as this is seen, however little else is open
 WIDEST = 8  # views of a path whose own content stays in front from the first
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
@@ -102,14 +104,14 @@ class Completer:
         order = farthest_first(cameras, self.photo_camera)
         shields = self._first_shields(cameras, order)
         visits = Visits(len(cameras))
-        allowed, enough = (0.0, CLOSED_HAR) if exact else (QUIET_HAR, QUIET_HAR)
+        enough = CLOSED_HAR if exact else QUIET_HAR
         aux = Gaussians.empty()
         for count, index in enumerate(order):
             if exact or not visits.known(index):
                 camera = cameras[index]
                 before = self.renderer.render([self.base, aux], camera)
                 holes = hole_area_ratio(before.alpha, self.threshold)
-                quiet = holes <= allowed
+                quiet = holes == 0 if exact else holes <= QUIET_HAR and not self._has_speck(before)
                 if not quiet:
                     others = [shield for of, shield in shields.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
@@ -120,6 +122,10 @@ class Completer:
             if progress:
                 progress(count + 1, len(order))
         return aux
+
+    def _has_speck(self, view: Rendering) -> bool:
+        """Whether holes lie so close together that they are seen, however few they are."""
+        return bool((max_pool2d(view.alpha[None], SPECK_PX, stride=SPECK_PX // 2) < self.threshold).any())
 
     def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> dict[int, Shield]:
         """What stays in front from the first: the photo (-1), and what the base shows from the widest views."""
