@@ -150,6 +150,8 @@ def test_few_holes_are_a_speck_where_they_lie_together(height: int, width: int, 
     alpha = torch.ones(120, 160)
     alpha[120 - height :, 160 - width :] = 0.3
     assert subject()._has_speck(Rendering(torch.zeros(120, 160, 3), alpha, alpha)) is speck
+    tiny = torch.zeros(2, 60)
+    assert not subject()._has_speck(Rendering(torch.zeros(2, 60, 3), tiny, tiny))
 
 
 def test_an_exact_path_is_looked_at_frame_by_frame() -> None:

@@ -125,6 +125,8 @@ class Completer:
 
     def _has_speck(self, view: Rendering) -> bool:
         """Whether holes lie so close together that they are seen, however few they are."""
+        if min(view.alpha.shape) < SPECK_PX:
+            return False
         return bool((max_pool2d(view.alpha[None], SPECK_PX, stride=SPECK_PX // 2) < self.threshold).any())
 
     def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> dict[int, Shield]:
