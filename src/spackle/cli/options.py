@@ -108,7 +108,7 @@ PathOption = Annotated[
 ]
 DisparityOption = Annotated[
     float | None,
-    typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.", show_default="0.3"),
+    typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.", show_default=str(DEFAULT_DISPARITY)),
 ]
 CamerasOption = Annotated[
     Path | None, typer.Option(metavar="FILE.json", help="Exactly these views in place of a path.")

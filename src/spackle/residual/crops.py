@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from spackle.residual.sparse import Cells
 
 Mask = NDArray[np.bool_]
 Edges = NDArray[np.int64]
@@ -114,13 +117,7 @@ def _least(blocks: Mask, crop: Crop, reach: int) -> int:
     """Blocks that are looked at however a rectangle is cut."""
     near = np.zeros_like(blocks)
     near[crop.slices] = blocks[crop.slices]
-    for _ in range(2):
-        grown = near.copy()
-        for far in range(1, reach + 1):
-            grown[far:] |= near[:-far]
-            grown[:-far] |= near[far:]
-        near = grown.T
-    return int(near.sum())
+    return int(Cells(torch.from_numpy(near)).grown(reach).grid.sum())
 
 
 def _looked_at(edges: Edges, reach: int, shape: tuple[int, ...]) -> NDArray[np.int64]:

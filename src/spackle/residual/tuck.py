@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.fill import far_fill
@@ -13,10 +12,12 @@ from spackle.gaussians import Gaussians
 from spackle.residual.compose import compose
 from spackle.residual.cues import CELL, Cues
 from spackle.residual.seeds import BLOB_CELLS, Seeds, placed_behind
+from spackle.residual.sparse import Cells
 from spackle.surface import surface_slope
 
 REACH_CELLS = 6  # how far beneath the rim
 COARSE = 3  # one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
+EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 
 def tucked(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
@@ -30,28 +31,20 @@ def tucked(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
         seeds: of all cells; those of the masked ones are what goes on.
         camera: the view.
     """
-    every = (slice(None, None, COARSE),) * 2
-    rim = (_around(cues.mask, REACH_CELLS) & ~cues.mask)[every]
-    known, rgb = ~rim, seeds.rgb[every].permute(2, 0, 1)
+    rim = (Cells(cues.mask).grown(REACH_CELLS).grid & ~cues.mask)[EVERY]
+    known, rgb = ~rim, seeds.rgb[EVERY].permute(2, 0, 1)
     if not bool(rim.any()) or not bool(known.any()):
         return Gaussians.empty()
-    depth, rgb = far_fill(seeds.inverse_depth[every], rgb, known)
+    depth, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
     placed = _behind(depth, rim, cues, seeds)
     slope = surface_slope(placed) / (COARSE * CELL)
-    there = Seeds(seeds.uv[every], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
+    there = Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
     fine = compose(there, None, camera)
     return dataclasses.replace(fine, scales=COARSE * fine.scales)
 
 
 def _behind(coarse: Tensor, rim: Tensor, cues: Cues, seeds: Seeds) -> Tensor:
     """The inverse depth of every COARSE-th cell, at the rim behind all that is seen as far around as a blob reaches."""
-    every = (slice(None, None, COARSE),) * 2
     field, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
-    field[every], chosen[every] = coarse, rim
-    return placed_behind(field, chosen, cues, COARSE * BLOB_CELLS)[every]
-
-
-def _around(mask: Tensor, radius: int) -> Tensor:
-    """[h, w] bool: all cells within `radius` of the chosen ones, along rows and columns."""
-    wide = max_pool2d(mask.float()[None, None], (2 * radius + 1, 1), stride=1, padding=(radius, 0))
-    return max_pool2d(wide, (1, 2 * radius + 1), stride=1, padding=(0, radius))[0, 0] > 0
+    field[EVERY], chosen[EVERY] = coarse, rim
+    return placed_behind(field, chosen, cues, COARSE * BLOB_CELLS)[EVERY]
