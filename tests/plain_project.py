@@ -61,7 +61,7 @@ def _project(
     columns, rows = _tiles(u, half_width, view.width), _tiles(v, half_height, view.height)
     if columns is None or rows is None:
         return None
-    record = [u, v, cxy / cyy, across, fall, math.log2(opacity), half_height, z, *color]
+    record = [u, v, cxy / cyy, across, fall, math.log2(opacity), half_width, half_height, z, *color]
     return Plain(record, (*columns, *rows))
 
 

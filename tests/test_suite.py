@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from typing import Any
 from xml.etree import ElementTree
@@ -38,9 +39,10 @@ from spackle.evaluation.table import to_markdown
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, GsplatRenderer
 from spackle.render.approx import alpha_of, encode_srgb, exp2, natural_log
-from spackle.render.blend import INVISIBLE, STATE, blend_row, blend_splat, is_full, rows_of
+from spackle.render.blend import blend_splats, is_full
+from spackle.render.patch import STATE, blend_patch, span_of
 from spackle.render.pipeline import draw, wanted_tiles
-from spackle.render.project import FALL, HALF_HEIGHT, PEAK, View, Y
+from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, View, X, Y
 from spackle.render.project_forward import cover, pack_block
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.network import IN_CHANNELS, compile_network
@@ -63,13 +65,12 @@ def test_operations_are_those_in_the_source() -> None:
 
 
 def test_the_blenders_operations_counted_by_hand() -> None:
-    # alpha: centre 1, power 3, clamps and test 3, 2^x: rounding 3 and a polynomial 10
+    # alpha: from the centre 6, power 6, clamps and test 3, 2^x: rounding 3 and a polynomial 10
     # light: 1 - alpha, times light, full?, weight; five planes: four products, five sums
     assert operations_of(exp2) == 3 + 10
     assert operations_of(alpha_of) == 3
-    assert operations_of(blend_row, counts.INTEGERS) == 1 + 3 + 4 + 9
-    assert counts.pixel_operations() == 33
-    assert counts.row_operations() == 7  # dy, the peak's three, is it visible?, the centre's two
+    assert operations_of(blend_patch, counts.INTEGERS) == 6 + 6 + 4 + 9
+    assert counts.pixel_operations() == 41
     assert operations_of(encode_srgb) == 2 + 2 + 2 + 16 + 3
     assert counts.finish_operations() == 77
 
@@ -89,32 +90,32 @@ def test_the_projections_needs_counted_by_hand() -> None:
     assert not counts.sort_need(5).operations
 
 
-def test_rows_that_are_drawn_are_counted_as_a_plain_loop_counts_them() -> None:
+def test_patches_that_are_drawn_are_counted_as_a_plain_loop_counts_them() -> None:
     scene, camera = photo_scene(SIDE)
     scene = dataclasses.replace(scene, scales=5 * scene.scales, opacities=0.1 + 0.9 * scene.opacities)  # full tiles
     view = View.of(camera, 0.0)
     drawing = draw([scene], view, wanted_tiles(view, None), None)
     found = counts.walked(drawing)
-    records, rows, splats = drawing.splats.records, 0, 0
+    records, patches, splats = drawing.splats.records, 0, 0
     for tile in range(drawing.wanted.size):
         left, top = (tile % view.tiles[1]) * 16, (tile // view.tiles[1]) * 16
         state = np.zeros(STATE, np.float32)
         state[:256] = 1
         mine = drawing.lists.ids[drawing.lists.starts[tile] : drawing.lists.starts[tile + 1]]
         for number, index in enumerate(mine):
-            blend_splat(state, records, index, left, top)
+            blend_splats(state, records[index : index + 1], 1, left, top)
             splats += 1
-            y = records[index, Y] - np.float32(top) - np.float32(0.5)
-            first, last = rows_of(y, records[index, HALF_HEIGHT])
-            for row in range(first, last):
-                dy = np.float32(row) - y
-                rows += bool(records[index, PEAK] - records[index, FALL] * dy * dy >= INVISIBLE)
+            record = records[index]
+            top_row, last_row = span_of(record[Y] - np.float32(top) - np.float32(0.5), record[HALF_HEIGHT])
+            left_column, last_column = span_of(record[X] - np.float32(left) - np.float32(0.5), record[HALF_WIDTH])
+            pixels = itertools.product(range(top_row, last_row), range(left_column, last_column))
+            patches += len({(row // 4, column // 4) for row, column in pixels})
             if number % 16 == 15 and is_full(state):
                 break
-    assert (found.splats, found.rows) == (splats, pytest.approx(rows, abs=3))  # fused arithmetic at the threshold
+    assert (found.splats, found.patches) == (splats, patches)
     assert 0 < found.splats < 0.9 * len(drawing.lists.ids)
     need = counts.drawing_needs([scene], view)["blend"]
-    assert need.operations["fp32"] == found.rows * (16 * 33 + 7) + SIDE * SIDE * 77
+    assert need.operations["fp32"] == found.patches * 16 * 41 + SIDE * SIDE * 77
     visible = len(np.unique(drawing.lists.ids))
     assert need.bytes == len(drawing.lists.ids) * 4 + visible * 48 + SIDE * SIDE * 20
 

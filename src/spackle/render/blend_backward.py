@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from spackle._numba import kernel
 from spackle.render.approx import ONE, ZERO, srgb_slope
-from spackle.render.blend import PLANE
+from spackle.render.patch import PLANE
 from spackle.render.protocol import TILE
 from spackle.render.walk import BEHIND, CHUNK, GRADIENTS, NOTES, SUMS, WORKSPACE, replay, walk_back
 

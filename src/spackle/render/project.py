@@ -16,8 +16,8 @@ Array = npt.NDArray[Any]
 # A record is what the blender needs, in two thirds of a cache line. Along a row of pixels at distance
 # dy from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square
 # of this form is ever negative, and each row's span can be read off it.
-X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(11)
-RECORD = 12  # floats in a record, the last one unused
+X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_WIDTH, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(12)
+RECORD = 12  # floats in a record
 
 SPARE = 1 << 16  # Gaussians
 BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place

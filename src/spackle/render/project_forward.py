@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from spackle._numba import inlined_kernel, kernel
 from spackle.render.approx import ZERO, natural_log
-from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
+from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, HALF_WIDTH, PEAK, RED, SLOPE, X, Y
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE
 
 Array = npt.NDArray[Any]
@@ -124,6 +124,7 @@ def measure_block(
         block[i + np.uint64(ACROSS * BLOCK)] = across
         block[i + np.uint64(FALL * BLOCK)] = fall
         block[i + np.uint64(PEAK * BLOCK)] = log_opacity * LOG2_E
+        block[i + np.uint64(HALF_WIDTH * BLOCK)] = half_width
         block[i + np.uint64(HALF_HEIGHT * BLOCK)] = half_height
         block[i + np.uint64(DEPTH * BLOCK)] = z
         block[i + np.uint64(LEFT * BLOCK)] = left // TILE

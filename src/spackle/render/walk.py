@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy.typing as npt
 
 from spackle._numba import kernel, reordering_kernel
 from spackle.render.approx import HALF, LIMIT, ONE, ZERO, alpha_of
-from spackle.render.blend import CHECK_EVERY, INVISIBLE, PLANE, STOP, is_full, rows_of
+from spackle.render.blend import CHECK_EVERY, is_full
+from spackle.render.patch import PLANE, STOP, span_of
 from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
-from spackle.render.protocol import TILE
+from spackle.render.protocol import ALPHA_MIN, TILE
 
 Array = npt.NDArray[Any]
 
@@ -19,8 +21,8 @@ Array = npt.NDArray[Any]
 # v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace is one flat buffer of planes, see `blend`: the light that is left, what lies behind the
-# Gaussian in hand, the gradients of red, green, blue, depth and alpha.
+# The workspace is one flat buffer of planes, as in `patch`, but with the pixels row by row: the light that is
+# left, what lies behind the Gaussian in hand, the gradients of red, green, blue, depth and alpha.
 BEHIND = 1 * PLANE
 GRADIENTS = 2 * PLANE
 WORKSPACE = 7 * PLANE
@@ -30,6 +32,7 @@ WORKSPACE = 7 * PLANE
 CHUNK = 128  # Gaussians
 NOTE = 2 * TILE  # floats for one row of one Gaussian
 NOTES = CHUNK * TILE * NOTE
+INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row that peaks below this shows nothing
 
 
 @kernel
@@ -42,7 +45,7 @@ def replay_row(
     across: np.float32,
     center: np.float32,
 ) -> None:
-    """Draw one row as `blend_row` does; note alpha (0 where nothing is drawn) and the light before it."""
+    """Draw one row as `blend_patch` does; note alpha (0 where nothing is drawn) and the light before it."""
     for x in range(TILE):
         i, n = offset + np.uint64(x), note + np.uint64(x)
         u = np.float32(x) - center
@@ -67,7 +70,7 @@ def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top
         first_notes[k] = note
         record = records[ids[k]]
         x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
-        first, last = rows_of(y, record[HALF_HEIGHT])
+        first, last = span_of(y, record[HALF_HEIGHT])
         for row in range(first, last):
             dy = np.float32(row) - y
             peak = record[PEAK] - record[FALL] * dy * dy
@@ -145,7 +148,7 @@ def walk_back(
     """Walk back past one Gaussian, whose notes begin at `note`; if it wants gradients, `sums` [SUMS] gets them."""
     x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
     red, green, blue, depth = record[RED], record[GREEN], record[BLUE], record[DEPTH]
-    first, last = rows_of(y, record[HALF_HEIGHT])
+    first, last = span_of(y, record[HALF_HEIGHT])
     for row in range(first, last):
         dy = np.float32(row) - y
         if record[PEAK] - record[FALL] * dy * dy < INVISIBLE:

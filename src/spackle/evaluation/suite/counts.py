@@ -16,18 +16,10 @@ from spackle.gaussians import Gaussians
 from spackle.render import project as projection
 from spackle.render import project_forward as forward
 from spackle.render.approx import ONE, ZERO, alpha_of, encode_srgb, exp2, natural_log
-from spackle.render.blend import (
-    CHECK_EVERY,
-    INVISIBLE,
-    PLANE,
-    STATE,
-    blend_row,
-    blend_splat,
-    is_full,
-    rows_of,
-)
+from spackle.render.blend import CHECK_EVERY, is_full
+from spackle.render.patch import LANES, PLANE, STATE, blend_patch, blend_splat, patches_of
 from spackle.render.pipeline import BLEND_GRAIN, Drawing, draw, wanted_tiles
-from spackle.render.project import FALL, HALF_HEIGHT, PEAK, View, Y
+from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, View, X, Y
 from spackle.render.protocol import TILE
 from spackle.threads import run_chunks
 
@@ -42,7 +34,6 @@ PASSES = 3  # of the radix sort
 
 INTEGERS = frozenset({"i", "k", "first", "found", "row", "bits", "exponent"})  # in the kernels' sources
 EDGES = frozenset({"left", "right", "top", "bottom"})  # in those of the projection
-SPLAT_OPERATIONS = 4  # of a Gaussian in a tile: its centre, counted from the tile's corner
 DEPTH_OPERATIONS = 2  # of a pixel: depth over alpha, where that is more than zero
 DEPTH_TEST = 10  # of a Gaussian behind the camera: z in three products and three sums, and the four comparisons
 
@@ -52,7 +43,7 @@ class Walk:
     """How far blending goes before its tiles are full."""
 
     splats: int  # Gaussians drawn into tiles, each as often as into tiles
-    rows: int  # rows of sixteen pixels that they are drawn into
+    patches: int  # of sixteen pixels, that they are drawn into
 
 
 def drawing_needs(sets: Sequence[Gaussians], view: View, tiles: Array | None = None) -> dict[str, Need]:
@@ -94,23 +85,18 @@ def bin_need(visible: int, entries: int, tiles: int) -> Need:
 def blend_need(drawing: Drawing, visible: int, entries: int) -> Need:
     """Read the lists, and each visible record once (again it comes from the cache); write each pixel once.
 
-    Operations: those of `blend_row` for each of the sixteen pixels of each row that is drawn before its tile is full,
-    those of `blend_splat` for each such row, and what finishes each pixel.
+    Operations: those of `blend_patch` for each of the sixteen pixels of each patch that is drawn before its tile is
+    full, and what finishes each pixel.
     """
     walk, pixels = walked(drawing), int(drawing.wanted.sum()) * PLANE
-    operations = walk.rows * (TILE * pixel_operations() + row_operations()) + pixels * finish_operations()
+    operations = walk.patches * LANES * pixel_operations() + pixels * finish_operations()
     traffic = entries * ID + visible * RECORD + pixels * PIXEL
     return Need(float(traffic), {"fp32": float(operations)})
 
 
 def pixel_operations() -> int:
-    """Of one pixel of one row of one Gaussian."""
-    return sum(operations_of(part, INTEGERS) for part in (blend_row, alpha_of, exp2))
-
-
-def row_operations() -> int:
-    """Of one row of one Gaussian, besides its pixels: `blend_splat` but for its first two lines of arithmetic."""
-    return operations_of(blend_splat, INTEGERS) - SPLAT_OPERATIONS
+    """Of one pixel of one patch of one Gaussian."""
+    return sum(operations_of(part, INTEGERS) for part in (blend_patch, alpha_of, exp2))
 
 
 def finish_operations() -> int:
@@ -127,15 +113,15 @@ def walked(drawing: Drawing) -> Walk:
         len(tiles),
         BLEND_GRAIN,
     )
-    splats, rows = counts.sum(axis=0)
-    return Walk(int(splats), int(rows))
+    splats, patches = counts.sum(axis=0)
+    return Walk(int(splats), int(patches))
 
 
 @kernel
 def count_walk(
     first: int, last: int, tiles: Array, columns: int, ids: Array, starts: Array, records: Array, counts: Array
 ) -> None:
-    """Go through tiles first..last as `blend_tiles` does; write Gaussians and rows of each to counts [K, 2]."""
+    """Go through tiles first..last as `blend_tiles` does; write Gaussians and patches of each to counts [K, 2]."""
     state = np.empty(STATE, np.float32)
     for k in range(first, last):
         tile = tiles[k]
@@ -145,18 +131,15 @@ def count_walk(
         for entry in range(starts[tile], starts[tile + 1]):
             blend_splat(state, records, ids[entry], left, top)
             counts[k, 0] += 1
-            counts[k, 1] += count_rows(records[ids[entry]], top)
+            counts[k, 1] += count_patches(records[ids[entry]], left, top)
             if (entry - starts[tile]) % CHECK_EVERY == CHECK_EVERY - 1 and is_full(state):
                 break
 
 
 @kernel
-def count_rows(record: Array, top: int) -> int:
-    """The rows of a tile that a Gaussian is drawn into."""
-    y = record[Y] - np.float32(top) - np.float32(0.5)
-    first, last = rows_of(y, record[HALF_HEIGHT])
-    count = 0
-    for row in range(first, last):
-        dy = np.float32(row) - y
-        count += record[PEAK] - record[FALL] * dy * dy >= INVISIBLE
-    return count
+def count_patches(record: Array, left: int, top: int) -> int:
+    """The patches of a tile that a Gaussian is drawn into."""
+    half = np.float32(0.5)
+    first_row, last_row = patches_of(record[Y] - np.float32(top) - half, record[HALF_HEIGHT])
+    first_column, last_column = patches_of(record[X] - np.float32(left) - half, record[HALF_WIDTH])
+    return max(last_row - first_row, 0) * max(last_column - first_column, 0)
