@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 R = TypeVar("R")
 
@@ -16,17 +19,41 @@ _FASTMATH = {"contract", "nsz", "afn"}
 
 def kernel(function: Callable[..., R]) -> Callable[..., R]:
     """Compile a function at its first call, keep the machine code on disk, and run it without the GIL."""
-    compiled = numba.njit(cache=True, nogil=True, fastmath=_FASTMATH, error_model="numpy")(function)
-    return cast("Callable[..., R]", compiled)
+    return _compiled(function, _FASTMATH)
 
 
 def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` whose sums may be reordered, which lets them run in vector registers."""
-    compiled = numba.njit(cache=True, nogil=True, fastmath={"reassoc", *_FASTMATH}, error_model="numpy")(function)
-    return cast("Callable[..., R]", compiled)
+    return _compiled(function, {"reassoc", *_FASTMATH})
 
 
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` that becomes part of the loops that call it, which only then run in vector registers."""
-    compiled = numba.njit(cache=True, nogil=True, fastmath=_FASTMATH, error_model="numpy", forceinline=True)(function)
+    return _compiled(function, _FASTMATH, forceinline=True)
+
+
+def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:
+    compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **more)(function)
+    if isinstance(compiled, Dispatcher):  # not where numba is switched off
+        kept = _kept(compiled)
+        kept._source_stamp = (kept._source_stamp, _surroundings(function))
     return cast("Callable[..., R]", compiled)
+
+
+def _surroundings(function: Callable[..., Any]) -> str:
+    """A hash of all numbers and kernels that a function's module has so far, imported ones above all.
+
+    With them kept machine code becomes invalid; numba itself looks at the function's own file alone.
+    """
+    seen = []
+    for name, value in sorted(function.__globals__.items()):
+        if isinstance(value, Dispatcher):
+            seen.append((name, _kept(value)._source_stamp))
+        elif isinstance(value, (int, float, np.generic)):
+            seen.append((name, repr(value)))
+    return hashlib.sha256(repr(seen).encode()).hexdigest()
+
+
+def _kept(compiled: Any) -> Any:
+    """What keeps a kernel's machine code on disk."""
+    return compiled._cache._cache_file

@@ -1,0 +1,52 @@
+"""Kept machine code is used again, but never after what it was made from has changed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+USER = """
+from number import SIDE
+from helper import doubled
+from spackle._numba import kernel
+
+@kernel
+def area(x):
+    return inner(doubled(x))
+
+@kernel
+def inner(x):
+    return x * SIDE
+
+print(area(3), sum(area.stats.cache_hits.values()), sum(area.stats.cache_misses.values()))
+"""
+HELPER = """
+from spackle._numba import kernel
+
+@kernel
+def doubled(x):
+    return {factor} * x
+"""
+
+
+def run(folder: Path, side: int = 10, factor: int = 2) -> list[int]:
+    """What the kernel says, how often it came from the disk, and how often it was compiled."""
+    sources = {"number": f"SIDE = {side}\n", "helper": HELPER.format(factor=factor), "user": USER}
+    for name, text in sources.items():
+        path = folder / f"{name}.py"
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, str(folder / "user.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return [int(word) for word in done.stdout.split()]
+
+
+def test_a_changed_number_or_kernel_of_another_file_is_noticed(tmp_path: Path) -> None:
+    assert run(tmp_path) == [60, 0, 1]
+    assert run(tmp_path) == [60, 1, 0]
+    assert run(tmp_path, side=11) == [66, 0, 1]
+    assert run(tmp_path, side=11, factor=5) == [165, 0, 1]
+    assert run(tmp_path, side=11, factor=5) == [165, 1, 0]
