@@ -16,7 +16,7 @@ from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, farthest_first, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.complete import WIDEST
 from spackle.residual.tuck import COARSE, REACH_CELLS, tucked
-from spackle.residual.visits import Visits
+from spackle.residual.visits import Visits, has_speck, reach_of
 from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 CPU = CpuRenderer()
@@ -116,22 +116,38 @@ def test_a_view_without_neighbours_gets_nothing_beneath_its_rims() -> None:
 
 def test_a_quiet_frame_speaks_for_those_half_of_the_way_to_the_next_known_ones() -> None:
     visits = Visits(12)
-    visits.looked(0, quiet=False)
-    visits.looked(9, quiet=False)
+    visits.looked(0, 0.0)
+    visits.looked(9, 0.0)
     assert [k for k in range(12) if visits.known(k)] == [0, 9]
-    visits.looked(4, quiet=True)
+    visits.looked(4, 0.5)
     assert [k for k in range(12) if visits.known(k)] == [0, 2, 3, 4, 5, 6, 9]
-    visits.looked(8, quiet=True)
+    visits.looked(8, 0.5)
     assert [k for k in range(12) if visits.known(k)] == [0, 2, 3, 4, 5, 6, 7, 8, 9]
 
 
-def test_nobody_speaks_for_the_ends_of_a_path() -> None:
+def test_one_with_hardly_a_hole_speaks_for_more() -> None:
+    visits = Visits(16)
+    visits.looked(1, 0.0)
+    visits.looked(14, 0.0)
+    visits.looked(5, 0.75)
+    assert [k for k in range(16) if visits.known(k)] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 14]
+
+
+@pytest.mark.parametrize("reach", [0.5, 0.75])
+def test_nobody_speaks_for_the_ends_of_a_path(reach: float) -> None:
     visits = Visits(5)
-    visits.looked(2, quiet=True)
+    visits.looked(2, reach)
     assert [visits.known(i) for i in range(5)] == [False, False, True, False, False]
 
 
-@pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 40), ("rotate", 60), ("swipe", 25)])
+@pytest.mark.parametrize(("holes", "reach"), [(0, 0.75), (25, 0.75), (26, 0.5), (100, 0.5), (101, 0.0)])
+def test_the_fewer_holes_the_farther_a_frame_speaks(holes: int, reach: float) -> None:
+    alpha = torch.ones(250, 400)
+    alpha.view(-1)[torch.arange(holes) * 37] = 0.3  # nowhere together
+    assert reach_of(alpha) == reach
+
+
+@pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 30), ("rotate", 60), ("swipe", 20)])
 def test_few_frames_of_a_path_are_looked_at_and_all_of_them_are_closed(kind: TrajectoryKind, most: int) -> None:
     counting = Counting()
     completer = dataclasses.replace(subject(), renderer=counting)  # type: ignore[arg-type]
@@ -149,9 +165,9 @@ def test_few_frames_of_a_path_are_looked_at_and_all_of_them_are_closed(kind: Tra
 def test_few_holes_are_a_speck_where_they_lie_together(height: int, width: int, speck: bool) -> None:
     alpha = torch.ones(120, 160)
     alpha[120 - height :, 160 - width :] = 0.3
-    assert subject()._has_speck(Rendering(torch.zeros(120, 160, 3), alpha, alpha)) is speck
-    tiny = torch.zeros(2, 60)
-    assert not subject()._has_speck(Rendering(torch.zeros(2, 60, 3), tiny, tiny))
+    assert has_speck(alpha) is speck
+    assert not reach_of(alpha) or not speck
+    assert not has_speck(torch.zeros(2, 60))
 
 
 def test_an_exact_path_is_looked_at_frame_by_frame() -> None:

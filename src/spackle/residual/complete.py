@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
@@ -21,12 +20,10 @@ from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.rim import Rim
 from spackle.residual.seeds import Seeds, make_seeds
 from spackle.residual.tuck import tucked
-from spackle.residual.visits import Visits, farthest_first
+from spackle.residual.visits import QUIET_HAR, Visits, farthest_first, reach_of
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
-QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
-SPECK_PX = 4  # a square of holes as wide as this is seen, however little else is open
 WIDEST = 8  # views of a path whose own content stays in front from the first
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
@@ -102,40 +99,39 @@ class Completer:
             progress: called with (views visited, views in all).
         """
         order = farthest_first(cameras, self.photo_camera)
-        shields = self._first_shields(cameras, order)
+        shields, view = self._first_shields(cameras, order)
         visits = Visits(len(cameras))
         enough = CLOSED_HAR if exact else QUIET_HAR
         aux = Gaussians.empty()
         for count, index in enumerate(order):
             if exact or not visits.known(index):
                 camera = cameras[index]
-                before = self.renderer.render([self.base, aux], camera)
-                holes = hole_area_ratio(before.alpha, self.threshold)
-                quiet = holes == 0 if exact else holes <= QUIET_HAR and not self._has_speck(before)
-                if not quiet:
+                view = self.renderer.render([self.base, aux], camera) if count else view
+                holes = hole_area_ratio(view.alpha, self.threshold)
+                reach = float(holes == 0) if exact else reach_of(view.alpha, self.threshold)
+                if not reach:
                     others = [shield for of, shield in shields.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
-                    new, after = chosen._fill(camera, others, [self.base, aux], before, enough, len(cameras) > 1)
+                    new, view = chosen._fill(camera, others, [self.base, aux], view, enough, len(cameras) > 1)
                     aux = Gaussians.cat([aux, new])
-                    shields[index] = Shield.of(after, camera, self.threshold)
-                visits.looked(index, quiet)
+                    shields[index] = Shield.of(view, camera, self.threshold)
+                visits.looked(index, reach)
             if progress:
                 progress(count + 1, len(order))
         return aux
 
-    def _has_speck(self, view: Rendering) -> bool:
-        """Whether holes lie so close together that they are seen, however few they are."""
-        if min(view.alpha.shape) < SPECK_PX:
-            return False
-        return bool((max_pool2d(view.alpha[None], SPECK_PX, stride=SPECK_PX // 2) < self.threshold).any())
+    def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> tuple[dict[int, Shield], Rendering]:
+        """What stays in front from the first: the photo (-1), and what the base shows from the widest views.
 
-    def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> dict[int, Shield]:
-        """What stays in front from the first: the photo (-1), and what the base shows from the widest views."""
-        shields = {-1: self.photo_shield()} if order else {}
-        for index in order[:WIDEST] if len(order) > 1 else ():  # the only view has no other's content to cover
+        Returns:
+            These, and the base from the widest view of all, or from the photo's where there is no other.
+        """
+        view = self.renderer.render(self.base, self.photo_camera)
+        shields = {-1: Shield.of(view, self.photo_camera, self.threshold)}
+        for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
             view = self.renderer.render(self.base, cameras[index])
             shields[index] = Shield.of(view, cameras[index], self.threshold)
-        return shields
+        return shields, view
 
     def _fill(
         self,

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
+from spackle.residual.cues import MASK_THRESHOLD, hole_area_ratio
+
+QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
+SURE_HAR = QUIET_HAR / 4  # so few that frames farther off need no look either
+SPECK_PX = 4  # a square of holes as wide as this is seen, however little else is open
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
@@ -27,11 +35,23 @@ def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]
     return order
 
 
-class Visits:
-    """Which frames of a path are known to be in order: looked at, or near one that needed nothing.
+def reach_of(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
+    """How much of the way to the next known frames a frame of this alpha [H, W] speaks for; 0: complete it."""
+    holes = hole_area_ratio(alpha, threshold)
+    if holes > QUIET_HAR or has_speck(alpha, threshold):
+        return 0.0
+    return 0.75 if holes <= SURE_HAR else 0.5
 
-    Such a frame speaks for those around it, half of the way to the next that is known on either side.
-    """
+
+def has_speck(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> bool:
+    """Whether holes lie so close together that they are seen, however few they are."""
+    if min(alpha.shape) < SPECK_PX:
+        return False
+    return bool((max_pool2d(alpha[None], SPECK_PX, stride=SPECK_PX // 2) < threshold).any())
+
+
+class Visits:
+    """Which frames of a path are known to be in order: looked at, or near one that needed nothing."""
 
     def __init__(self, frames: int) -> None:
         self._known = [False] * frames
@@ -40,13 +60,10 @@ class Visits:
         """Whether this frame needs no look."""
         return self._known[index]
 
-    def looked(self, index: int, quiet: bool) -> None:
-        """Note a look at a frame, and whether nothing was to be done there."""
-        self._known[index] = True
-        if not quiet:
-            return
-        before, after = (self._unknown(index, step) for step in (-1, 1))
-        for frame in range(index - (before + 1) // 2, index + (after + 1) // 2 + 1):
+    def looked(self, index: int, reach: float) -> None:
+        """Note a look at a frame, which speaks for so much of the way to the next known ones; see `reach_of`."""
+        before, after = (math.ceil(reach * self._unknown(index, step)) for step in (-1, 1))
+        for frame in range(index - before, index + after + 1):
             self._known[frame] = True
 
     def _unknown(self, index: int, step: int) -> int:
