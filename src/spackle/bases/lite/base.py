@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -22,7 +23,8 @@ from spackle.network_file import read_network
 SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
 # What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
 # thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
-INPUT_PIXELS = (128 * 160, 192 * 256, 256 * 320, 352 * 480)
+INPUT_PIXELS = (80 * 96, 96 * 128, 192 * 256, 256 * 320, 448 * 608)
+MIRRORED_PX = 256 * 320  # so much is looked at both ways round; larger takes longest and gains nothing by it
 FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
 
@@ -64,34 +66,35 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """What the network says of a photo and of its mirror image, at several sizes: the mean of the logarithms.
+        """What the network says of a photo, and of its mirror image, at several sizes: the mean of the logarithms.
 
         Args:
             rgb: [H, W, 3] sRGB in 0..1, of any size.
 
         Returns:
-            [h, w] float32 inverse depth up to a factor, on the processor; about 176×240, of the photo's shape.
+            [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
         """
         return self.looks(rgb).mean(0).exp()
 
     @torch.no_grad()
-    def looks(self, rgb: Tensor) -> Tensor:
-        """[n, h, w] the logarithm of inverse depth at each of the sizes, as `inverse_depth` has them."""
+    def looks(self, rgb: Tensor, sizes_px: Sequence[int] = INPUT_PIXELS) -> Tensor:
+        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n sizes, the last the largest."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         height, width = rgb.shape[:2]
-        sizes = [network_size(height, width, pixels) for pixels in INPUT_PIXELS]
+        sizes = [network_size(height, width, pixels) for pixels in sizes_px]
         finest = tuple(side // 2 for side in sizes[-1])
-        said = [interpolate(self._look(picture, size)[None, None], size=finest, mode="bilinear") for size in sizes]
-        return torch.cat(said)[:, 0].cpu()
+        said = [
+            self._look(picture, size, both=pixels <= MIRRORED_PX) for size, pixels in zip(sizes, sizes_px, strict=True)
+        ]
+        return torch.cat([interpolate(look[None, None], size=finest, mode="bilinear") for look in said])[:, 0].cpu()
 
-    def _look(self, picture: Tensor, size: tuple[int, int]) -> Tensor:
-        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], seen at a size (h, w), both ways round."""
+    def _look(self, picture: Tensor, size: tuple[int, int], both: bool) -> Tensor:
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], seen at a size (h, w), perhaps both ways round."""
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
-        both = torch.cat([seen, seen.flip(-1)]).contiguous(memory_format=torch.channels_last)
+        ways = torch.cat([seen, seen.flip(-1)]) if both else seen
         with own_arithmetic(self.device):
-            straight, mirrored = self.network(both).float()
-        mean: Tensor = (straight + mirrored.flip(-1)) / 2
-        return mean
+            straight, *mirrored = self.network(ways.contiguous(memory_format=torch.channels_last)).float()
+        return torch.stack([straight, *(look.flip(-1) for look in mirrored)]).mean(0)
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
