@@ -8,6 +8,9 @@ import sys
 from pathlib import Path
 
 USER = """
+import os
+import spackle._numba
+spackle._numba._FASTMATH = set(os.environ["FLAGS"].split())
 from number import SIDE
 from helper import doubled
 from spackle._numba import kernel
@@ -31,16 +34,16 @@ def doubled(x):
 """
 
 
-def run(folder: Path, side: int = 10, factor: int = 2) -> list[int]:
+def run(folder: Path, side: int = 10, factor: int = 2, flags: str = "nsz afn") -> list[int]:
     """What the kernel says, how often it came from the disk, and how often it was compiled."""
     sources = {"number": f"SIDE = {side}\n", "helper": HELPER.format(factor=factor), "user": USER}
     for name, text in sources.items():
         path = folder / f"{name}.py"
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
+    mine = {"FLAGS": flags, "NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, str(folder / "user.py")]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(command, env={**os.environ, **mine}, capture_output=True, text=True, check=True)
     return [int(word) for word in done.stdout.split()]
 
 
@@ -50,3 +53,9 @@ def test_a_changed_number_or_kernel_of_another_file_is_noticed(tmp_path: Path) -
     assert run(tmp_path, side=11) == [66, 0, 1]
     assert run(tmp_path, side=11, factor=5) == [165, 0, 1]
     assert run(tmp_path, side=11, factor=5) == [165, 1, 0]
+
+
+def test_so_is_another_way_to_compile(tmp_path: Path) -> None:
+    assert run(tmp_path) == [60, 0, 1]
+    assert run(tmp_path, flags="afn nsz") == [60, 1, 0]
+    assert run(tmp_path, flags="contract") == [60, 0, 1]

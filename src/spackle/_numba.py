@@ -34,9 +34,10 @@ def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
 
 def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:
     compiled = numba.njit(cache=True, nogil=True, fastmath=fastmath, error_model="numpy", **more)(function)
-    if isinstance(compiled, Dispatcher):  # not where numba is switched off
-        kept = _kept(compiled)
-        kept._source_stamp = (kept._source_stamp, _surroundings(function))
+    kept = _kept(compiled)
+    if kept is not None:
+        options = (sorted(fastmath), sorted(more.items()))
+        kept._source_stamp = (kept._source_stamp, _surroundings(function), repr(options))
     return cast("Callable[..., R]", compiled)
 
 
@@ -48,12 +49,13 @@ def _surroundings(function: Callable[..., Any]) -> str:
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):
-            seen.append((name, _kept(value)._source_stamp))
+            seen.append((name, repr(getattr(_kept(value), "_source_stamp", None))))
         elif isinstance(value, (int, float, np.generic)):
             seen.append((name, repr(value)))
     return hashlib.sha256(repr(seen).encode()).hexdigest()
 
 
 def _kept(compiled: Any) -> Any:
-    """What keeps a kernel's machine code on disk."""
-    return compiled._cache._cache_file
+    """What keeps a kernel's machine code on disk, as numba has it inside; None where it has not, or is switched off."""
+    file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    return file if hasattr(file, "_source_stamp") else None

@@ -1,4 +1,4 @@
-"""The few functions of a pixel or a Gaussian, without branches or calls, so that whole rows run in vector registers."""
+"""The few functions of a pixel or a Gaussian, without branches or calls, so that loops run in vector registers."""
 
 from __future__ import annotations
 

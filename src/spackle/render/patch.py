@@ -21,7 +21,7 @@ PLANE = TILE * TILE
 STATE = 6 * PLANE
 
 # A plane is its patches one after the other, of PATCH × PATCH pixels each: most Gaussians are small, and touch
-# little more than half as many of these as rows of the tile.
+# about two thirds as many of these as rows of the tile.
 PATCH = 4
 PATCHES = TILE // PATCH  # along a tile's side
 LANES = PATCH * PATCH

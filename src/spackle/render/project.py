@@ -13,9 +13,9 @@ from spackle.render.protocol import TILE
 
 Array = npt.NDArray[Any]
 
-# A record is what the blender needs, in two thirds of a cache line. Along a row of pixels at distance
-# dy from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square
-# of this form is ever negative, and each row's span can be read off it.
+# A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy
+# from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square of this
+# form is ever negative.
 X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_WIDTH, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(12)
 RECORD = 12  # floats in a record
 

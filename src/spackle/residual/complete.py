@@ -98,6 +98,8 @@ class Completer:
                 nothing are passed over, and what nobody would see may stay open.
             progress: called with (views visited, views in all).
         """
+        if not cameras:
+            return Gaussians.empty()
         order = farthest_first(cameras, self.photo_camera)
         shields, view = self._first_shields(cameras, order)
         visits = Visits(len(cameras))
@@ -108,6 +110,7 @@ class Completer:
                 camera = cameras[index]
                 view = self.renderer.render([self.base, aux], camera) if count else view
                 holes = hole_area_ratio(view.alpha, self.threshold)
+                # Nobody is spoken for where all are looked at.
                 reach = float(holes == 0) if exact else reach_of(view.alpha, self.threshold)
                 if not reach:
                     others = [shield for of, shield in shields.items() if of != index]
@@ -124,7 +127,7 @@ class Completer:
         """What stays in front from the first: the photo (-1), and what the base shows from the widest views.
 
         Returns:
-            These, and the base from the widest view of all, or from the photo's where there is no other.
+            These, and the base from the widest view of all.
         """
         view = self.renderer.render(self.base, self.photo_camera)
         shields = {-1: Shield.of(view, self.photo_camera, self.threshold)}

@@ -23,7 +23,7 @@ from spackle.network_file import read_network
 SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
 # What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
 # thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
-INPUT_PIXELS = (80 * 96, 96 * 128, 192 * 256, 256 * 320, 448 * 608)
+INPUT_PIXELS = (64 * 96, 96 * 128, 192 * 256, 256 * 320, 448 * 608)
 MIRRORED_PX = 256 * 320  # so much is looked at both ways round; larger takes longest and gains nothing by it
 FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
@@ -77,14 +77,14 @@ class LiteBase:
         return self.looks(rgb).mean(0).exp()
 
     @torch.no_grad()
-    def looks(self, rgb: Tensor, sizes_px: Sequence[int] = INPUT_PIXELS) -> Tensor:
+    def looks(self, rgb: Tensor, sizes_px: Sequence[int] = INPUT_PIXELS, mirrored_px: int = MIRRORED_PX) -> Tensor:
         """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n sizes, the last the largest."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         height, width = rgb.shape[:2]
         sizes = [network_size(height, width, pixels) for pixels in sizes_px]
         finest = tuple(side // 2 for side in sizes[-1])
         said = [
-            self._look(picture, size, both=pixels <= MIRRORED_PX) for size, pixels in zip(sizes, sizes_px, strict=True)
+            self._look(picture, size, both=pixels <= mirrored_px) for size, pixels in zip(sizes, sizes_px, strict=True)
         ]
         return torch.cat([interpolate(look[None, None], size=finest, mode="bilinear") for look in said])[:, 0].cpu()
 

@@ -32,7 +32,7 @@ BOX, KEY, ID, START = 4 * 2, 4, 4, 8
 PIXEL = FLOAT * (3 + 1 + 1)  # colour, depth, alpha
 PASSES = 3  # of the radix sort
 
-INTEGERS = frozenset({"i", "k", "first", "found", "row", "bits", "exponent"})  # in the kernels' sources
+INTEGERS = frozenset({"i", "k", "first", "found", "bits", "exponent"})  # in the kernels' sources
 EDGES = frozenset({"left", "right", "top", "bottom"})  # in those of the projection
 DEPTH_OPERATIONS = 2  # of a pixel: depth over alpha, where that is more than zero
 DEPTH_TEST = 10  # of a Gaussian behind the camera: z in three products and three sums, and the four comparisons

@@ -19,7 +19,7 @@ from spackle.image import load_photo
 from spackle.training.depth.augment import GUESSED, Frame, Rng, Turning
 from spackle.training.depth.made import TRIES, Warn
 
-LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)
+LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # each both ways round; much smaller ones agree on little
 UNSURE = 0.12  # where the looks at several sizes differ by more than this, in logarithms, the guess does not count
 STEEP = 0.25  # nor where it changes by more than this from pixel to pixel: its outlines are soft, true ones are not
 
@@ -39,7 +39,7 @@ class GuessedPhotos:
         for index, photo in enumerate(self.photos):
             if not self._file(index).is_file():
                 try:
-                    guess = sure_inverse_depth(base.looks(load_photo(photo).rgb, LOOKS_PX))
+                    guess = sure_inverse_depth(base.looks(load_photo(photo).rgb, LOOKS_PX, max(LOOKS_PX)))
                 except (InputError, ValueError) as error:
                     warn(f"passed over: {error}")
                     continue
