@@ -80,7 +80,9 @@ def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(heig
         assert tall % STRIDE == 0
         assert wide % STRIDE == 0
         if 0.5 < height / width < 2:
-            assert 0.6 * pixels < tall * wide < 1.4 * pixels
+            assert 0.65 * pixels < tall * wide < 1.4 * pixels
+            assert abs(tall - (pixels * height / width) ** 0.5) <= STRIDE / 2
+            assert abs(wide - (pixels * width / height) ** 0.5) <= STRIDE / 2
             assert 0.75 < (tall / wide) / (height / width) < 1.33
     small = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
     if height * width < 200_000:

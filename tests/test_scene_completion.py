@@ -144,7 +144,7 @@ def test_nobody_speaks_for_the_ends_of_a_path(reach: float) -> None:
 def test_the_fewer_holes_the_farther_a_frame_speaks(holes: int, reach: float) -> None:
     alpha = torch.ones(250, 400)
     alpha.view(-1)[torch.arange(holes) * 37] = 0.3  # nowhere together
-    assert reach_of(alpha) == reach
+    assert reach_of(hole_area_ratio(alpha), alpha) == reach
 
 
 @pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 30), ("rotate", 60), ("swipe", 20)])
@@ -166,7 +166,7 @@ def test_few_holes_are_a_speck_where_they_lie_together(height: int, width: int, 
     alpha = torch.ones(120, 160)
     alpha[120 - height :, 160 - width :] = 0.3
     assert has_speck(alpha) is speck
-    assert not reach_of(alpha) or not speck
+    assert not reach_of(hole_area_ratio(alpha), alpha) or not speck
     assert not has_speck(torch.zeros(2, 60))
 
 

@@ -111,7 +111,7 @@ class Completer:
                 view = self.renderer.render([self.base, aux], camera) if count else view
                 holes = hole_area_ratio(view.alpha, self.threshold)
                 # Nobody is spoken for where all are looked at.
-                reach = float(holes == 0) if exact else reach_of(view.alpha, self.threshold)
+                reach = float(holes == 0) if exact else reach_of(holes, view.alpha, self.threshold)
                 if not reach:
                     others = [shield for of, shield in shields.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
@@ -129,8 +129,7 @@ class Completer:
         Returns:
             These, and the base from the widest view of all.
         """
-        view = self.renderer.render(self.base, self.photo_camera)
-        shields = {-1: Shield.of(view, self.photo_camera, self.threshold)}
+        shields = {-1: self.photo_shield()}
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
             view = self.renderer.render(self.base, cameras[index])
             shields[index] = Shield.of(view, cameras[index], self.threshold)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
-from spackle.residual.cues import MASK_THRESHOLD, hole_area_ratio
+from spackle.residual.cues import MASK_THRESHOLD
 
 QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
 SURE_HAR = QUIET_HAR / 4  # so few that frames farther off need no look either
@@ -35,9 +35,14 @@ def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]
     return order
 
 
-def reach_of(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
-    """How much of the way to the next known frames a frame of this alpha [H, W] speaks for; 0: complete it."""
-    holes = hole_area_ratio(alpha, threshold)
+def reach_of(holes: float, alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
+    """How much of the way to the next known frames a frame speaks for; 0: complete it.
+
+    Args:
+        holes: their share of the picture.
+        alpha: [H, W], the frame's opacity.
+        threshold: less is a hole.
+    """
     if holes > QUIET_HAR or has_speck(alpha, threshold):
         return 0.0
     return 0.75 if holes <= SURE_HAR else 0.5

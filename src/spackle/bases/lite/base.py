@@ -81,11 +81,10 @@ class LiteBase:
         """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n sizes, the last the largest."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
         height, width = rgb.shape[:2]
-        sizes = [network_size(height, width, pixels) for pixels in sizes_px]
-        finest = tuple(side // 2 for side in sizes[-1])
         said = [
-            self._look(picture, size, both=pixels <= mirrored_px) for size, pixels in zip(sizes, sizes_px, strict=True)
+            self._look(picture, network_size(height, width, pixels), both=pixels <= mirrored_px) for pixels in sizes_px
         ]
+        finest = said[-1].shape
         return torch.cat([interpolate(look[None, None], size=finest, mode="bilinear") for look in said])[:, 0].cpu()
 
     def _look(self, picture: Tensor, size: tuple[int, int], both: bool) -> Tensor:
