@@ -595,6 +595,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--base", "shrap"), "did you mean sharp?"),
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),
+        (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view looks from where"),
         (("--disparity", "0.3,3"), "up to 2"),
         (("--disparity=-0.3",), "--disparity -0.3: must be above 0"),
         (("--disparity", "0.3,0.30"), "the same number twice"),

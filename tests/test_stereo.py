@@ -397,6 +397,17 @@ def test_bad_choices_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("options", [("--fps", 24.0), ("--loop", 2), ("--format", "webm")], ids=lambda o: o[0])
+def test_what_is_for_a_video_needs_one(tmp_path: Path, options: tuple[str, object]) -> None:
+    photo, depth = write_pair(tmp_path)
+    common = ("predict", "-i", photo, "--depth", depth, "-o", tmp_path / "out", "--residual", "none", "--no-render")
+    result = run(*common, *options)
+    assert (result.code, len(result.lines)) == (2, 1)
+    assert " ".join(map(str, options)) in result.err
+    assert "--no-render writes none" in result.err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_name_and_a_format_must_agree(tmp_path: Path, scene: Path) -> None:
     result = run("render", "-i", scene, "-o", tmp_path / "a.gif", "--format", "webm")
     assert (result.code, len(result.lines)) == (2, 1)

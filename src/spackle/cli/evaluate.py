@@ -102,6 +102,11 @@ def evaluate(
         limit=limit,
         download=download_metrics,
     )
+    if options.near and "--disparity" in _given(context):
+        raise InputError(
+            f"--disparity {disparity}: --protocol near-view looks from where the true second photos were taken: "
+            "leave one of them out"
+        )
     folder = output or Path(f"evaluation-{dataset}-{protocol}")
     if run(options, folder, Reporter(verbose, as_json=as_json), html) == "stopped":
         raise typer.Exit(INTERRUPTED)

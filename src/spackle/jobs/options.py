@@ -85,6 +85,10 @@ def check_options(options: PredictOptions) -> None:
     check_base_options(options)
     check_path_options(options.disparity, options.frames)
     check_view_options(options.cameras, options.path, options.video)
+    video = options.video
+    for option, value in {"--format": video.format, "--fps": video.fps, "--loop": video.loop}.items():
+        if value is not None and not options.render:
+            raise InputError(f"{option} {value}: is for the video, and --no-render writes none: leave one of them out")
 
 
 def check_base_options(options: PredictOptions) -> None:
