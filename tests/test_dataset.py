@@ -34,8 +34,8 @@ from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.jobs import dataset_build
-from spackle.jobs.dataset_worker import Job, Made, Maker, _results
+from spackle.jobs.dataset import build as building
+from spackle.jobs.dataset.worker import Job, Made, Maker, _results
 from spackle.pseudo import PseudoDataset, PseudoFiles, PseudoSample
 from spackle.pseudo.archive import END, pack, unpack
 from spackle.pseudo.encode import (
@@ -196,7 +196,7 @@ def test_two_workers_make_the_same_bytes_as_one(whole: tuple[Path, Run], place: 
 KILL = """
 import os, sys
 sys.argv = {words!r}
-import spackle.jobs.dataset_build as build, spackle.jobs.dataset_worker as worker
+import spackle.jobs.dataset.build as build, spackle.jobs.dataset.worker as worker
 make, save, count = worker.Maker.make, build.Manifest.save, [0]
 def dying(*arguments, **more):
     count[0] += 1
@@ -243,7 +243,7 @@ def test_workers_end_with_a_killed_build(whole: tuple[Path, Run], place: Path, t
 import multiprocessing, os, sys
 from pathlib import Path
 sys.argv = {[str(word) for word in [*words, "--workers", 2]]!r}
-import spackle.jobs.dataset_build as build
+import spackle.jobs.dataset.build as build
 def dying(*arguments):
     Path({str(note)!r}).write_text(" ".join(str(child.pid) for child in multiprocessing.active_children()))
     os.kill(os.getpid(), 9)
@@ -631,7 +631,7 @@ def test_depth_has_to_be_a_folder(place: Path, tmp_path: Path) -> None:
 def test_more_photos_than_there_are_keys_are_a_line(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset_build, "MAX_PHOTOS", 4)
+    monkeypatch.setattr(building, "MAX_PHOTOS", 4)
     done = build(place, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 1)
     assert "5 photos are too many for a dataset (at most 4): give --sample" in done.err

@@ -17,10 +17,11 @@ import pytest
 from command import Run, names_in
 from test_dataset import SHORT, build, content, is_alive, write_inputs
 
-from spackle.jobs import dataset_crew, dataset_ray
-from spackle.jobs.dataset_options import DatasetOptions, base_options, view_choices
-from spackle.jobs.dataset_remote import RemoteMaker
-from spackle.jobs.dataset_worker import IN_HAND, Job, Made
+from spackle.jobs.dataset import crew as crews
+from spackle.jobs.dataset import ray as on_ray
+from spackle.jobs.dataset.options import DatasetOptions, base_options, view_choices
+from spackle.jobs.dataset.remote import RemoteMaker
+from spackle.jobs.dataset.worker import IN_HAND, Job, Made
 from spackle.pseudo.photos import PhotoFile
 
 os.environ.setdefault("RAY_AUTH_MODE", "token")  # before it is loaded: a cluster of newer versions wants one
@@ -97,7 +98,7 @@ def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, tmp_path: Pa
 def test_photos_of_a_killed_worker_are_made_again_by_another(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset_crew, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
+    monkeypatch.setattr(crews, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
     done = on(address, place, tmp_path / "out")
     assert (done.code, done.out) == (0, ""), done.err
     assert len(done.lines) == 3
@@ -111,7 +112,7 @@ def test_a_photo_that_kills_every_worker_ends_the_build_which_goes_on_later(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(dataset_crew, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
+        patch.setattr(crews, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
         done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (2, "", 4)
     assert f"{place}/photos/3.png: at this photo a worker died for the 4th time" in done.lines[-1]
@@ -128,7 +129,7 @@ def test_workers_and_their_cluster_end_with_a_killed_build(place: Path, tmp_path
     code = f"""
 import os, subprocess, sys
 sys.argv = {[str(word) for word in words]!r}
-import spackle.jobs.dataset_build as build
+import spackle.jobs.dataset.build as build
 def dying(*arguments):
     with open({str(note)!r}, "w") as file:
         subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
@@ -171,7 +172,7 @@ def test_without_ray_there_is_a_line(place: Path, tmp_path: Path, monkeypatch: p
 def test_an_address_where_nobody_answers_is_a_line(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset_ray, "ANSWER_S", 1.0)
+    monkeypatch.setattr(on_ray, "ANSWER_S", 1.0)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     with socket.socket() as nobody:  # takes the port, and no calls
         nobody.bind(("127.0.0.1", 0))
@@ -179,7 +180,7 @@ def test_an_address_where_nobody_answers_is_a_line(
         done = on(address, place, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 1)
     assert f"--ray {address}: no cluster: no answer within 1 seconds: is one running there" in done.err
-    monkeypatch.setattr(dataset_ray, "ANSWER_S", 60.0)
+    monkeypatch.setattr(on_ray, "ANSWER_S", 60.0)
     done = on("nowhere", place, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 1)
     assert "--ray nowhere: no cluster: ValueError: " in done.err
@@ -206,9 +207,9 @@ def test_a_node_that_is_not_like_the_others_is_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, instead: Any, line: str
 ) -> None:
     if name == "RemoteMaker":
-        monkeypatch.setattr(dataset_crew, name, dying(0, 99, tmp_path / "notes", instead))
+        monkeypatch.setattr(crews, name, dying(0, 99, tmp_path / "notes", instead))
     else:
-        monkeypatch.setattr(dataset_crew, name, lambda *arguments: instead)
+        monkeypatch.setattr(crews, name, lambda *arguments: instead)
     done = on(address, place, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 1 if name != "RemoteMaker" else 4)
     assert line.format(node=socket.gethostname()) in done.lines[-1]
@@ -221,12 +222,12 @@ def test_a_worker_takes_a_gpu_only_where_a_network_uses_one(tmp_path: Path) -> N
         return DatasetOptions(one, view_choices(0, 2, None, (0.1, 0.2)), inpainter=inpainter)
 
     with_one = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": True, "Resources": {"CPU": 4.0, "GPU": 1.0}}]
-    assert dataset_ray.gpus_of(options("sharp"), with_one) == 1
-    assert dataset_ray.gpus_of(options("rgbd", inpainter="propainter"), with_one) == 1
-    assert dataset_ray.gpus_of(options("rgbd"), with_one) == 0
-    assert dataset_ray.gpus_of(options("sharp", "cpu"), with_one) == 0
-    assert dataset_ray.gpus_of(options("sharp"), with_one[:1]) == 0
-    assert dataset_ray.gpus_of(options("sharp"), [with_one[0], {**with_one[1], "Alive": False}]) == 0
+    assert on_ray.gpus_of(options("sharp"), with_one) == 1
+    assert on_ray.gpus_of(options("rgbd", inpainter="propainter"), with_one) == 1
+    assert on_ray.gpus_of(options("rgbd"), with_one) == 0
+    assert on_ray.gpus_of(options("sharp", "cpu"), with_one) == 0
+    assert on_ray.gpus_of(options("sharp"), with_one[:1]) == 0
+    assert on_ray.gpus_of(options("sharp"), [with_one[0], {**with_one[1], "Alive": False}]) == 0
 
 
 # Back-pressure ------------------------------------------------------------------------------------
@@ -263,6 +264,6 @@ def test_workers_have_few_photos_in_hand(tmp_path: Path) -> None:
     options = DatasetOptions(base, view_choices(0, 2, None, (0.1, 0.2)), workers=3, ray="local")
     jobs = [(number, PhotoFile(tmp_path / f"{number}.png", f"{number}.png", "")) for number in range(50)]
     counts: list[int] = []
-    crew = dataset_crew.Crew(noting(counts), options, tmp_path, jobs, 0, print)
+    crew = crews.Crew(noting(counts), options, tmp_path, jobs, 0, print)
     assert sorted(made.index for made in crew.results()) == list(range(50))
     assert max(counts) == 3 * IN_HAND

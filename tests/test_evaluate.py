@@ -36,7 +36,7 @@ from spackle.evaluation.results import Mean, Record, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
-from spackle.jobs.evaluate import problem_of
+from spackle.jobs.evaluate.run import problem_of
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.trajectory import DepthRange, max_offset
@@ -467,7 +467,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
     ]
     code = (
         "import os, sys\n"
-        "from spackle.jobs import evaluate as job\n"
+        "from spackle.jobs.evaluate import run as job\n"
         "save = job.save_record\n"
         "def once(*rest):\n"
         "    save(*rest)\n"
@@ -543,7 +543,7 @@ def test_a_second_photo_that_is_broken_is_a_remark(
         lack = f"{scenes}/Chair/third.png: not\nan image"
         return dataclasses.replace(load(case), lacks=(lack,) if case.name == "Chair" else ())
 
-    monkeypatch.setattr("spackle.jobs.evaluate_case.load_case", lacking)
+    monkeypatch.setattr("spackle.jobs.evaluate.case.load_case", lacking)
     done = evaluate(scenes, tmp_path, "--protocol", "near-view", "--methods", "base", "--metrics", "none")
     assert done.code == 0, done.err
     remark = "without one of its second photos: Chair/third.png: not an image"

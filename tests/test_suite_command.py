@@ -17,7 +17,7 @@ from command import names_in, run
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
 from spackle.evaluation.suite.tables import TITLES
-from spackle.jobs.evaluate_store import KINDS, begin
+from spackle.jobs.evaluate.store import KINDS, begin
 
 SIDE = 64
 
@@ -58,7 +58,7 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
         yield lambda: next(answers)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spackle.jobs.bench_suite.asked_to_stop", stopping)
+        patch.setattr("spackle.jobs.bench.suite.asked_to_stop", stopping)
         done = run(*words)
     assert (done.code, "the same command goes on" in done.err) == (INTERRUPTED, True)
     assert names_in(output) == {"config.json", "sections"}

@@ -77,8 +77,8 @@ def dataset_build(
     verbose: VerboseOption = False,
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
-    from spackle.jobs.dataset_build import build_dataset
-    from spackle.jobs.dataset_options import DatasetOptions, base_options, view_choices
+    from spackle.jobs.dataset.build import build_dataset
+    from spackle.jobs.dataset.options import DatasetOptions, base_options, view_choices
     from spackle.jobs.progress import Reporter
 
     options = DatasetOptions(
@@ -103,7 +103,7 @@ def dataset_info(location: DatasetArgument) -> None:
     """Say what a dataset holds: counts, sizes, holes of each view, configuration."""
     from rich.console import Console
 
-    from spackle.jobs.dataset_look import show_info
+    from spackle.jobs.dataset.look import show_info
 
     show_info(location, Console(highlight=False))
 
@@ -111,7 +111,7 @@ def dataset_info(location: DatasetArgument) -> None:
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 where there is one."""
-    from spackle.jobs.dataset_look import verify_dataset
+    from spackle.jobs.dataset.look import verify_dataset
     from spackle.jobs.progress import Reporter
 
     if verify_dataset(location, Reporter()):
@@ -126,7 +126,7 @@ def dataset_preview(
     views: Annotated[int, typer.Option(help="How many views of each.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
-    from spackle.jobs.dataset_look import preview_dataset
+    from spackle.jobs.dataset.look import preview_dataset
     from spackle.jobs.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())

@@ -37,7 +37,7 @@ def train(
 ) -> None:
     """Train the residual, SHARP itself or lite: best.safetensors, last.safetensors, run.json, pictures and logs."""
     from spackle.jobs.progress import Reporter
-    from spackle.jobs.train import train_recipe
+    from spackle.jobs.train.recipe import train_recipe
 
     speaker, choices = Reporter(verbose), overrides or []
     ended = train_recipe(

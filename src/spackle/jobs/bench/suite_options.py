@@ -11,8 +11,8 @@ from spackle.bases.sharp.base import check_windows
 from spackle.errors import InputError
 from spackle.evaluation.suite.scenes import SIDE
 from spackle.evaluation.suite.tables import TITLES
-from spackle.jobs.bench_options import MAX_RUNS
-from spackle.jobs.evaluate_options import BASE, split_words
+from spackle.jobs.bench.options import MAX_RUNS
+from spackle.jobs.evaluate.options import BASE, split_words
 from spackle.jobs.names import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
 

@@ -11,9 +11,9 @@ from spackle.bases.sharp.tensor_file import read_tensors
 from spackle.bases.sharp.tuning import TunableSharp
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
-from spackle.jobs.dataset_options import weights_digest
-from spackle.jobs.train_judge import feature_name, judge_of
-from spackle.jobs.train_plan import Place, Start, parameters
+from spackle.jobs.dataset.options import weights_digest
+from spackle.jobs.train.judge import feature_name, judge_of
+from spackle.jobs.train.plan import Place, Start, parameters
 from spackle.training.direct_ft import DirectFt
 from spackle.training.method import MethodName
 from spackle.training.pseudo_photos import VIEWS_AT_ONCE, PseudoPhotos, only_dataset

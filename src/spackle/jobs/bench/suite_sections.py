@@ -24,8 +24,8 @@ from spackle.evaluation.suite.tables import GPU_LIMITS, LIMITS
 from spackle.evaluation.suite.training import BATCH, CELLS, training_section
 from spackle.evaluation.suite.values import Found
 from spackle.evaluation.suite.video import FRAMES, video_section
-from spackle.jobs.bench_suite_options import SuiteOptions
-from spackle.jobs.dataset_options import weights_digest
+from spackle.jobs.bench.suite_options import SuiteOptions
+from spackle.jobs.dataset.options import weights_digest
 from spackle.jobs.demo import load_motorcycle
 from spackle.render import CpuRenderer, GsplatRenderer, Renderer
 from spackle.residual import ResidualNet

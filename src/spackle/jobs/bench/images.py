@@ -20,12 +20,12 @@ from spackle.evaluation.efficiency_results import Bill, ImageCost
 from spackle.evaluation.efficiency_tables import efficiency_tables
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.jobs.bases import kind_of
-from spackle.jobs.bench_image import time_image
-from spackle.jobs.bench_options import BenchOptions, check_bench_options
-from spackle.jobs.evaluate import inputs_digest, problem_of, spread
-from spackle.jobs.evaluate_case import Bench
-from spackle.jobs.evaluate_setup import check_cases, configuration, metrics_device, open_bench
-from spackle.jobs.evaluate_store import IMAGES, begin, stem_of, write_json, write_text
+from spackle.jobs.bench.image import time_image
+from spackle.jobs.bench.options import BenchOptions, check_bench_options
+from spackle.jobs.evaluate.case import Bench
+from spackle.jobs.evaluate.run import inputs_digest, problem_of, spread
+from spackle.jobs.evaluate.setup import check_cases, configuration, metrics_device, open_bench
+from spackle.jobs.evaluate.store import IMAGES, begin, stem_of, write_json, write_text
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter

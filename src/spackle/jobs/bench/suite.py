@@ -20,10 +20,10 @@ from spackle.evaluation.suite.plot import scaling_svg
 from spackle.evaluation.suite.tables import GPU_LIMITS, LIMITS, TITLES, row_limits, suite_tables, targets
 from spackle.evaluation.suite.values import Found
 from spackle.evaluation.table import to_markdown
-from spackle.jobs.bench_suite_options import SuiteOptions, check_suite_options
-from spackle.jobs.bench_suite_sections import Sections
-from spackle.jobs.dataset_options import weights_digest
-from spackle.jobs.evaluate_store import begin, write_json, write_text
+from spackle.jobs.bench.suite_options import SuiteOptions, check_suite_options
+from spackle.jobs.bench.suite_sections import Sections
+from spackle.jobs.dataset.options import weights_digest
+from spackle.jobs.evaluate.store import begin, write_json, write_text
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions, without_nan
 from spackle.jobs.progress import Reporter

@@ -9,8 +9,8 @@ from spackle.errors import InputError
 from spackle.evaluation.results import Run
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
-from spackle.jobs.evaluate_pictures import BENCH, REPORT, find_bench, load_source, write_report
-from spackle.jobs.evaluate_store import LATEX, MARKDOWN, RESULTS, write_text
+from spackle.jobs.evaluate.pictures import BENCH, REPORT, find_bench, load_source, write_report
+from spackle.jobs.evaluate.store import LATEX, MARKDOWN, RESULTS, write_text
 from spackle.jobs.inputs import results_folder
 from spackle.jobs.progress import Reporter
 

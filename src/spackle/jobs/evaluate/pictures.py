@@ -16,7 +16,7 @@ from spackle.evaluation.sheets import columns, cut, thumbnail
 from spackle.evaluation.tables import make_tables
 from spackle.formats import atomic_path
 from spackle.formats.png import to_bytes
-from spackle.jobs.evaluate_store import IMAGES, RESULTS, TIMES, load_run, read_json, stem_of, write_text
+from spackle.jobs.evaluate.store import IMAGES, RESULTS, TIMES, load_run, read_json, stem_of, write_text
 
 REPORT = "report.html"
 BENCH = "bench.json"  # of `spackle bench`

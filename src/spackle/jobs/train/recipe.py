@@ -12,11 +12,11 @@ from rich.console import Console
 from spackle.errors import InputError
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.progress import Reporter
-from spackle.jobs.train_direct import DirectPlan
-from spackle.jobs.train_lite import LitePlan
-from spackle.jobs.train_plan import Place, Plan
-from spackle.jobs.train_residual import ResidualPlan
-from spackle.jobs.train_run import run_training
+from spackle.jobs.train.direct import DirectPlan
+from spackle.jobs.train.lite import LitePlan
+from spackle.jobs.train.plan import Place, Plan
+from spackle.jobs.train.residual import ResidualPlan
+from spackle.jobs.train.run import run_training
 from spackle.training.checkpoint import (
     BEST,
     LAST,

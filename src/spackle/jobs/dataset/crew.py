@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.jobs.dataset_options import DatasetOptions
-from spackle.jobs.dataset_remote import RemoteMaker, setting, what_is_seen
-from spackle.jobs.dataset_worker import IN_HAND, Job, Made, Maker, keep
+from spackle.jobs.dataset.options import DatasetOptions
+from spackle.jobs.dataset.remote import RemoteMaker, setting, what_is_seen
+from spackle.jobs.dataset.worker import IN_HAND, Job, Made, Maker, keep
 from spackle.pseudo.photos import PhotoFile
 
 RETRIES = 3  # of a photo whose worker died

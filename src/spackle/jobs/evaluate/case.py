@@ -21,7 +21,7 @@ from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import NEAR, Gauges, Wanted, large_views, measure
 from spackle.evaluation.results import Record
 from spackle.evaluation.sheets import TRUTH
-from spackle.jobs.evaluate_options import EvaluateOptions
+from spackle.jobs.evaluate.options import EvaluateOptions
 from spackle.render import Renderer
 from spackle.residual import ResidualNet, hole_mask
 

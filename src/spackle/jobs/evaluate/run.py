@@ -20,11 +20,11 @@ from spackle.evaluation.pyiqa_metrics import NOTICE
 from spackle.evaluation.results import Record, Run
 from spackle.evaluation.sheets import CASES, rank, sheet, strip
 from spackle.formats import atomic_path, save_png
-from spackle.jobs.evaluate_case import Bench, examine, from_root
-from spackle.jobs.evaluate_options import EvaluateOptions, check_evaluate_options
-from spackle.jobs.evaluate_pictures import find_bench, picture_suffix, save_picture, source_of, write_report
-from spackle.jobs.evaluate_setup import check_cases, configuration, metrics_device, open_bench
-from spackle.jobs.evaluate_store import (
+from spackle.jobs.evaluate.case import Bench, examine, from_root
+from spackle.jobs.evaluate.options import EvaluateOptions, check_evaluate_options
+from spackle.jobs.evaluate.pictures import find_bench, picture_suffix, save_picture, source_of, write_report
+from spackle.jobs.evaluate.setup import check_cases, configuration, metrics_device, open_bench
+from spackle.jobs.evaluate.store import (
     BEST,
     IMAGES,
     RESULTS,
@@ -36,7 +36,7 @@ from spackle.jobs.evaluate_store import (
     stem_of,
     write_json,
 )
-from spackle.jobs.evaluate_tables import TABLES, page, write_tables
+from spackle.jobs.evaluate.tables import TABLES, page, write_tables
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter

@@ -14,8 +14,8 @@ from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import ImageCost
 from spackle.evaluation.load import LoadedCase, load_case
 from spackle.evaluation.protocols import large_views
-from spackle.jobs.bench_options import BenchOptions
-from spackle.jobs.evaluate_case import Bench
+from spackle.jobs.bench.options import BenchOptions
+from spackle.jobs.evaluate.case import Bench
 
 
 def time_image(case: Case, options: BenchOptions, tools: Bench, clock: Clock, warm: bool) -> ImageCost:

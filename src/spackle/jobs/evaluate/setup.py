@@ -19,9 +19,9 @@ from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import Gauges
 from spackle.evaluation.pyiqa_metrics import DEFINITIONS, open_metrics
 from spackle.jobs.bases import NETWORKS, kind_of, public_name, says_of, title_of
-from spackle.jobs.dataset_options import base_digest, weights_digest
-from spackle.jobs.evaluate_case import Bench
-from spackle.jobs.evaluate_options import EvaluateOptions, for_base
+from spackle.jobs.dataset.options import base_digest, weights_digest
+from spackle.jobs.evaluate.case import Bench
+from spackle.jobs.evaluate.options import EvaluateOptions, for_base
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import digest_of
 from spackle.jobs.setup import set_up

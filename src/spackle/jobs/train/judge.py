@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from spackle.jobs.train_plan import Place
+from spackle.jobs.train.plan import Place
 from spackle.render import get_renderer
 from spackle.training.features import load_features
 from spackle.training.recipe import Recipe

@@ -11,9 +11,9 @@ from typing import Any, NoReturn
 from rich.filesize import decimal
 
 from spackle.errors import InputError
-from spackle.jobs.dataset_options import MAX_PHOTOS, DatasetOptions, check_dataset_options, configuration
-from spackle.jobs.dataset_ray import at_work_on_ray, cluster
-from spackle.jobs.dataset_worker import PARTS, Job, Made, Maker, at_work, part_file
+from spackle.jobs.dataset.options import MAX_PHOTOS, DatasetOptions, check_dataset_options, configuration
+from spackle.jobs.dataset.ray import at_work_on_ray, cluster
+from spackle.jobs.dataset.worker import PARTS, Job, Made, Maker, at_work, part_file
 from spackle.jobs.inputs import alone_in, make_folder, remove_half_written, results_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.stopping import asked_to_stop

@@ -9,7 +9,7 @@ from typing import Any
 from spackle.jobs.machine import hardware, versions, without_nan
 from spackle.jobs.report import write_report
 from spackle.jobs.stopping import asked_to_stop
-from spackle.jobs.train_plan import Place, Start
+from spackle.jobs.train.plan import Place, Start
 from spackle.training.checkpoint import LOGS, RUN, Checkpoint, Progress
 from spackle.training.learner import Learner
 from spackle.training.logs import NoLogs, open_logs

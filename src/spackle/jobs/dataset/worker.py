@@ -24,7 +24,7 @@ from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import Photo
-from spackle.jobs.dataset_options import DatasetOptions, depth_of
+from spackle.jobs.dataset.options import DatasetOptions, depth_of
 from spackle.jobs.setup import Tools, make_base, set_up
 from spackle.pseudo.build import Seconds, key_of, make_sample, timed
 from spackle.pseudo.inpainters import Inpainter, get_inpainter

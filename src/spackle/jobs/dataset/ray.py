@@ -15,9 +15,9 @@ from typing import Any
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.jobs.bases import kind_of
-from spackle.jobs.dataset_crew import Crew
-from spackle.jobs.dataset_options import DatasetOptions
-from spackle.jobs.dataset_worker import Job, Made
+from spackle.jobs.dataset.crew import Crew
+from spackle.jobs.dataset.options import DatasetOptions
+from spackle.jobs.dataset.worker import Job, Made
 
 ANSWER_S = 30.0  # for a cluster to answer
 

@@ -1,0 +1,1 @@
+"""`spackle train`: a recipe into weights, whichever of the three methods learns."""
