@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch.nn.functional import interpolate
 
 import spackle
-from spackle.bases.lite.base import FARTHEST, INPUT_PIXELS, NEAREST_M, SHIPPED, LiteBase, network_size
-from spackle.bases.lite.network import STRIDE, LiteNet
+from spackle.bases.lite.base import FARTHEST, LOOKS, NEAREST_M, SHIPPED, LiteBase, merged, network_size
+from spackle.bases.lite.network import STRIDE, LiteNet, Size
+from spackle.bases.lite.weights import SCALE, load_networks
 from spackle.errors import InputError
 from spackle.image import Photo
+from spackle.training.depth.export import save_networks
 from spackle.training.depth.score import score_depth, vertical_ramp
+
+BOTH_WAYS = [look for look in LOOKS if look.mirrored]
 
 
 @functools.cache
 def shipped() -> LiteBase:
     return LiteBase.load(device="cpu")
+
+
+def some_network(size: Size, seed: int) -> LiteNet:
+    torch.manual_seed(seed)
+    return LiteNet(size).eval().requires_grad_(False)
 
 
 def photo_of(rgb: torch.Tensor) -> Photo:
@@ -49,9 +60,9 @@ def test_a_real_photo_comes_out_nearer_to_its_measured_depth_than_by_a_guess_wit
 
 def test_a_mirrored_photo_has_nearly_the_mirrored_depth_and_quite_where_all_sizes_are_seen_both_ways() -> None:
     rgb, *_ = motorcycle()
-    seen, mirrored = (shipped().looks(picture).mean(0) for picture in (rgb, rgb.flip(1)))
+    seen, mirrored = (shipped().inverse_depth(picture).log() for picture in (rgb, rgb.flip(1)))
     assert float((mirrored - seen.flip(1)).abs().mean()) < 0.02
-    seen, mirrored = (shipped().looks(picture, INPUT_PIXELS[:-1]).mean(0) for picture in (rgb, rgb.flip(1)))
+    seen, mirrored = (shipped().looks(picture, BOTH_WAYS).mean(0) for picture in (rgb, rgb.flip(1)))
     torch.testing.assert_close(mirrored, seen.flip(1), rtol=1e-3, atol=1e-4)
 
 
@@ -75,7 +86,7 @@ def test_depth_lies_in_the_range_that_the_report_names() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (1536, 864), (40, 3000), (17, 17), (1, 1)])
 def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(height: int, width: int) -> None:
-    for pixels in INPUT_PIXELS:
+    for pixels in {look.pixels for look in LOOKS}:
         tall, wide = network_size(height, width, pixels)
         assert tall % STRIDE == 0
         assert wide % STRIDE == 0
@@ -91,7 +102,68 @@ def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(heig
 
 def test_the_weights_are_small_and_of_the_network_that_reads_them() -> None:
     assert SHIPPED.stat().st_size <= 12_000_000
-    assert sum(weight.numel() for weight in LiteNet().parameters()) * 2 <= SHIPPED.stat().st_size
+    networks = load_networks(SHIPPED)
+    assert [network.encoder.size for network in networks] == ["lite0", "lite2"]
+    assert sum(weight.numel() for network in networks for weight in network.parameters()) < SHIPPED.stat().st_size
+
+
+def test_stored_weights_are_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
+    """Steps of 1/127 of an output's largest weight: half of that is the most that one can be off."""
+    networks = [some_network("lite2", 1), some_network("lite0", 2)]
+    save_networks(networks, tmp_path / "two.safetensors")
+    read = load_networks(tmp_path / "two.safetensors")
+    assert [network.encoder.size for network in read] == ["lite2", "lite0"]
+    for one, other in zip(networks, read, strict=True):
+        for weight, stored in zip(one.parameters(), other.parameters(), strict=True):
+            largest = weight.abs().flatten(1).amax(1) if weight.dim() > 1 else weight.abs()
+            off = (weight - stored).abs().flatten(1).amax(1) if weight.dim() > 1 else (weight - stored).abs()
+            assert bool((off <= largest / 254 * 1.001 + 1e-7).all())
+    assert (tmp_path / "two.safetensors").stat().st_size < 1.1 * sum(
+        w.numel() for n in networks for w in n.parameters()
+    )
+    save_networks(read, tmp_path / "again.safetensors")
+    for one, other in zip(read, load_networks(tmp_path / "again.safetensors"), strict=True):
+        torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=1e-6, atol=1e-9)
+
+
+def test_each_look_is_by_its_own_network_and_one_network_alone_does_without_the_others() -> None:
+    networks, rgb = [some_network("lite0", 1), some_network("lite0", 2)], motorcycle()[0][:96, :128]
+    seen = LiteBase(networks, torch.device("cpu")).looks(rgb, LOOKS)
+    alone = [LiteBase([network], torch.device("cpu")) for network in networks]
+    for look, said in zip(LOOKS, seen, strict=True):
+        own = alone[look.network].looks(rgb, [dataclasses.replace(look, network=0), LOOKS[-1]])[0]
+        assert torch.equal(said, own)
+    first = [number for number, look in enumerate(LOOKS) if look.network == 0]
+    expected = merged(seen[first], [LOOKS[number].tilt for number in first]).exp()
+    torch.testing.assert_close(alone[0].inverse_depth(rgb), expected)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (80, 48)])
+def test_a_look_without_a_say_in_the_tilt_adds_its_outlines_alone(shape: tuple[int, int]) -> None:
+    height, width = shape
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    post = torch.zeros(shape)
+    post[:, width // 2 - 1 : width // 2 + 1] = 0.5
+    level, steep = torch.zeros(shape), 3 * y + x
+    torch.testing.assert_close(merged(torch.stack([level, steep]), [True, True]), steep / 2, rtol=0, atol=1e-5)
+    inner = (slice(height // 5, -height // 5), slice(width // 5, -width // 5))  # bicubic flattens the ends
+    assert float(merged(torch.stack([level, steep]), [True, False])[inner].abs().max()) < 0.15
+    seen = merged(torch.stack([level, steep + post]), [True, False])[inner]
+    assert 0.15 < float((seen.amax(1) - seen.median(1).values).min()) < 0.35
+
+
+@pytest.mark.parametrize("harm", ["a tensor is missing", "a scale is missing", "a scale is of another length"])
+def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, harm: str) -> None:
+    save_networks([LiteNet()], tmp_path / "one.safetensors")
+    tensors = load_file(tmp_path / "one.safetensors")
+    name = "0.context.weight" + ("" if "tensor" in harm else SCALE)
+    if "length" in harm:
+        tensors[name] = tensors[name][1:]
+    else:
+        del tensors[name]
+    save_file(tensors, tmp_path / "harmed.safetensors")
+    with pytest.raises(InputError, match=r"harmed.safetensors are of another network: 1 tensors differ, e.g. context"):
+        LiteBase.load(tmp_path / "harmed.safetensors")
 
 
 def test_weights_of_another_network_are_refused_in_a_line(tmp_path: Path) -> None:

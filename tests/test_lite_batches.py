@@ -11,6 +11,7 @@ import pytest
 import torch
 from lite_data import write_data
 from torch import nn
+from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.bases.lite.base import LiteBase
 from spackle.errors import InputError
@@ -43,6 +44,10 @@ def frame(seed: int) -> tuple[str, Frame]:
     return str(seed), Frame(torch.rand(3, 48, 64, generator=rng), depth, torch.ones(48, 64, dtype=torch.bool))
 
 
+def blurred(rgb: torch.Tensor) -> torch.Tensor:
+    return avg_pool2d(rgb[None], 9, 1, 4, count_include_pad=False)[0]
+
+
 def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     mixture = Mixture([Kept([frame(n) for n in range(5)]), Kept([frame(9)])], [1.0, 0.5], (64, 96), 0)
     batch = mixture.batch(7, [0, 1, 2])
@@ -59,6 +64,24 @@ def test_a_place_in_a_step_decides_what_stands_there_and_nothing_else() -> None:
     assert 70 < sum(name.startswith("9") for name in names) < 130
     assert 70 < sum(" and " in name for name in names) < 140
     assert any(name.startswith("9 and") and name != "9 and 9" for name in names)  # of two sources
+
+
+def test_a_step_sees_its_pictures_large_or_small() -> None:
+    smooth = [Kept([(name, dataclasses.replace(one, rgb=blurred(one.rgb))) for name, one in map(frame, range(5))])]
+    whole = Mixture(smooth, [1.0], (128, 192), 0)
+    mixed = Mixture(smooth, [1.0], (128, 192), 0, (1.0, 0.5, 0.3))
+    heights = []
+    for step in range(40):
+        large, small = whole.batch(step, [0, 1]), mixed.batch(step, [0, 1])
+        heights.append(min(small.rgb.shape[2:]))
+        assert all(side % 32 == 0 for side in small.rgb.shape[2:])
+        assert small.inverse_depth.shape == small.valid.shape == (2, *(side // 2 for side in small.rgb.shape[2:]))
+        assert (small.rgb - interpolate(large.rgb, size=small.rgb.shape[2:], mode="area")).abs().mean() < 0.02
+        if heights[-1] == 128:
+            assert torch.equal(small.rgb, large.rgb)
+            assert torch.equal(small.inverse_depth, large.inverse_depth)
+    assert set(heights) == {128, 64, 32}
+    assert 5 < heights.count(128) < 25
 
 
 def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:

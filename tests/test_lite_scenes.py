@@ -15,7 +15,7 @@ from plain_trace import plain_trace
 from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, pad, relu6
 
-from spackle.bases.lite.network import STAGES, TAPS, Encoder
+from spackle.bases.lite.network import STAGES, TAPS, Encoder, Size
 from spackle.errors import InputError
 from spackle.training.depth.augment import Frame, Turning, relit, turned
 from spackle.training.depth.encoder import load_encoder
@@ -237,8 +237,8 @@ def test_near_is_light_and_unknown_is_grey() -> None:
 # The encoder's first weights ----------------------------------------------------------------------
 
 
-def published(rng: torch.Generator) -> dict[str, Tensor]:
-    """Tensors by the names of EfficientNet-Lite0's conversion to PyTorch, at random."""
+def published(rng: torch.Generator, size: Size) -> dict[str, Tensor]:
+    """Tensors by the names of EfficientNet-Lite's conversions to PyTorch, at random."""
     tensors: dict[str, Tensor] = {}
 
     def layer(convolution: str, norm: str, shape: torch.Size) -> None:
@@ -248,9 +248,9 @@ def published(rng: torch.Generator) -> dict[str, Tensor]:
             tensors[f"{norm}.{name}"] = low + (high - low) * torch.rand(shape[0], generator=rng)
         tensors[f"{norm}.running_var"] = 0.5 + torch.rand(shape[0], generator=rng)
 
-    shapes = {name: tensor.shape for name, tensor in Encoder().state_dict().items() if name.endswith("weight")}
+    shapes = {name: tensor.shape for name, tensor in Encoder(size).state_dict().items() if name.endswith("weight")}
     layer("_conv_stem", "_bn0", shapes["stem.weight"])
-    places = [(stage, block) for stage, (count, *_) in enumerate(STAGES) for block in range(count)]
+    places = [(stage, block) for stage, (count, *_) in enumerate(STAGES[size]) for block in range(count)]
     for number, (stage, block) in enumerate(places):
         ours, theirs = f"stages.{stage}.{block}", f"_blocks.{number}"
         for part, norm in (("expand", "_bn0"), ("depthwise", "_bn1"), ("project", "_bn2")):
@@ -259,8 +259,8 @@ def published(rng: torch.Generator) -> dict[str, Tensor]:
     return tensors | {"_fc.weight": torch.zeros(10, 1280)}
 
 
-def plain_features(tensors: dict[str, Tensor], x: Tensor) -> list[Tensor]:
-    """EfficientNet-Lite0 layer by layer, convolution and normalisation apart, with TensorFlow's padding."""
+def plain_features(tensors: dict[str, Tensor], x: Tensor, size: Size) -> list[Tensor]:
+    """EfficientNet-Lite layer by layer, convolution and normalisation apart, with TensorFlow's padding."""
 
     def layer(x: Tensor, convolution: str, norm: str, stride: int = 1, groups: int = 1) -> Tensor:
         weight = tensors[f"{convolution}.weight"]
@@ -272,7 +272,7 @@ def plain_features(tensors: dict[str, Tensor], x: Tensor) -> list[Tensor]:
 
     x = relu6(layer((x * 255 - 127) / 128, "_conv_stem", "_bn0", 2))
     number, features = 0, []
-    for stage, (count, _, stride, expansion, _) in enumerate(STAGES):
+    for stage, (count, _, stride, expansion, _) in enumerate(STAGES[size]):
         for block in range(count):
             name, y = f"_blocks.{number}", x
             if expansion > 1:
@@ -287,14 +287,15 @@ def plain_features(tensors: dict[str, Tensor], x: Tensor) -> list[Tensor]:
     return features
 
 
-def test_folded_weights_do_what_convolutions_and_normalisations_did(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", ["lite0", "lite2"])
+def test_folded_weights_do_what_convolutions_and_normalisations_did(tmp_path: Path, size: Size) -> None:
     rng = torch.Generator().manual_seed(0)
-    tensors = published(rng)
-    torch.save(tensors, tmp_path / "lite0.pth")
+    tensors = published(rng, size)
+    torch.save(tensors, tmp_path / "published.pth")
     photos = torch.rand(1, 3, 64, 64, generator=rng)
     with torch.no_grad():
         for mine, plain in zip(
-            load_encoder(tmp_path / "lite0.pth")(photos), plain_features(tensors, photos), strict=True
+            load_encoder(size, tmp_path / "published.pth")(photos), plain_features(tensors, photos, size), strict=True
         ):
             torch.testing.assert_close(mine, plain, rtol=1e-3, atol=1e-3 * float(plain.std()))
 
@@ -306,5 +307,5 @@ def test_a_file_that_is_no_efficientnet_is_refused(tmp_path: Path, content: obje
         path.write_bytes(content)
     else:
         torch.save(content, path)
-    with pytest.raises(InputError, match=r"other\.pth: no weights of EfficientNet-Lite0 for PyTorch: give encoder="):
-        load_encoder(path)
+    with pytest.raises(InputError, match=r"other\.pth: no weights of EfficientNet-Lite2 for PyTorch: give encoder="):
+        load_encoder("lite2", path)

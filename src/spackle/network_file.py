@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 
 from spackle.errors import InputError
 
@@ -27,12 +28,22 @@ def read_network(network: Network, path: str | os.PathLike[str], what: str, othe
     Raises:
         InputError: a missing or broken file, or weights of another architecture.
     """
+    return fill_network(network, read_tensors(path, what, otherwise), path, what)
+
+
+def read_tensors(path: str | os.PathLike[str], what: str, otherwise: str) -> dict[str, Tensor]:
+    """The tensors of a file by name; InputError where it is missing or broken, in the words of `read_network`."""
     if not os.path.isfile(path):
         raise InputError(f"{what} weights {path} not found: give {otherwise}")
     try:
-        tensors = load_file(path)
+        tensors: dict[str, Tensor] = load_file(path)
     except (SafetensorError, OSError) as error:
         raise InputError(f"{what} weights {path} are not readable as safetensors: {error}") from error
+    return tensors
+
+
+def fill_network(network: Network, tensors: Mapping[str, Tensor], path: str | os.PathLike[str], what: str) -> Network:
+    """The network with these weights; InputError where they are another's, in the words of `read_network`."""
     expected = network.state_dict()
     wrong = sorted(name for name in expected.keys() & tensors.keys() if expected[name].shape != tensors[name].shape)
     wrong += sorted(expected.keys() ^ tensors.keys())

@@ -1,4 +1,4 @@
-"""The lite base: rough depth from the photo alone, by a network that comes with the package."""
+"""The lite base: rough depth from the photo alone, by two networks that come with the package."""
 
 from __future__ import annotations
 
@@ -14,32 +14,51 @@ from torch.nn.functional import interpolate
 from spackle.bases.depth_maps import DepthMap
 from spackle.bases.device import own_arithmetic, pick_device
 from spackle.bases.lite.network import STRIDE, LiteNet
+from spackle.bases.lite.weights import load_networks
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.relative import NEAREST_M, nearest
 from spackle.bases.rgbd import lift
 from spackle.image import Photo, resize_photo
-from spackle.network_file import read_network
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"
-# What the network looks at, nearly, one after the other; it has learned from 256×320. Small shows it more of a
-# thing at once, large its outlines: the mean of what it says of all of them errs less than the best alone.
-INPUT_PIXELS = (64 * 96, 96 * 128, 192 * 256, 256 * 320, 448 * 608)
-MIRRORED_PX = 256 * 320  # so much is looked at both ways round; larger takes longest and gains nothing by it
 FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
 
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """One way of looking at a photo."""
+
+    pixels: int  # of what the network sees of it, nearly
+    network: int = 0  # which of the networks that a file has
+    mirrored: bool = True  # whether it sees the mirror image, too
+    tilt: bool = True  # whether it has a say in how the whole lies, and not in outlines alone
+
+
+# One after the other; both have learned from up to 256×320. Small shows them more of a thing at once, large its
+# outlines: the mean of what they say errs less than the best alone. The largest costs most, its mirror gains nothing.
+LOOKS = (
+    Look(64 * 96),
+    Look(96 * 128),
+    Look(192 * 256),
+    Look(192 * 256, network=1),
+    Look(256 * 320),
+    Look(448 * 608, mirrored=False, tilt=False),
+)
+COARSE = (3, 4)  # how the whole lies is what is left of a look in so many cells, the longer side having more
+
+
 class LiteBase:
-    """A small network's depth, lifted as a measured one is: plausible parallax, not measurement."""
+    """Small networks' depth, lifted as a measured one is: plausible parallax, not measurement."""
 
     name = "lite"
 
-    def __init__(self, network: LiteNet, device: torch.device) -> None:
-        self.network = network.to(device)
+    def __init__(self, networks: Sequence[LiteNet], device: torch.device) -> None:
+        self.networks = [network.to(device) for network in networks]
         self.device = device
 
     @classmethod
     def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
-        """Read the network's weights.
+        """Read the networks' weights.
 
         Args:
             path: a file that `spackle train --method lite` wrote; None takes the weights of the package.
@@ -49,7 +68,7 @@ class LiteBase:
             InputError: a file or device that cannot be used.
         """
         target = pick_device(device)
-        return cls(read_network(LiteNet(), path or SHIPPED, "lite", "a .safetensors file"), target)
+        return cls(load_networks(path or SHIPPED), target)
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `rgbd.lift` makes them."""
@@ -66,7 +85,7 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """What the network says of a photo, and of its mirror image, at several sizes: the mean of the logarithms.
+        """What the networks say of a photo in all of `LOOKS`, in the mean of the logarithms.
 
         Args:
             rgb: [H, W, 3] sRGB in 0..1, of any size.
@@ -74,26 +93,33 @@ class LiteBase:
         Returns:
             [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
         """
-        return self.looks(rgb).mean(0).exp()
+        looks = [look for look in LOOKS if look.network < len(self.networks)]
+        return merged(self.looks(rgb, looks), [look.tilt for look in looks]).exp()
 
     @torch.no_grad()
-    def looks(self, rgb: Tensor, sizes_px: Sequence[int] = INPUT_PIXELS, mirrored_px: int = MIRRORED_PX) -> Tensor:
-        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n sizes, the last the largest."""
+    def looks(self, rgb: Tensor, looks: Sequence[Look]) -> Tensor:
+        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] by each of n looks, as fine as the last."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
-        height, width = rgb.shape[:2]
-        said = [
-            self._look(picture, network_size(height, width, pixels), both=pixels <= mirrored_px) for pixels in sizes_px
-        ]
+        said = [self._say(picture, look) for look in looks]
         finest = said[-1].shape
         return torch.cat([interpolate(look[None, None], size=finest, mode="bilinear") for look in said])[:, 0].cpu()
 
-    def _look(self, picture: Tensor, size: tuple[int, int], both: bool) -> Tensor:
-        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W], seen at a size (h, w), perhaps both ways round."""
+    def _say(self, picture: Tensor, look: Look) -> Tensor:
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W] that is seen at (h, w)."""
+        size = network_size(picture.shape[2], picture.shape[3], look.pixels)
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
-        ways = torch.cat([seen, seen.flip(-1)]) if both else seen
+        ways = torch.cat([seen, seen.flip(-1)]) if look.mirrored else seen
         with own_arithmetic(self.device):
-            straight, *mirrored = self.network(ways.contiguous(memory_format=torch.channels_last)).float()
-        return torch.stack([straight, *(look.flip(-1) for look in mirrored)]).mean(0)
+            said = self.networks[look.network](ways.contiguous(memory_format=torch.channels_last))
+        straight, *mirrored = said.float()
+        return torch.stack([straight, *(one.flip(-1) for one in mirrored)]).mean(0)
+
+
+def merged(looks: Tensor, tilt: Sequence[bool]) -> Tensor:
+    """[h, w] the mean of looks [n, h, w], but what is coarse in it is the mean of those that have a say in it."""
+    cells = COARSE if looks.shape[1] <= looks.shape[2] else COARSE[::-1]
+    coarse = interpolate(interpolate(looks[None], size=cells, mode="area"), size=looks.shape[1:], mode="bicubic")[0]
+    return (looks - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:

@@ -1,26 +1,40 @@
-"""The network of the lite base: EfficientNet-Lite0's features, and a small decoder to inverse depth."""
+"""The networks of the lite base: an EfficientNet-Lite's features, and a small decoder to inverse depth."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad, relu, relu6
 
 STRIDE = 32  # both sides of the input are multiples of it
-# Stages of EfficientNet-Lite0 (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation):
+Size = Literal["lite0", "lite2"]
+# Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation):
 # blocks, kernel, stride, expansion, channels.
-STAGES = (
-    (1, 3, 1, 1, 16),
-    (2, 3, 2, 6, 24),
-    (2, 5, 2, 6, 40),
-    (3, 3, 2, 6, 80),
-    (3, 5, 1, 6, 112),
-    (4, 5, 2, 6, 192),
-    (1, 3, 1, 6, 320),
-)
+STAGES: dict[Size, tuple[tuple[int, int, int, int, int], ...]] = {
+    "lite0": (
+        (1, 3, 1, 1, 16),
+        (2, 3, 2, 6, 24),
+        (2, 5, 2, 6, 40),
+        (3, 3, 2, 6, 80),
+        (3, 5, 1, 6, 112),
+        (4, 5, 2, 6, 192),
+        (1, 3, 1, 6, 320),
+    ),
+    "lite2": (
+        (1, 3, 1, 1, 16),
+        (3, 3, 2, 6, 24),
+        (3, 5, 2, 6, 48),
+        (4, 3, 2, 6, 88),
+        (4, 5, 1, 6, 120),
+        (5, 5, 2, 6, 208),
+        (1, 3, 1, 6, 352),
+    ),
+}
 STEM = 32
 TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
-SPREADS = (6.0, 9.0, 8.0, 7.0, 3.0)  # standard deviations of those features, nearly, on photos
+SPREADS = (6.0, 9.6, 8.0, 6.7, 2.4)  # standard deviations of those features of lite2, nearly lite0's too, on photos
 DECODER = (24, 40, 64, 96, 160)  # its channels at those scales
 MEAN, STD = 127.0 / 255, 128.0 / 255  # the input that the features were learned on
 
@@ -58,14 +72,15 @@ class Block(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-Lite0 without its head."""
+    """An EfficientNet-Lite without its head."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: Size) -> None:
         super().__init__()
+        self.size = size
         self.stem = SameConv(3, STEM, 3, 2)
         self.stages = nn.ModuleList()
         inputs = STEM
-        for count, kernel, stride, expansion, outputs in STAGES:
+        for count, kernel, stride, expansion, outputs in STAGES[size]:
             blocks = []
             for n in range(count):
                 blocks.append(Block(inputs, outputs, kernel, stride if n == 0 else 1, expansion))
@@ -103,10 +118,10 @@ class Fuse(nn.Module):
 class LiteNet(nn.Module):
     """A photo to its inverse depth, up to a factor."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: Size = "lite2") -> None:
         super().__init__()
-        self.encoder = Encoder()
-        channels = [STAGES[stage][-1] for stage in TAPS]
+        self.encoder = Encoder(size)
+        channels = [STAGES[size][stage][-1] for stage in TAPS]
         top = DECODER[-1]
         self.top = nn.Conv2d(channels[-1] + 2, top, 1)
         self.context = nn.Conv2d(channels[-1], top, 1)

@@ -70,7 +70,7 @@ class LitePlan:
 
         height, width = recipe.data.size
         judge = DepthJudge(recipe.loss, height * width, place.precision, place.device)
-        mixture = Mixture(sources, parts, recipe.data.size, recipe.run.seed)
+        mixture = Mixture(sources, parts, recipe.data.size, recipe.run.seed, recipe.data.scales)
         method = LiteMethod(mixture, groups, judge, recipe.optim.batch, place.ranks, recipe.run.seed, self.digest)
         samples = {"train": counts, "validation": judged, "digest": self.digest}
         rate = recipe.optim.encoder_rate

@@ -8,15 +8,16 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
+from spackle.bases.lite.network import LiteNet
 from spackle.formats import atomic_path
 from spackle.training.ahead import Ahead
-from spackle.training.checkpoint import export_weights
 from spackle.training.depth.augment import Frame
+from spackle.training.depth.export import save_networks
 from spackle.training.depth.judging import MEASURES, DepthJudge
 from spackle.training.depth.mixture import DepthBatch, Mixture
 from spackle.training.depth.pictures import colored, ends, sheet
@@ -114,8 +115,8 @@ class LiteMethod:
             temporary.write_text(json.dumps({"step": step, "pictures": names}, indent=1) + "\n", encoding="utf-8")
 
     def export(self, network: nn.Module, path: Path) -> None:
-        """Weights in half precision, for `spackle predict --base lite`."""
-        export_weights(network, path)
+        """Weights in eight bits, for `spackle predict --base lite`."""
+        save_networks([cast(LiteNet, network)], path)
 
     @functools.cached_property
     def _ahead(self) -> Ahead[Wanted, DepthBatch]:

@@ -9,7 +9,9 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
+from spackle.bases.lite.network import STRIDE
 from spackle.training.depth.augment import MADE, MEASURED, Frame, Rng, Turning, mingled, relit, turned
 from spackle.training.depth.made import MadeScenes
 
@@ -76,16 +78,25 @@ class Mixture:
     shares: Sequence[float]
     size: tuple[int, int]  # height and width; upright steps have them the other way round
     seed: int
+    scales: Sequence[float] = (1.0,)  # of what the network sees of a step's pictures, one drawn for each step
 
     def batch(self, step: int, places: Sequence[int]) -> DepthBatch:
-        """The pictures at some places of a step; InputError where one cannot be read."""
+        """The pictures at some places of a step, seen large or small; InputError where one cannot be read."""
         # A seed ends in zeros without end: a step's own numbers would be those of its place 0, hence the 1 below.
-        upright = np.random.default_rng([self.seed, step]).random() < UPRIGHT
-        height, width = self.size[::-1] if upright else self.size
+        rng = np.random.default_rng([self.seed, step])
+        height, width = self.size[::-1] if rng.random() < UPRIGHT else self.size
+        scale = self.scales[int(rng.integers(len(self.scales)))]
         pictures = [self._picture(step, place, height, width)[1] for place in places]
-        rgb = torch.stack([picture.rgb for picture in pictures])
-        truths = (torch.stack([getattr(picture, name) for picture in pictures]) for name in ("inverse_depth", "valid"))
-        return DepthBatch(rgb, *(truth[:, ::COARSER, ::COARSER].contiguous() for truth in truths))
+        rgb, inverse_depth, valid = (
+            torch.stack([getattr(picture, field.name) for picture in pictures]) for field in dataclasses.fields(Frame)
+        )
+        seen = [max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width)]
+        coarse = [side // COARSER for side in seen]
+        return DepthBatch(
+            interpolate(rgb, size=seen, mode="bicubic", antialias=True).clamp(0, 1),
+            interpolate(inverse_depth[:, None], size=coarse, mode="nearest-exact")[:, 0],
+            interpolate(valid[:, None].float(), size=coarse, mode="nearest-exact")[:, 0] > 0.5,
+        )
 
     def name(self, step: int, place: int) -> str:
         """Where the picture at a place of a step comes from."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from spackle.bases.lite.network import STAGES, STRIDE
+from spackle.bases.lite.network import STAGES, STRIDE, Size
 from spackle.errors import InputError
 from spackle.training.depth.losses import DepthLossWeights
 from spackle.training.recipe import OptimRecipe, RgbdFolder, RunRecipe
@@ -36,6 +36,7 @@ class LiteData:
     guesses: int = 1500  # of so many photos at most
     shares: LiteShares = LiteShares()
     size: tuple[int, int] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
+    scales: tuple[float, ...] = (1.0,)  # of that, one drawn for each step: the base looks at photos at several sizes
     cache: Path | None = None  # a folder for made scenes and guesses; inside the output where None
     seed: int = 0  # of the made scenes alone, so that runs with other seeds learn from the same ones
     validation: float = 0.2  # share of each folder of `rgbd`, the last frames by name: neighbours look alike
@@ -58,7 +59,8 @@ class LiteRecipe:
     loss: DepthLossWeights = WEIGHTS
     optim: LiteOptim = LiteOptim()
     run: RunRecipe = RUN
-    encoder: Path | None = None  # EfficientNet-Lite0's .pth; None: of the installed package; "random": none
+    network: Size = "lite2"  # how large the encoder is: EfficientNet-Lite0's or -Lite2's
+    encoder: Path | None = None  # its .pth; None: of the installed package; "random": none
     init: Path | None = None  # weights of the whole network to start from
 
 
@@ -74,8 +76,9 @@ LITE_RANGES: dict[str, tuple[float, float]] = {
     "data.guesses": (1, 1e6),
     "data.made": (1, 1e6),  # six digits name a file
     "data.size": (STRIDE, 2048),
+    "data.scales": (0.1, 2),
     "data.validation": (0, 0.9),
     **{f"loss.{name}": (0, 1e6) for name in ("factor", "line", "steps", "offset")},
     "optim.encoder_rate": (0, 10),
-    "optim.frozen": (0, len(STAGES)),
+    "optim.frozen": (0, len(STAGES["lite2"])),
 }

@@ -19,14 +19,14 @@ from spackle.training.depth.skins import skins, sky
 Rng = np.random.Generator
 SAMPLES = 2  # rays along each side of a pixel
 KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # and how often
-    (indoors.room, 0.18),
-    (indoors.table, 0.1),
-    (indoors.sheets, 0.06),
-    (still_lifes.still_life, 0.26),
+    (indoors.room, 0.17),
+    (indoors.table, 0.09),
+    (indoors.sheets, 0.05),
+    (still_lifes.still_life, 0.25),
     (still_lifes.heap, 0.09),
     (still_lifes.shelf, 0.08),
     (outdoors.street, 0.07),
-    (outdoors.yard, 0.16),
+    (outdoors.yard, 0.2),
 )
 
 

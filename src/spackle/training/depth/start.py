@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 
-from spackle.bases.lite.network import Block, LiteNet
-from spackle.network_file import read_network
+from spackle.bases.lite.network import Block, LiteNet, Size
+from spackle.bases.lite.weights import load_networks
+from spackle.errors import InputError
 from spackle.training.depth.encoder import load_encoder
 from spackle.training.depth.recipe import RANDOM, LiteRecipe
 
@@ -19,13 +22,21 @@ def first_network(recipe: LiteRecipe) -> LiteNet:
         InputError: a file that is missing, or of another network.
     """
     if recipe.init is not None:
-        return balanced(read_network(LiteNet(), recipe.init, "lite", "a .safetensors file as init")).requires_grad_()
+        return balanced(_network_of(recipe.init, recipe.network)).requires_grad_()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.run.seed)
-        network = LiteNet()
+        network = LiteNet(recipe.network)
     if recipe.encoder != RANDOM:
-        network.encoder = load_encoder(recipe.encoder)
+        network.encoder = load_encoder(recipe.network, recipe.encoder)
     return network
+
+
+def _network_of(path: Path, size: Size) -> LiteNet:
+    """The network of this size in a file, the first where there are several."""
+    found = {network.encoder.size: network for network in reversed(load_networks(path, "a .safetensors file as init"))}
+    if size not in found:
+        raise InputError(f"{path}: has no network of the size {size}: add network={next(iter(found))}")
+    return found[size]
 
 
 @torch.no_grad()
