@@ -171,7 +171,7 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
     done = train(place, tmp_path / "out", "optim.steps=12", "run.validate_every=12", "run.save_every=100")
     assert done.code == 0, done.err
     losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
-    assert losses[-1] < 0.8 * losses[0], losses
+    assert losses[-1] < 0.85 * losses[0], losses
 
 
 # Going on -----------------------------------------------------------------------------------------
