@@ -69,6 +69,8 @@ def check_lite(recipe: LiteRecipe, file: str) -> None:
     for side in recipe.data.size:
         if side % STRIDE:
             raise InputError(f"{file}: data.size {list(recipe.data.size)}: both sides must be multiples of {STRIDE}")
+    if not recipe.data.scales:
+        raise InputError(f"{file}: data.scales is empty: give one number at least, such as [1]")
 
 
 LITE_RANGES: dict[str, tuple[float, float]] = {
