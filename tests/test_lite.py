@@ -152,17 +152,23 @@ def test_a_look_without_a_say_in_the_tilt_adds_its_outlines_alone(shape: tuple[i
     assert 0.15 < float((seen.amax(1) - seen.median(1).values).min()) < 0.35
 
 
-@pytest.mark.parametrize("harm", ["a tensor is missing", "a scale is missing", "a scale is of another length"])
+@pytest.mark.parametrize(
+    "harm", ["a tensor is missing", "a scale is missing", "a scale is of another length", "the last bias is a number"]
+)
 def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, harm: str) -> None:
     save_networks([LiteNet()], tmp_path / "one.safetensors")
     tensors = load_file(tmp_path / "one.safetensors")
     name = "0.context.weight" + ("" if "tensor" in harm else SCALE)
-    if "length" in harm:
+    if "bias" in harm:
+        tensors["0.encoder.stages.6.0.project.bias"] = torch.tensor(1.0)
+    elif "length" in harm:
         tensors[name] = tensors[name][1:]
     else:
         del tensors[name]
     save_file(tensors, tmp_path / "harmed.safetensors")
-    with pytest.raises(InputError, match=r"harmed.safetensors are of another network: 1 tensors differ, e.g. context"):
+    with pytest.raises(
+        InputError, match=r"harmed.safetensors are of another network: (1 tensors differ, e.g. context|encoder\.stages)"
+    ):
         LiteBase.load(tmp_path / "harmed.safetensors")
 
 

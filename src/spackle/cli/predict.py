@@ -42,8 +42,8 @@ def predict(
         str,
         typer.Option(
             metavar="NAME",
-            help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; lite: rough depth by a "
-            "network that comes along; hf:OWNER/NAME or hf:FOLDER: a depth model of transformers. "
+            help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; lite: rough depth by "
+            "networks that come along; hf:OWNER/NAME or hf:FOLDER: a depth model of transformers. "
             "auto: the depth that is given or in the photo, else sharp if its weights are here, else lite.",
         ),
     ] = "auto",

@@ -43,7 +43,7 @@ KINDS = {
     "sharp": BaseKind("SHARP", "Apple's network, from the photo alone", _OWN_DEPTH, slow=True),
     "lite": BaseKind(
         "lite",
-        f"Spackle's own small depth network, from the photo alone, lifted; {NOT_SHARP}",
+        f"Spackle's own small depth networks, from the photo alone, lifted; {NOT_SHARP}",
         _OWN_DEPTH
         | {"--precision": "always computes in fp32", "--low-memory": "takes little as it is"}
         | dict.fromkeys(_SHARPS_SPEED, "is fast as it is"),

@@ -1,1 +1,1 @@
-"""Depth from the photo alone, by a small network that ships with the package."""
+"""Depth from the photo alone, by two small networks that ship with the package."""

@@ -61,7 +61,8 @@ class LiteBase:
         """Read the networks' weights.
 
         Args:
-            path: a file that `spackle train --method lite` wrote; None takes the weights of the package.
+            path: a file that `spackle train --method lite` wrote; None takes the weights of the package. Of several
+                networks in it those are asked that `LOOKS` counts.
             device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:

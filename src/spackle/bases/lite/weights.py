@@ -31,19 +31,21 @@ def load_networks(path: str | os.PathLike[str], otherwise: str = "a .safetensors
     for name, tensor in tensors.items():
         number, _, rest = name.partition(".")
         parts.setdefault(number, {})[rest] = tensor
-    return [_network(parts[number], path) for number in sorted(parts)] or [_network({}, path)]
+    return [_network(parts[number], path) for number in sorted(parts, key=lambda number: (len(number), number))] or [
+        _network({}, path)
+    ]
 
 
 def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:
     last = tensors.get(LAST)
     for size, stages in STAGES.items():
-        if last is not None and len(last) == stages[-1][-1]:
+        if last is not None and last.shape == (stages[-1][-1],):
             return fill_network(LiteNet(size), tensors, path, "lite")
     raise InputError(f"lite weights {path} are of another network: {LAST} is missing or of another length")
 
 
 def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """All tensors as floats; steps without a scale that fits are left out."""
+    """All tensors as floats; steps without a scale that fits are left out, and what they are for is then missing."""
     values: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         scale = tensors.get(name + SCALE)

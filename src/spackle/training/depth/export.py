@@ -21,7 +21,7 @@ def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
     """Write networks into one file, which `spackle.bases.lite.weights.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
-    precision. `networks` are asked in this order: see `spackle.bases.lite.base.LOOKS`.
+    precision. `Look.network` counts them in this order.
 
     Raises:
         InputError: where the file cannot be written.
