@@ -31,9 +31,8 @@ def load_networks(path: str | os.PathLike[str], otherwise: str = "a .safetensors
     for name, tensor in tensors.items():
         number, _, rest = name.partition(".")
         parts.setdefault(number, {})[rest] = tensor
-    return [_network(parts[number], path) for number in sorted(parts, key=lambda number: (len(number), number))] or [
-        _network({}, path)
-    ]
+    numbers = sorted(parts, key=lambda number: (len(number), number))
+    return [_network(parts[number], path) for number in numbers] or [_network({}, path)]
 
 
 def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:

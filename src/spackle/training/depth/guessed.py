@@ -20,7 +20,7 @@ from spackle.training.depth.augment import GUESSED, Frame, Rng, Turning
 from spackle.training.depth.made import TRIES, Warn
 
 LOOKS_PX = (128 * 160, 192 * 256, 256 * 320, 352 * 480)  # each both ways round; much smaller ones agree on little
-UNSURE = 0.12  # where the looks at several sizes, by all networks, differ by more than this, in logarithms, the guess does not count
+UNSURE = 0.12  # where looks, of all sizes and networks, differ by more than this in logarithms, a guess does not count
 STEEP = 0.25  # nor where it changes by more than this from pixel to pixel: its outlines are soft, true ones are not
 
 
