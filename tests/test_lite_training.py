@@ -168,10 +168,12 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
 ) -> None:
     batch = Mixture.batch
     monkeypatch.setattr(Mixture, "batch", lambda self, step, places: batch(self, 0, [0, 1]))
-    done = train(place, tmp_path / "out", "optim.steps=12", "run.validate_every=12", "run.save_every=100")
+    done = train(
+        place, tmp_path / "out", "optim.steps=20", "optim.lr=3e-3", "run.validate_every=20", "run.save_every=100"
+    )
     assert done.code == 0, done.err
     losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
-    assert losses[-1] < 0.85 * losses[0], losses
+    assert losses[-1] < 0.8 * losses[0], losses
 
 
 # Going on -----------------------------------------------------------------------------------------
