@@ -125,6 +125,10 @@ def merged(looks: Tensor, tilt: Sequence[bool]) -> Tensor:
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
     """(height, width) of what the network sees of a photo: nearly its shape, nearly `pixels`."""
-    scale = math.sqrt(pixels / (height * width))
+    return scaled_size(height, width, math.sqrt(pixels / (height * width)))
+
+
+def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
+    """(height, width) times nearly `scale`, as a network takes it."""
     tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
     return tall, wide

@@ -13,7 +13,6 @@ import torch
 from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
-from spackle.evaluation.datasets import get_dataset
 from spackle.evaluation.efficiency import Clock, Parameters, count_parameters
 from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import Bill, ImageCost
@@ -23,8 +22,8 @@ from spackle.jobs.bases import kind_of
 from spackle.jobs.bench.image import time_image
 from spackle.jobs.bench.options import BenchOptions, check_bench_options
 from spackle.jobs.evaluate.case import Bench
-from spackle.jobs.evaluate.run import inputs_digest, problem_of, spread
-from spackle.jobs.evaluate.setup import check_cases, configuration, metrics_device, open_bench
+from spackle.jobs.evaluate.run import inputs_digest, problem_of
+from spackle.jobs.evaluate.setup import metrics_device, open_evaluation
 from spackle.jobs.evaluate.store import IMAGES, begin, stem_of, write_json, write_text
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
@@ -51,11 +50,7 @@ def bench(options: BenchOptions, output: Path, reporter: Reporter) -> str:
         InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`.
     """
     check_bench_options(options)
-    dataset = get_dataset(options.dataset)
-    cases = spread(dataset.cases(options.root), options.limit)
-    check_cases(cases, options.evaluation)
-    tools = open_bench(options.evaluation)
-    whole = configuration(options.evaluation, dataset, cases, tools)
+    cases, tools, whole = open_evaluation(options.evaluation)
     config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
     config |= {"view": SIDE, "runs": options.runs, "base_runs": options.base_times}
     network = kind_of(options.base.base).network

@@ -14,7 +14,6 @@ from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.cells import NOT_RUN
-from spackle.evaluation.datasets import get_dataset
 from spackle.evaluation.figures import definitions
 from spackle.evaluation.pyiqa_metrics import NOTICE
 from spackle.evaluation.results import Record, Run
@@ -23,7 +22,7 @@ from spackle.formats import atomic_path, save_png
 from spackle.jobs.evaluate.case import Bench, examine, from_root
 from spackle.jobs.evaluate.options import EvaluateOptions, check_evaluate_options
 from spackle.jobs.evaluate.pictures import find_bench, picture_suffix, save_picture, source_of, write_report
-from spackle.jobs.evaluate.setup import check_cases, configuration, metrics_device, open_bench
+from spackle.jobs.evaluate.setup import metrics_device, open_evaluation
 from spackle.jobs.evaluate.store import (
     BEST,
     IMAGES,
@@ -60,22 +59,11 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         InputError: options, a dataset or a folder that cannot be used; another evaluation in `output`.
     """
     check_evaluate_options(options)
-    dataset = get_dataset(options.dataset)
-    cases = spread(dataset.cases(options.root), options.limit)
-    check_cases(cases, options)
-    bench = open_bench(options)
-    config = configuration(options, dataset, cases, bench)
+    cases, bench, config = open_evaluation(options)
     _say_what_is_missing(bench, reporter)
     with results_folder(output, (RESULTS, TIMES, WORST, BEST, *TABLES, *page(html))), alone_in(output, "evaluation"):
         begin(output, config)
         return _Evaluation(cases, output, bench, reporter, config, html).run()
-
-
-def spread(cases: Sequence[Case], limit: int | None) -> list[Case]:
-    """So many of them, evenly over their order; all where there is no limit."""
-    if limit is None or limit >= len(cases):
-        return list(cases)
-    return [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
 
 
 def _say_what_is_missing(bench: Bench, reporter: Reporter) -> None:

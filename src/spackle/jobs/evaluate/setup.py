@@ -14,6 +14,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, EvalDataset
+from spackle.evaluation.datasets import get_dataset
 from spackle.evaluation.figures import OWN
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.protocols import Gauges
@@ -33,7 +34,23 @@ from spackle.training.features import FeatureNet, load_features
 NO_FEATURES = "not run: weights: give SqueezeNet's with --features FILE"
 
 
-def open_bench(options: EvaluateOptions) -> Bench:
+def open_evaluation(options: EvaluateOptions) -> tuple[list[Case], Bench, dict[str, Any]]:
+    """A dataset's cases, what they share, and the configuration; InputError where one of them cannot be used."""
+    dataset = get_dataset(options.dataset)
+    cases = _spread(dataset.cases(options.root), options.limit)
+    _check_cases(cases, options)
+    bench = _open_bench(options)
+    return cases, bench, _configuration(options, dataset, cases, bench)
+
+
+def _spread(cases: Sequence[Case], limit: int | None) -> list[Case]:
+    """So many of them, evenly over their order; all where there is no limit."""
+    if limit is None or limit >= len(cases):
+        return list(cases)
+    return [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+
+
+def _open_bench(options: EvaluateOptions) -> Bench:
     """Load what all images share; networks of a base are loaded with the first image.
 
     Raises:
@@ -68,7 +85,7 @@ def open_bench(options: EvaluateOptions) -> Bench:
     )
 
 
-def configuration(
+def _configuration(
     options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case], bench: Bench
 ) -> dict[str, Any]:
     """Everything that decides the figures, ready for JSON; nothing of where files lie."""
@@ -102,7 +119,7 @@ def _residual_precision(base: PredictOptions) -> str | None:
     return str(pick_dtype(base.precision, torch.device("cpu"))).removeprefix("torch.")
 
 
-def check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
+def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
     """InputError where not one of them has what is needed."""
     where = f"{options.root}: {options.dataset}"
     if not cases:

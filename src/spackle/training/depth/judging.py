@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 from spackle.bases.lite.base import network_size
 from spackle.training.depth.augment import Frame
 from spackle.training.depth.losses import DepthLossWeights, depth_loss
-from spackle.training.depth.mixture import COARSER, DepthBatch
+from spackle.training.depth.mixture import DepthBatch
 from spackle.training.depth.score import score_depth, vertical_ramp
 
 MEASURES = ("abs_rel", "delta", "ramp_abs_rel", "loss", "factor", "line", "steps", "offset")
@@ -59,11 +59,7 @@ class DepthJudge:
     def _batch(self, frame: Frame) -> DepthBatch:
         """A frame at the size that the network sees."""
         height, width = frame.inverse_depth.shape
-        tall, wide = network_size(height, width, self.pixels)
-        rgb = interpolate(frame.rgb[None], size=(tall, wide), mode="bicubic", antialias=True).clamp(0, 1)
-        known = torch.stack([frame.inverse_depth, frame.valid.float()])[None]
-        inverse_depth, valid = interpolate(known, size=(tall // COARSER, wide // COARSER), mode="nearest-exact")[0]
-        return DepthBatch(rgb, inverse_depth[None], valid[None] > 0.5)
+        return DepthBatch.of([frame], network_size(height, width, self.pixels))
 
 
 def _at_size_of(frame: Frame, predicted: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.lite.network import STRIDE
+from spackle.bases.lite.base import scaled_size
 from spackle.training.depth.augment import MADE, MEASURED, Frame, Rng, Turning, mingled, relit, turned
 from spackle.training.depth.made import MadeScenes
 
@@ -69,6 +69,17 @@ class DepthBatch:
     inverse_depth: Tensor  # [B, H/2, W/2] in any unit
     valid: Tensor  # [B, H/2, W/2] bool
 
+    @staticmethod
+    def of(frames: Sequence[Frame], size: tuple[int, int]) -> DepthBatch:
+        """Frames of one size as a network of the input (height, width) sees them; depth is one of theirs, no mean."""
+        rgb, inverse_depth, valid = (
+            torch.stack([getattr(frame, field.name) for frame in frames]) for field in dataclasses.fields(Frame)
+        )
+        coarse = [side // COARSER for side in size]
+        known = interpolate(torch.stack([inverse_depth, valid.float()], 1), size=coarse, mode="nearest-exact")
+        rgb = interpolate(rgb, size=size, mode="bicubic", antialias=True).clamp(0, 1)
+        return DepthBatch(rgb, known[:, 0], known[:, 1] > 0.5)
+
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
@@ -87,16 +98,7 @@ class Mixture:
         height, width = self.size[::-1] if rng.random() < UPRIGHT else self.size
         scale = self.scales[int(rng.integers(len(self.scales)))]
         pictures = [self._picture(step, place, height, width)[1] for place in places]
-        rgb, inverse_depth, valid = (
-            torch.stack([getattr(picture, field.name) for picture in pictures]) for field in dataclasses.fields(Frame)
-        )
-        seen = [max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width)]
-        coarse = [side // COARSER for side in seen]
-        return DepthBatch(
-            interpolate(rgb, size=seen, mode="bicubic", antialias=True).clamp(0, 1),
-            interpolate(inverse_depth[:, None], size=coarse, mode="nearest-exact")[:, 0],
-            interpolate(valid[:, None].float(), size=coarse, mode="nearest-exact")[:, 0] > 0.5,
-        )
+        return DepthBatch.of(pictures, scaled_size(height, width, scale))
 
     def name(self, step: int, place: int) -> str:
         """Where the picture at a place of a step comes from."""

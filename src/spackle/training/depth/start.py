@@ -33,10 +33,11 @@ def first_network(recipe: LiteRecipe) -> LiteNet:
 
 def _network_of(path: Path, size: Size) -> LiteNet:
     """The network of this size in a file, the first where there are several."""
-    found = {network.encoder.size: network for network in reversed(load_networks(path, "a .safetensors file as init"))}
-    if size not in found:
-        raise InputError(f"{path}: has no network of the size {size}: add network={next(iter(found))}")
-    return found[size]
+    networks = load_networks(path, "a .safetensors file as init")
+    for network in networks:
+        if network.encoder.size == size:
+            return network
+    raise InputError(f"{path}: has no network of the size {size}: add network={networks[0].encoder.size}")
 
 
 @torch.no_grad()
