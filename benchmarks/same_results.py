@@ -1,0 +1,101 @@
+"""Hashes what a fixed set of commands writes, to hold two versions of the code against each other, bit for bit.
+
+    python benchmarks/same_results.py -o before.json
+    (change the code)
+    python benchmarks/same_results.py --against before.json
+
+The commands: `demo`, and `predict` of the demo's photo by lite (three given cameras; keyframes), by its depth in view
+mode, and by its depth without weights. Run both on one machine: the last bits depend on its processor and threads.
+Reports are compared without what differs between two runs of one version: times and the digest of the request.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from skimage.data import stereo_motorcycle
+
+WIDTH, HEIGHT, FOCAL = 640, 432, 860.0
+VARYING = ("seconds", "request")
+
+
+def write_inputs(folder: Path) -> None:
+    """Write the photo, its depth in metres, three cameras and a path of keyframes."""
+    left, _, disparity = stereo_motorcycle()
+    photo = Image.fromarray(left).resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC)
+    photo.save(folder / "photo.png")
+    depth = 994.978 * 0.193001 / (np.where(np.isfinite(disparity), disparity, 40) + 31.086)
+    small = Image.fromarray(depth.astype(np.float32)).resize((WIDTH, HEIGHT), Image.Resampling.NEAREST)
+    np.save(folder / "depth.npy", np.asarray(small))
+    K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
+    eyes = [(0.25, 0.0, 0.0), (-0.2, 0.1, 0.0), (0.1, -0.1, 0.15)]
+    frames = [
+        {"K": K, "world_to_camera": [[1, 0, 0, -x], [0, 1, 0, -y], [0, 0, 1, -z], [0, 0, 0, 1]]} for x, y, z in eyes
+    ]
+    (folder / "cameras.json").write_text(json.dumps({"width": WIDTH, "height": HEIGHT, "frames": frames}))
+    keyframes = [
+        {"time": time, "eye": eye, "target": [0, 0, 3]}
+        for time, eye in ((0.0, [0, 0, 0]), (0.4, [0.2, -0.1, 0.1]), (0.8, [-0.2, 0, 0]))
+    ]
+    (folder / "path.json").write_text(json.dumps({"keyframes": keyframes}))
+
+
+def commands(folder: Path) -> dict[str, list[str]]:
+    """Name of the output folder to the words of the command."""
+    photo = ["predict", "-i", f"{folder}/photo.png"]
+    depth = ["--depth", f"{folder}/depth.npy"]
+    return {
+        "demo": ["demo"],
+        "lite-cameras": [*photo, "--base", "lite", "--cameras", f"{folder}/cameras.json"],
+        "lite-path": [*photo, "--base", "lite", "--path", f"{folder}/path.json"],
+        "depth-view": [*photo, *depth, "--mode", "view", "--trajectory", "swipe", "--frames", "6"],
+        "depth-seeds": [*photo, *depth, "--residual", "seeds", "--frames", "6", "--stereo", "sbs", "--focal-px", "700"],
+    }
+
+
+def digest(file: Path) -> str:
+    """SHA-256 of a file; of a report without what varies between two runs."""
+    content = file.read_bytes()
+    if file.name == "report.json":
+        report = {key: value for key, value in json.loads(content).items() if key not in VARYING}
+        content = json.dumps(report, indent=2).encode()
+    return hashlib.sha256(content).hexdigest()
+
+
+def main() -> int:
+    """Run the commands, print each file's hash, and return 1 where one differs."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, help="write the hashes here, as JSON")
+    parser.add_argument("--against", type=Path, help="compare with these hashes")
+    options = parser.parse_args()
+    hashes: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        write_inputs(folder)
+        for run, words in commands(folder).items():
+            output = folder / run
+            command = [sys.executable, "-m", "spackle", *words, "-o", str(output)]
+            subprocess.run(command, check=True, capture_output=True)
+            for file in sorted(path for path in output.rglob("*") if path.is_file() and not path.name.startswith(".")):
+                hashes[str(file.relative_to(folder))] = digest(file)
+    before = json.loads(options.against.read_text()) if options.against else hashes
+    differing = [name for name in sorted({*before, *hashes}) if before.get(name) != hashes.get(name)]
+    for file_name, value in hashes.items():
+        print(f"{value[:16]}  {'DIFFERS  ' if file_name in differing else ''}{file_name}")
+    for file_name in sorted(set(before) - set(hashes)):
+        print(f"{'gone':16}  {file_name}")
+    if options.output:
+        options.output.write_text(json.dumps(hashes, indent=1) + "\n")
+    return int(bool(differing))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
