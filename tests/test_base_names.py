@@ -21,10 +21,10 @@ from spackle.bases.hf import HfBase
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
+from spackle.evaluation.setup import EvaluateOptions
 from spackle.image import Photo
 from spackle.jobs.bases import KINDS, base_files, public_name, says_of
 from spackle.jobs.bench.options import BenchOptions
-from spackle.jobs.evaluate.options import EvaluateOptions
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import shared_digest
 from spackle.pseudo.manifest import load_manifest

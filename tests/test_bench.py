@@ -19,12 +19,12 @@ from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.config import TINY
 from spackle.evaluation import efficiency, paper
 from spackle.evaluation import paper_efficiency as published
-from spackle.evaluation.cells import EMPTY
 from spackle.evaluation.efficiency import Clock, TimedBase, ViewBench, count_parameters, time_base
 from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import BASE_PATH, EXTRA, STAGES, Bill, ImageCost, ViewCost
 from spackle.evaluation.efficiency_tables import efficiency_tables
 from spackle.evaluation.protocols import large_views
+from spackle.evaluation.table import EMPTY
 from spackle.image import Photo
 from spackle.render import get_renderer
 from spackle.residual import Completer

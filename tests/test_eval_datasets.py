@@ -22,10 +22,9 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.alignment import SAME, align, to_base
-from spackle.evaluation.case import Case, Points
+from spackle.evaluation.case import Case, Points, dense_cells, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, get_dataset
-from spackle.evaluation.datasets.sampling import spread
-from spackle.evaluation.load import dense_cells, known_depth, load_case
+from spackle.evaluation.datasets.multiview import spread
 from spackle.image import working_size
 
 Array = NDArray[Any]

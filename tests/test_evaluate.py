@@ -26,17 +26,15 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation import paper
-from spackle.evaluation.case import Case
-from spackle.evaluation.load import LoadedCase, load_case
+from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.methods import Shot, make_method
-from spackle.evaluation.metrics import psnr, reduction, ssim, ssim_map
+from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
-from spackle.evaluation.pyiqa_metrics import DEFINITIONS, NOT_INSTALLED, open_metrics
 from spackle.evaluation.results import Mean, Record, Row
 from spackle.evaluation.results import Run as Results
+from spackle.evaluation.run import problem_of
 from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
-from spackle.jobs.evaluate.run import problem_of
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.trajectory import DepthRange, max_offset
@@ -467,7 +465,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
     ]
     code = (
         "import os, sys\n"
-        "from spackle.jobs.evaluate import run as job\n"
+        "from spackle.evaluation import run as job\n"
         "save = job.save_record\n"
         "def once(*rest):\n"
         "    save(*rest)\n"
@@ -543,7 +541,7 @@ def test_a_second_photo_that_is_broken_is_a_remark(
         lack = f"{scenes}/Chair/third.png: not\nan image"
         return dataclasses.replace(load(case), lacks=(lack,) if case.name == "Chair" else ())
 
-    monkeypatch.setattr("spackle.jobs.evaluate.case.load_case", lacking)
+    monkeypatch.setattr("spackle.evaluation.run.load_case", lacking)
     done = evaluate(scenes, tmp_path, "--protocol", "near-view", "--methods", "base", "--metrics", "none")
     assert done.code == 0, done.err
     remark = "without one of its second photos: Chair/third.png: not an image"

@@ -16,8 +16,9 @@ from command import names_in, run
 
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
+from spackle.evaluation.results import begin
 from spackle.evaluation.suite.tables import TITLES
-from spackle.jobs.evaluate.store import KINDS, begin
+from spackle.jobs.bases import KINDS
 
 SIDE = 64
 

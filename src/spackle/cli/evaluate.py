@@ -85,8 +85,8 @@ def evaluate(
     verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image takes.")] = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
-    from spackle.jobs.evaluate.options import EvaluateOptions, parse_disparities, split_words
-    from spackle.jobs.evaluate.run import evaluate as run
+    from spackle.evaluation.run import evaluate as run
+    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.jobs.progress import Reporter
 
     options = EvaluateOptions(
@@ -118,7 +118,7 @@ def tables(
     html: Annotated[bool, typer.Option("--html", help="Write T/report.html too: one page with all of it.")] = False,
 ) -> None:
     """Put several evaluations into the same tables: tables.md and tables.tex."""
-    from spackle.jobs.evaluate.tables import merge_tables
+    from spackle.evaluation.run import merge_tables
     from spackle.jobs.progress import Reporter
 
     merge_tables(results, output, Reporter(), html)
@@ -174,11 +174,11 @@ def bench(
 
     With --suite: time every stage beside the least it could take, without a dataset: suite.json, suite.md, scaling.svg.
     """
+    from spackle.evaluation.setup import parse_disparities
     from spackle.jobs.bench.images import bench as run
     from spackle.jobs.bench.options import BenchOptions
     from spackle.jobs.bench.suite import bench_suite
     from spackle.jobs.bench.suite_options import check_choice, suite_options
-    from spackle.jobs.evaluate.options import parse_disparities
     from spackle.jobs.progress import Reporter
 
     given = _given(context)

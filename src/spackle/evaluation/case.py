@@ -1,4 +1,7 @@
-"""What a dataset is to an evaluation: photos, and what is known beside them."""
+"""What a dataset is to an evaluation: photos, and what is known beside them.
+
+A case's photos at the working size, with their cameras.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from spackle.bases.depth_maps import DepthMap
 from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.image import MAX_SIDE, Photo, load_photo, resize_photo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,3 +66,117 @@ class EvalDataset(Protocol):
             InputError: folders that are not this dataset's; says what was expected where.
         """
         ...
+
+
+SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
+LENS_SOURCE = "dataset"
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedView:
+    """A true second photo."""
+
+    name: str
+    rgb: Tensor  # [H, W, 3] sRGB in 0..1, both sides even
+    camera: Camera  # of these pixels, in the input photo's frame and the dataset's lengths
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedCase:
+    """A case whose photos have been read."""
+
+    case: Case
+    full: Photo  # the input as it is stored, with the dataset's focal length: for bases that look at all its pixels
+    photo: Photo  # the input at the working size
+    camera: Camera  # of `photo`, at the world's origin: the dataset's, or the photo's own where that has none
+    seconds: tuple[LoadedView, ...]
+    lacks: tuple[str, ...] = ()  # why second photos of the case are not among them
+
+    @property
+    def cells(self) -> int:
+        """Of a view of the photo's size, see `dense_cells`."""
+        return dense_cells(self.photo.width, self.photo.height)
+
+
+def dense_cells(width: int, height: int) -> int:
+    """Cells of 2×2 pixels in a picture whose sides are made even: the paper's dense count."""
+    return (width + 1) // 2 * ((height + 1) // 2)
+
+
+def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
+    """Read the photos of a case.
+
+    Photos are brought to `working_size`, as everywhere, and cameras with them. The last row or column of a second
+    photo with an odd side is cut off: views have even sides, and there are no true pixels to add.
+
+    A second photo that cannot be used is left out: the others are as true without it.
+
+    Raises:
+        InputError: a file that is missing or no image, or one of another shape than its camera; of second photos,
+            where that is so of all.
+    """
+    if case.problem is not None:
+        raise InputError(case.problem)
+    full = load_photo(case.photo)
+    if case.camera is not None:
+        check_shape(case.photo, full, case.camera)
+        focal = case.camera.resized(full.width, full.height).focal[0]
+        full = dataclasses.replace(full, focal_px=focal, focal_source=LENS_SOURCE)
+    photo = resize_photo(full, max_side)
+    camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
+    seconds, lacks = _load_views(case, max_side)
+    camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+    return LoadedCase(case, full, photo, camera, tuple(seconds), tuple(lacks))
+
+
+def known_depth(case: Case) -> DepthMap:
+    """A case's depth map; else its points as one with gaps, each in its pixel of the case's camera, the nearest first.
+
+    Raises:
+        InputError: the case has neither, or a file of it cannot be used.
+    """
+    if case.depth is not None:
+        return case.depth()
+    if case.points is None or case.camera is None:
+        raise InputError(f"{case.name}: has no depth map and no points, of which --base rgbd takes either")
+    points, camera = case.points(), case.camera
+    column, row = points.uv.floor().long().unbind(-1)
+    inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height) & (points.z > 0)
+    order = points.z[inside].argsort(descending=True, stable=True)  # what is written last stays
+    depth = torch.zeros(camera.height, camera.width)
+    depth[row[inside][order], column[inside][order]] = points.z[inside][order].float()
+    if not bool((depth > 0).any()):
+        raise InputError(f"{case.name}: not one of its {len(points.z)} points lies in the photo")
+    return DepthMap(depth, depth > 0, camera.K, None, "depth", case.photo)
+
+
+def check_shape(path: Path, photo: Photo, camera: Camera) -> None:
+    """InputError unless the photo has the shape that its camera was calibrated for."""
+    if abs(photo.width * camera.height / (photo.height * camera.width) - 1) > SHAPE_TOLERANCE:
+        raise InputError(
+            f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
+            f"{camera.width}×{camera.height}: the photo was cropped or turned, unpack it again"
+        )
+
+
+def _load_views(case: Case, max_side: int) -> tuple[list[LoadedView], list[str]]:
+    """The second photos, and what is wrong with those that cannot be used; InputError where that is all."""
+    seconds, lacks = [], []
+    for view in case.seconds:
+        try:
+            seconds.append(_load_view(view.name, view.photo, view.camera, max_side))
+        except InputError as error:
+            lacks.append(str(error))
+    if lacks and not seconds:
+        raise InputError(lacks[0])
+    return seconds, lacks
+
+
+def _load_view(name: str, path: Path, camera: Camera, max_side: int) -> LoadedView:
+    stored = load_photo(path)
+    check_shape(path, stored, camera)
+    photo = resize_photo(stored, max_side)
+    camera = camera.resized(photo.width, photo.height)
+    width, height = (max(1, side - side % 2) for side in (photo.width, photo.height))
+    rgb = photo.rgb[:height, :width].contiguous()
+    return LoadedView(name, rgb, dataclasses.replace(camera, width=width, height=height))

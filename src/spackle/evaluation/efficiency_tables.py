@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 from spackle.evaluation import paper
 from spackle.evaluation import paper_efficiency as published
-from spackle.evaluation.cells import PAPER_ROW, count_text
 from spackle.evaluation.efficiency import Parameters
 from spackle.evaluation.efficiency_cells import (
     base_title,
@@ -21,6 +20,7 @@ from spackle.evaluation.efficiency_cells import (
 from spackle.evaluation.efficiency_results import Bill
 from spackle.evaluation.efficiency_stages import parameters_table, stages_table
 from spackle.evaluation.table import EMPTY, Line, Table
+from spackle.evaluation.tables import PAPER_ROW, count_text
 
 Cells = tuple[str, ...]
 

@@ -1,13 +1,110 @@
-"""Figures of a view that need no network: what is covered, and how far a picture is from the truth."""
+"""The metrics that can be asked for: what they are called, and exactly what they are.
+
+Figures of a view that need no network: what is covered, and how far a picture is from the truth.
+
+Published quality metrics by way of pyiqa (optional: pip install 'spackle-nvs[eval]'; not for commercial use).
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import io
 import math
+import socket
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from spackle.errors import reason_in_a_line
 from spackle.training.distance import hole_psnr
+
+OWN = "own"
+
+
+@dataclasses.dataclass(frozen=True)
+class Definition:
+    """Exactly which variant of a metric is meant."""
+
+    call: str  # pyiqa's name of it
+    says: str  # for the tables' captions
+    options: tuple[tuple[str, Any], ...]  # pinned, whatever another release has for defaults
+
+
+DEFINITIONS: dict[str, Definition] = {
+    "clipiqa": Definition(
+        "clipiqa",
+        "CLIP RN50 without positional embedding at the picture's own size; mean over the prompt pairs Good/bad image, "
+        "Sharp/blurry image, sharp/blurry edges, High/low resolution image, Noise-free/noisy image",
+        (("model_type", "clipiqa"), ("backbone", "RN50"), ("pos_embedding", False)),
+    ),
+    "niqe": Definition(
+        "niqe",
+        "on the float render, of which pyiqa rounds the luma (YIQ) to 0..255; blocks of 96×96, "
+        "the pristine model of the authors' release",
+        (("test_y_channel", True),),
+    ),
+    "musiq": Definition(
+        "musiq", "trained on KonIQ-10k; scales 224, 384 and the picture's own", (("pretrained", "koniq10k"),)
+    ),
+    "dists": Definition("dists", "VGG16 with the authors' weights, at the picture's own size", ()),
+    "lpips": Definition(
+        "lpips",
+        "AlexNet, version 0.1, at the picture's own size (the paper does not say which network it took)",
+        (("net", "alex"), ("version", "0.1")),
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """A metric of a view."""
+
+    title: str  # with the direction that is better
+    says: str  # its definition, for captions
+    lower: bool  # is better
+    digits: int
+    truth: bool  # needs a true second view
+
+    def text(self, value: float) -> str:
+        return f"{value:.{self.digits}f}"
+
+
+METRICS: dict[str, Figure] = {
+    "clipiqa": Figure("CLIPIQA ↑", DEFINITIONS["clipiqa"].says, False, 4, False),
+    "niqe": Figure("NIQE ↓", DEFINITIONS["niqe"].says, True, 4, False),
+    "musiq": Figure("MUSIQ ↑", DEFINITIONS["musiq"].says, False, 4, False),
+    "psnr": Figure("PSNR ↑", "in dB over sRGB pixels and channels in 0..1", False, 2, True),
+    "ssim": Figure(
+        "SSIM ↑", "Gaussian window of 11 pixels, σ 1.5, K 0.01 and 0.03, mean of the sRGB channels", False, 4, True
+    ),
+    "distance": Figure(
+        "distance ↓",
+        "masked perceptual distance in the hole: SqueezeNet 1.0 at conv1, fire4, fire8 and fire9, unit feature "
+        "vectors, 0 to 8 (spackle.training.distance.hole_distance); not LPIPS",
+        True,
+        4,
+        True,
+    ),
+    "dists": Figure("DISTS ↓", DEFINITIONS["dists"].says, True, 4, True),
+    "lpips": Figure("LPIPS ↓", DEFINITIONS["lpips"].says, True, 4, True),
+}
+
+PROTOCOLS = ("large-view", "near-view")
+DEFAULT_METRICS = {
+    "large-view": ("clipiqa", "niqe", "musiq"),
+    "near-view": ("psnr", "ssim", "distance", "dists", "lpips"),
+}
+SPLIT = ("psnr", "ssim")  # measured over the image, in the base's hole and outside of it
+
+
+def definitions(names: tuple[str, ...]) -> list[str]:
+    """A sentence for each metric."""
+    return [f"{METRICS[name].title[:-2]}: {METRICS[name].says}." for name in names]
+
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM, in pixels (Wang et al. 2004)
 C1, C2 = 0.01**2, 0.03**2  # its constants K1 = 0.01, K2 = 0.03, for values in 0..1
@@ -92,3 +189,99 @@ def _mirrored(size: int, reach: int) -> Tensor:
     """Indices -reach..size+reach folded back into 0..size: d c b a | a b c d | d c b a."""
     folded = torch.arange(-reach, size + reach) % (2 * size)
     return torch.where(folded < size, folded, 2 * size - 1 - folded)
+
+
+NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
+NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
+
+Metric = Callable[[Tensor, Tensor | None], float]  # (picture, truth), [H, W, 3] sRGB 0..1 each, to a score
+
+
+@dataclasses.dataclass(frozen=True)
+class Opened:
+    """The metrics that can run here, and why the others cannot."""
+
+    metrics: dict[str, Metric]
+    missing: dict[str, str]
+    version: str | None  # pyiqa's
+
+
+def open_metrics(names: Sequence[str], device: str, download: bool) -> Opened:
+    """Load metrics by their names in `DEFINITIONS`; what is missing is no error.
+
+    Args:
+        names: which ones; none leaves pyiqa alone.
+        device: "cpu" or "cuda".
+        download: let pyiqa fetch weights that are not here; otherwise it is kept off the network while it looks.
+    """
+    metrics: dict[str, Metric] = {}
+    missing: dict[str, str] = {}
+    if not names:
+        return Opened(metrics, missing, None)
+    try:
+        pyiqa = _import()
+    except Exception as error:
+        return Opened(metrics, {name: _why_not(error) for name in names}, None)
+    for name in names:
+        attempts: list[str] = []
+        try:
+            with _quiet(), contextlib.nullcontext() if download else _off_the_network(attempts):
+                metrics[name] = _open(pyiqa, DEFINITIONS[name], device)
+        except Exception as error:  # whatever a stranger's package raises is one line of the report
+            missing[name] = (
+                "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
+                if attempts
+                else f"pyiqa cannot load it: {reason_in_a_line(error)}"
+            )
+    return Opened(metrics, missing, str(getattr(pyiqa, "__version__", "unknown")))
+
+
+def _import() -> Any:
+    with _quiet():
+        import pyiqa
+    return pyiqa
+
+
+def _why_not(error: Exception) -> str:
+    """torchvision, which pyiqa needs, raises RuntimeError where it is not the one of the installed torch."""
+    if isinstance(error, ModuleNotFoundError) and error.name == "pyiqa":
+        return NOT_INSTALLED
+    return f"pyiqa cannot be imported: {reason_in_a_line(error)}"
+
+
+def _open(pyiqa: Any, definition: Definition, device: str) -> Metric:
+    """A metric that gives one number; NaN is passed on for the caller to count."""
+    network = pyiqa.create_metric(definition.call, device=torch.device(device), **dict(definition.options))
+
+    def measure(picture: Tensor, truth: Tensor | None = None) -> float:
+        images = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in (picture, truth) if image is not None]
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return float(network(*images))
+
+    return measure
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """pyiqa and what it is made of print, log and warn while they load."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@contextlib.contextmanager
+def _off_the_network(attempts: list[str]) -> Iterator[None]:
+    """Refuse to look up any host, and note the attempts: every way to download begins with that."""
+    lookup = socket.getaddrinfo
+
+    def refuse(host: Any, *rest: Any, **more: Any) -> Any:
+        attempts.append(str(host))
+        raise OSError("no download without leave")
+
+    socket.getaddrinfo = refuse
+    try:
+        yield
+    finally:
+        socket.getaddrinfo = lookup

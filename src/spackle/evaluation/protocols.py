@@ -12,10 +12,8 @@ from torch import Tensor
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.errors import reason_in_a_line
-from spackle.evaluation.figures import METRICS
 from spackle.evaluation.methods import Method, Shot, View
-from spackle.evaluation.metrics import psnr, ssim_average, ssim_map
-from spackle.evaluation.pyiqa_metrics import Metric
+from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.results import Row
 from spackle.render import Renderer
 from spackle.rendering import Rendering

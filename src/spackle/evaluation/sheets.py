@@ -12,8 +12,8 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from spackle.evaluation.figures import METRICS
 from spackle.evaluation.methods import METHODS
+from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.results import Record, Run
 
 SIDE = 320  # pixels of a thumbnail's longer side

@@ -6,11 +6,8 @@ import difflib
 
 from spackle.errors import InputError
 from spackle.evaluation.case import EvalDataset
-from spackle.evaluation.datasets.booster import Booster
-from spackle.evaluation.datasets.eth3d import Eth3d
-from spackle.evaluation.datasets.llff import Llff
-from spackle.evaluation.datasets.middlebury import Middlebury
-from spackle.evaluation.datasets.tanks import Tanks
+from spackle.evaluation.datasets.reconstructions import Eth3d, Llff, Tanks
+from spackle.evaluation.datasets.stereo import Booster, Middlebury
 from spackle.evaluation.datasets.wildrgbd import WildRgbd
 
 __all__ = ["DATASETS", "get_dataset"]

@@ -1,10 +1,18 @@
-"""Rectified pairs: Middlebury's calib.txt, and disparities as depth."""
+"""Rectified pairs: Middlebury's calib.txt, and disparities as depth.
+
+Middlebury stereo: the sets of 2014, and of 2001, 2003, 2005 and 2006.
+
+Booster: stereo at 12 megapixels of scenes with glass and mirrors.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import re
-from collections.abc import Callable
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +22,9 @@ from numpy.typing import NDArray
 
 from spackle.bases.depth_maps import DepthMap, load_depth
 from spackle.camera import Camera
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case, SecondView
+from spackle.evaluation.datasets.folders import by_name, photo_files, scene_folders
 from spackle.image import check_file, read_image
 
 MAX_TEXT_BYTES = 1 << 16
@@ -148,3 +157,193 @@ def read_levels(path: Path) -> NDArray[Any]:
         return values if values.ndim == 2 else values[..., 0]  # grey that was saved as colour
 
     return read_image(path, levels)
+
+
+# Published for the sets of 2005 and 2006 at full size, height 1110; nearly exact, the site says.
+FOCAL_2006, BASELINE_2006, HEIGHT_2006 = 3740.0, 0.160, 1110
+# Of the sets of 2001 and 2003 only the disparities are known. Any lens makes the pair exact, with its own depth; these
+# numbers, for 450 pixels of width, give depths like those of the later sets.
+FOCAL_OLD, BASELINE_OLD, DOFFS_OLD, WIDTH_OLD = 1000.0, 0.1, 30.0, 450
+SCALE_2001 = 8  # grey levels a pixel of disparity
+WIDTH_2003_FULL = 1800  # Cones and Teddy: 450, 900 or 1800 wide, 4, 2 or 1 grey levels a pixel
+LIGHT_2006 = "Illum2/Exp1"  # in the archives with seven views and all lights
+
+
+class Middlebury:
+    """Rectified pairs with dense truth; the second view is the true right photo.
+
+    Scene folders, at any depth below the root: `im0.png` with `calib.txt` (2014 at full size, and MiddEval3 at full,
+    half or quarter size); `view1.png` with `disp1.png` and `dmin.txt` (2005, 2006); `im2.ppm` with `disp2.pgm`, or
+    the same as PNG (2001, 2003); or a `scene.json`. Of `Piano-perfect` and `Piano-imperfect` the first is taken.
+    Test scenes, which have no truth, are passed over. The paper's 23 are those of 2014. MiddEval3's three sizes have
+    the same names: give `trainingF`, `trainingH` or `trainingQ` alone.
+    """
+
+    name = "middlebury"
+    title = "Middlebury"
+    terms = "free to use, cite"
+    paper_images = 23
+
+    def cases(self, root: Path) -> Sequence[Case]:
+        """One case for each scene; see `EvalDataset`."""
+        folders = scene_folders(root, self.name)
+        perfect = {folder.name for folder in folders}
+        kept = [f for f in folders if f.name.replace("-imperfect", "-perfect") not in perfect - {f.name}]
+        return [_case(folder) for folder in by_name(kept).values()]
+
+
+def _case(folder: Path) -> Case:
+    try:
+        return _readable(folder)
+    except BrokenPhoto as error:
+        return Case(folder.name, folder, problem=str(error))
+
+
+def _readable(folder: Path) -> Case:
+    if (folder / "calib.txt").is_file() or (folder / "im0.png").is_file():
+        return pair_of_2014(folder)
+    if (folder / "scene.json").is_file():
+        return _described(folder)
+    if (folder / "disp1.png").is_file() or (folder / "view1.png").is_file():
+        return _of_2006(folder)
+    return _of_2003(folder)
+
+
+def _of_2006(folder: Path) -> Case:
+    """Grey level 0 is unknown; levels and dmin are pixels of the full size."""
+    photos = folder if (folder / "view1.png").is_file() else folder / LIGHT_2006
+    left, right, truth = photos / "view1.png", photos / "view5.png", folder / "disp1.png"
+    width, height = picture_size(left)
+    shrink = round(HEIGHT_2006 / height)
+    if abs(height * shrink - HEIGHT_2006) > shrink or not 1 <= shrink <= 3:
+        raise InputError(f"{left}: {height} pixels high: expected 1110, 555 or 370, as the sets of 2005 and 2006 are")
+    try:
+        dmin = float(read_text(folder / "dmin.txt", "offset of the disparities"))
+    except ValueError as error:
+        raise InputError(f"{folder / 'dmin.txt'}: not a number: unpack the scene again") from error
+    lens = FOCAL_2006 / shrink, width / 2, height / 2
+    pair = make_pair(lens, dmin / shrink, BASELINE_2006, (width, height))
+    return pair.case(folder.name, (left, right), lambda: _levels(pair, truth, 1 / shrink), metric=True)
+
+
+def _of_2003(folder: Path) -> Case:
+    """Also 2001: grey level 0 is unknown; the width tells how many levels a pixel has."""
+    suffix = ".ppm" if (folder / "im2.ppm").is_file() else ".png"
+    left, right = folder / f"im2{suffix}", folder / f"im6{suffix}"
+    truth = next((folder / name for name in ("disp2.pgm", "disp2.png") if (folder / name).is_file()), None)
+    if truth is None:
+        raise InputError(f"{folder}: no disp2.pgm or disp2.png: unpack the whole scene")
+    at = truth
+    width, height = picture_size(left)
+    scale = WIDTH_2003_FULL // width if width in (450, 900, 1800) else SCALE_2001
+    size = width / WIDTH_OLD
+    lens = FOCAL_OLD * size, width / 2, height / 2
+    pair = make_pair(lens, DOFFS_OLD * size, BASELINE_OLD, (width, height))
+    return pair.case(folder.name, (left, right), lambda: _levels(pair, at, 1 / scale), metric=False)
+
+
+def _levels(pair: Pair, path: Path, unit: float) -> DepthMap:
+    stored = read_levels(path)
+    return pair.depth(stored, stored > 0, unit, path)
+
+
+def _described(folder: Path) -> Case:
+    """By a `scene.json`, whose principal point has pixel centres at half-integers; its lengths may be nominal."""
+    path = folder / "scene.json"
+    try:
+        facts = json.loads(read_text(path, "scene description"))
+        left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
+        focal, cx, cy, doffs, baseline = (float(facts[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise InputError(
+            f"{path}: not a scene description: needs the photos, the disparity map and the lens"
+        ) from error
+    pair = make_pair((focal, cx, cy), doffs, baseline, picture_size(left))
+    return pair.case(folder.name, (left, right), lambda: load_depth(truth, calib=path), metric=False)
+
+
+CALIBRATION = "calib_00-02.xml"
+
+
+class Booster:
+    """The balanced training scenes: each photo of the left camera (one a light) is a case.
+
+    `train/balanced/SCENE/camera_00/im*.png` at 4112×3008, the right photo of the same name in `camera_02`, one
+    `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres) for all lights.
+    The test scenes have no truth, and the unbalanced ones another right camera: both are passed over.
+    At the working size the photos are 1536×1124: the paper's 431,616 cells.
+    """
+
+    name = "booster"
+    title = "Booster"
+    terms = "research, cite; see its page"
+    paper_images = 228
+
+    def cases(self, root: Path) -> Sequence[Case]:
+        """One case for each photo of a left camera; see `EvalDataset`."""
+        return [case for scene in by_name(scene_folders(root, self.name)).values() for case in _cases(scene)]
+
+
+def _cases(scene: Path) -> list[Case]:
+    photos = photo_files(scene / "camera_00")
+    if not photos:
+        raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
+    try:
+        size = _first_size(photos)
+    except BrokenPhoto as error:
+        return [Case(f"{scene.name}/{photo.stem}", photo, problem=str(error)) for photo in photos]
+    pair = _pair(scene / CALIBRATION, size)
+    truth = scene / "disp_00.npy"
+    if not truth.is_file():
+        raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
+
+    def depth() -> DepthMap:
+        stored = _read(truth)
+        return pair.depth(stored, np.isfinite(stored) & (stored > 0), 1.0, truth)
+
+    def case(photo: Path) -> Case:
+        right = scene / "camera_02" / photo.name
+        return pair.case(f"{scene.name}/{photo.stem}", (photo, right), depth, metric=True)
+
+    return [case(photo) for photo in photos]
+
+
+def _first_size(photos: Sequence[Path]) -> tuple[int, int]:
+    """Of the first photo that can be read: all of a scene are of one size."""
+    for photo in photos[:-1]:
+        with contextlib.suppress(BrokenPhoto):
+            return picture_size(photo)
+    return picture_size(photos[-1])
+
+
+def _pair(path: Path, size: tuple[int, int]) -> Pair:
+    text = read_text(path, "calibration")
+    try:
+        entries = {entry.tag: entry for entry in ElementTree.fromstring(text)}
+        left, right = (_matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
+        baseline = float(entries["baselineLR"].text or "") / 1000
+        focal, cx, cy = float(left[0, 0]), float(left[0, 2]), float(left[1, 2])
+        if not (focal > 0 and baseline > 0):
+            raise ValueError("focal length and baseline must be positive")
+    except (ElementTree.ParseError, KeyError, ValueError, IndexError) as error:
+        raise InputError(
+            f"{path}: not a Booster calibration ({reason_in_a_line(error)}): needs proj_matL, proj_matR and baselineLR"
+        ) from error
+    return make_pair((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), float(right[0, 2]) - cx, baseline, size)
+
+
+def _matrix(entry: ElementTree.Element) -> NDArray[np.float64]:
+    """OpenCV's <rows>, <cols>, <data>."""
+    rows, columns = (int(entry.findtext(name, "")) for name in ("rows", "cols"))
+    return np.array(entry.findtext("data", "").split(), np.float64).reshape(rows, columns)
+
+
+def _read(path: Path) -> NDArray[Any]:
+    """Float disparities [H, W]; nothing is unpickled."""
+    try:
+        stored: NDArray[Any] = np.load(path, allow_pickle=False)
+    except Exception as error:  # NumPy at work on a stranger's bytes raises anything
+        raise InputError(f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged") from error
+    if stored.ndim != 2 or stored.dtype.kind != "f":
+        raise InputError(f"{path}: {stored.dtype} of shape {stored.shape}: expected disparities as floats, [H, W]")
+    return stored

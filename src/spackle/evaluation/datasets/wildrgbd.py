@@ -17,8 +17,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.folders import by_name, scene_folders
-from spackle.evaluation.datasets.multiview import Posed, check_two, make_case, near_views
-from spackle.evaluation.datasets.sampling import frames_of, spread
+from spackle.evaluation.datasets.multiview import Posed, check_two, frames_of, make_case, near_views, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL, read_text
 
 MAX_POSES_BYTES = 1 << 24

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from spackle.evaluation.cells import ratio_text
-from spackle.evaluation.figures import METRICS
+from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.report.markup import Html, joined, tag
 from spackle.evaluation.report.pictures import data_address, size_of
 from spackle.evaluation.report.summary import percent
 from spackle.evaluation.results import Record, Row, Run
 from spackle.evaluation.sheets import column_title
+from spackle.evaluation.tables import ratio_text
 
 # Columns beside a picture, in this order, where they were measured.
 COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {

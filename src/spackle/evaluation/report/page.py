@@ -7,7 +7,6 @@ from importlib import resources
 from typing import Any
 
 from spackle.evaluation import paper
-from spackle.evaluation.cells import method_name
 from spackle.evaluation.report.gallery import gallery
 from spackle.evaluation.report.markup import Html, joined, tag
 from spackle.evaluation.report.plots import plots_of
@@ -15,6 +14,7 @@ from spackle.evaluation.report.source import Source
 from spackle.evaluation.report.summary import findings
 from spackle.evaluation.report.tables import facts_html, table_html
 from spackle.evaluation.table import Table
+from spackle.evaluation.tables import method_name
 
 # Nothing is fetched from anywhere, whatever a name in the results says.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"

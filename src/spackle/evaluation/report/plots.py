@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from spackle.evaluation import paper
-from spackle.evaluation.cells import method_name, percent_text, ratio_text
-from spackle.evaluation.large_tables import ADDING, FILLING
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.report.axes import linear, percent_decades
 from spackle.evaluation.report.markup import Html
 from spackle.evaluation.report.svg import Point, Series, dot_rows, scatter, spread
 from spackle.evaluation.results import Run
 from spackle.evaluation.sheets import UP, mean_of
+from spackle.evaluation.tables import ADDING, FILLING, method_name, percent_text, ratio_text
 
 FORMS = {
     "base": "circle",

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from spackle.evaluation.cells import count_text
 from spackle.evaluation.methods import METHODS
-from spackle.evaluation.near_tables import NEAR
 from spackle.evaluation.results import Run
+from spackle.evaluation.tables import NEAR, count_text
 
 HEADLINES = {  # figures of near views: what they are, their unit, digits
     "psnr_hole": ("PSNR in the hole, higher is better", " dB", 2),

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from spackle.evaluation.cells import NOT_RUN, PAPER_ROW
 from spackle.evaluation.report.markup import Html, escaped, joined, tag
 from spackle.evaluation.table import BEST, EMPTY, Line, Table
+from spackle.evaluation.tables import NOT_RUN, PAPER_ROW
 
 TITLES = {
     "tab:large_view_nr_iqa": "Quality of large views, without a truth",

@@ -8,14 +8,13 @@ import os
 from spackle.bases.protocol import Base
 from spackle.bases.rgbd import RgbdBase
 from spackle.errors import InputError
-from spackle.evaluation.case import Case
+from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.efficiency import Clock, ViewBench, time_base
 from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import ImageCost
-from spackle.evaluation.load import LoadedCase, load_case
 from spackle.evaluation.protocols import large_views
+from spackle.evaluation.setup import Bench
 from spackle.jobs.bench.options import BenchOptions
-from spackle.jobs.evaluate.case import Bench
 
 
 def time_image(case: Case, options: BenchOptions, tools: Bench, clock: Clock, warm: bool) -> ImageCost:

@@ -17,14 +17,13 @@ from spackle.evaluation.efficiency import Clock, Parameters, count_parameters
 from spackle.evaluation.efficiency_cells import SIDE
 from spackle.evaluation.efficiency_results import Bill, ImageCost
 from spackle.evaluation.efficiency_tables import efficiency_tables
+from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write_text
+from spackle.evaluation.run import inputs_digest, problem_of
+from spackle.evaluation.setup import Bench, metrics_device, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.jobs.bases import kind_of
 from spackle.jobs.bench.image import time_image
 from spackle.jobs.bench.options import BenchOptions, check_bench_options
-from spackle.jobs.evaluate.case import Bench
-from spackle.jobs.evaluate.run import inputs_digest, problem_of
-from spackle.jobs.evaluate.setup import metrics_device, open_evaluation
-from spackle.jobs.evaluate.store import IMAGES, begin, stem_of, write_json, write_text
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from spackle.errors import InputError
 from spackle.evaluation.paper import DISPARITIES
+from spackle.evaluation.setup import BASE, EvaluateOptions, check_evaluate_options
 from spackle.jobs.bases import kind_of
-from spackle.jobs.evaluate.options import BASE, EvaluateOptions, check_evaluate_options
 from spackle.jobs.options import PredictOptions
 
 MAX_RUNS = 1000

@@ -15,6 +15,7 @@ import torch
 
 import spackle
 from spackle.errors import InputError
+from spackle.evaluation.results import begin, write_json, write_text
 from spackle.evaluation.suite.limits import Peaks
 from spackle.evaluation.suite.plot import scaling_svg
 from spackle.evaluation.suite.tables import GPU_LIMITS, LIMITS, TITLES, row_limits, suite_tables, targets
@@ -23,7 +24,6 @@ from spackle.evaluation.table import to_markdown
 from spackle.jobs.bench.suite_options import SuiteOptions, check_suite_options
 from spackle.jobs.bench.suite_sections import Sections
 from spackle.jobs.dataset.options import weights_digest
-from spackle.jobs.evaluate.store import begin, write_json, write_text
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions, without_nan
 from spackle.jobs.progress import Reporter

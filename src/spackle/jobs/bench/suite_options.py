@@ -9,10 +9,10 @@ import torch
 
 from spackle.bases.sharp.base import check_windows
 from spackle.errors import InputError
+from spackle.evaluation.setup import BASE, split_words
 from spackle.evaluation.suite.scenes import SIDE
 from spackle.evaluation.suite.tables import TITLES
 from spackle.jobs.bench.options import MAX_RUNS
-from spackle.jobs.evaluate.options import BASE, split_words
 from spackle.jobs.names import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
 

@@ -1,0 +1,236 @@
+"""ETH3D: high-resolution photos with COLMAP models in metres, and rectified grey pairs.
+
+Tanks and Temples: video frames of large scenes, with COLMAP models.
+
+LLFF: eight scenes, photographed by hand from a grid of places that face them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from spackle.camera import Camera
+from spackle.errors import InputError, reason_in_a_line
+from spackle.evaluation.case import Case
+from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
+from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
+from spackle.evaluation.datasets.multiview import Posed, check_two, frames_of, make_case, near_views, posed_by, spread
+from spackle.evaluation.datasets.stereo import TRUTHS_2014, pair_of_2014
+
+CALIBRATION = "dslr_calibration_undistorted"
+
+
+class Eth3d:
+    """The undistorted DSLR photos of the training scenes, or the two-view scenes.
+
+    Multi-view: `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and
+    `SCENE/images/dslr_images_undistorted/*.JPG`. The model is metric (it was aligned to laser scans); its sparse points
+    give the scale. The dense truth is of the distorted photos, and not used. Second views: see `near_views`. The
+    paper's 454 images are the 13 training scenes'.
+
+    Two-view: `SCENE_1l/im0.png`, `im1.png`, `calib.txt`, and the truth beside them or, as it is unpacked, in
+    `two_view_training_gt/SCENE_1l`. A root with both kinds gives both; give the folder of one of them alone.
+    """
+
+    name = "eth3d"
+    title = "ETH3D"
+    terms = "CC BY-NC-SA 4.0"
+    paper_images = 454
+
+    def cases(self, root: Path) -> Sequence[Case]:
+        """One case for each photo, or each pair; see `EvalDataset`."""
+        scenes = by_name(scene_folders(root, self.name)).values()
+        multi = [case for scene in scenes if not is_two_view(scene) for case in _photos_of(scene)]
+        return multi + [_pair_of(scene) for scene in scenes if is_two_view(scene)]
+
+
+def _photos_of(scene: Path) -> list[Case]:
+    folder = scene / CALIBRATION
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
+    model = read_model(folder)
+    check_two(scene, len(model.views))
+    photos = [_photo(scene, view.name) for view in model.views]
+    names = [f"{scene.name}/{Path(view.name).stem}" for view in model.views]
+    views = posed_by(model, names, photos)
+    seconds = near_views(views, range(len(views)))
+    return [make_case(views, index, others, model=model, metric=True) for index, others in seconds.items()]
+
+
+def _photo(scene: Path, name: str) -> Path:
+    """The model names a photo by its folder: dslr_images_undistorted/DSC_0286.JPG."""
+    places = [scene / "images" / name, scene / name, scene / "images" / Path(name).name]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        raise InputError(
+            f"{places[0]}: no such photo, but the model has it: unpack the scene's dslr_undistorted archive"
+        )
+    return found
+
+
+def _pair_of(scene: Path) -> Case:
+    """The truth lies beside the photos, or in the folder that its own archive makes."""
+    apart = scene.parent.parent / "two_view_training_gt" / scene.name
+    truth = next((at / name for at in (scene, apart) for name in TRUTHS_2014 if (at / name).is_file()), None)
+    return pair_of_2014(scene, truth)
+
+
+class Tanks:
+    """`SCENE/images` with `SCENE/sparse/0`: what COLMAP, 3D Gaussian splatting and most of the field call a scene.
+
+    `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens has to be nearly a pinhole's
+    (`colmap image_undistorter` makes it one). The dataset's own archives have no such models, only `.log` poses
+    without lenses, which are not read. Lengths are arbitrary.
+
+    512 photos are taken from all scenes by `spread`: evenly, and by names alone; second views come from all photos,
+    see `near_views`. The paper's 331,776 cells are those of 1920×1080, the size of most scenes' frames; those of
+    2048×1080 give 1536×810, and the 980×545 that came with 3D Gaussian splatting stay as they are.
+    """
+
+    name = "tanks"
+    title = "Tanks"
+    terms = "see its page; research, cite"
+    paper_images = 512
+
+    def cases(self, root: Path) -> Sequence[Case]:
+        """One case for each photo that is taken; see `EvalDataset`."""
+        scenes = by_name(scene_folders(root, self.name))
+        read = {name: _read(scene) for name, scene in scenes.items()}
+        picked = spread(list(scenes), lambda name: range(len(read[name][1])), self.paper_images)
+        return [
+            case
+            for name, (model, views) in read.items()
+            for case in _tanks_cases(model, views, frames_of(name, picked))
+        ]
+
+
+def _tanks_cases(model: Model, views: list[Posed], wanted: list[int]) -> list[Case]:
+    seconds = near_views(views, wanted)
+    return [make_case(views, index, others, model=model) for index, others in seconds.items()]
+
+
+def _read(scene: Path) -> tuple[Model, list[Posed]]:
+    folder = model_folder(scene)
+    model = read_model(folder)
+    check_two(scene, len(model.views))
+    top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
+    photos = [top / "images" / view.name for view in model.views]
+    for photo in photos:
+        if not photo.is_file():
+            raise InputError(f"{photo}: no such photo, but {folder} has it: put the scene's photos there")
+    names = [f"{scene.name}/{Path(view.name).with_suffix('').as_posix()}" for view in model.views]
+    return model, posed_by(model, names, photos)
+
+
+PHOTO_FOLDERS = ("images_4", "images", "images_8")  # the first that is there
+BOUNDS_FILE = "poses_bounds.npy"
+
+
+class Llff:
+    """Scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
+
+    Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
+    bounds only where it has no points. Its photos' names need not be the files': those are matched by name, else by
+    their order, as `poses_bounds.npy` always is. Lengths are arbitrary. Second views: see `near_views`; without a
+    model, the middle depth is that of the bounds, half way in inverse depth.
+
+    The paper's 190,512 cells are those of `images_4` (1008×756); `images` (4032×3024) gives 1536×1152.
+    """
+
+    name = "llff"
+    title = "LLFF"
+    terms = "research, cite"
+    paper_images = 305
+
+    def cases(self, root: Path) -> Sequence[Case]:
+        """One case for each photo; see `EvalDataset`."""
+        return [case for scene in by_name(scene_folders(root, self.name)).values() for case in _llff_cases(scene)]
+
+
+def _llff_cases(scene: Path) -> list[Case]:
+    photos = next((found for name in PHOTO_FOLDERS if (found := photo_files(scene / name))), None)
+    if photos is None:
+        raise InputError(f"{scene}: no photos: expected them in {', '.join(PHOTO_FOLDERS)}")
+    check_two(scene, len(photos))
+    table = read_bounds(scene / BOUNDS_FILE, len(photos)) if (scene / BOUNDS_FILE).is_file() else None
+    bounds: list[tuple[float, float] | None] = [None] * len(photos)
+    if table is not None:
+        bounds = [(float(near), float(far)) for near, far in table[:, 15:]]
+    model = read_model(model_folder(scene)) if (scene / "sparse").is_dir() else None
+    if model is not None:
+        check_two(scene, len(model.views))
+        files = _match(scene, [view.name for view in model.views], photos)
+        views = posed_by(model, [_name(scene, file) for file in files], files)
+        bounds = [bounds[photos.index(file)] for file in files]
+    else:
+        assert table is not None  # a scene has one or the other
+        views = [_posed(scene, photo, row) for photo, row in zip(photos, table, strict=True)]
+    return _all(views, model, bounds)
+
+
+def _all(views: list[Posed], model: Model | None, bounds: Sequence[tuple[float, float] | None]) -> list[Case]:
+    seconds = near_views(views, range(len(views)))
+    return [make_case(views, index, others, model=model, bounds=bounds[index]) for index, others in seconds.items()]
+
+
+def read_bounds(path: Path, count: int) -> NDArray[Any]:
+    """[count, 17]: for each photo by name a 3×5 matrix and its nearest and farthest depth.
+
+    Raises:
+        InputError: another table, or one for another number of photos.
+    """
+    try:
+        table: NDArray[Any] = np.load(path, allow_pickle=False)
+        if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f" or not np.isfinite(table).all():
+            raise ValueError(f"{table.dtype} of shape {table.shape}")
+        if not (table[:, [4, 9, 14, 15, 16]] > 0).all():
+            raise ValueError("a size, a focal length or a bound is not positive")
+    except Exception as error:  # NumPy at work on a stranger's bytes raises anything
+        reason = reason_in_a_line(error)
+        raise InputError(f"{path}: not LLFF's table ({reason}): expected finite floats, [photos, 17]") from error
+    if len(table) != count:
+        raise InputError(f"{path}: {len(table)} rows, but there are {count} photos: unpack the scene again")
+    return table
+
+
+def camera_of_row(row: NDArray[Any]) -> Camera:
+    """A row of `poses_bounds.npy` as a camera, float64.
+
+    Its matrix is camera-to-world with the columns down, right, backwards; then the eye; then height, width and focal
+    length. The principal point is the middle.
+    """
+    matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
+    down, right, backwards, eye, lens = matrix.unbind(1)
+    height, width, focal = (float(number) for number in lens)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = torch.stack([right, down, -backwards, eye], dim=1)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(K, torch.linalg.inv(pose), round(width), round(height))
+
+
+def _posed(scene: Path, photo: Path, row: NDArray[Any]) -> Posed:
+    near, far = float(row[15]), float(row[16])
+    return Posed(_name(scene, photo), photo, camera_of_row(row), 2 / (1 / near + 1 / far))
+
+
+def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
+    """The file of each photo of the model; its suffix may differ (JPEG made of PNG)."""
+    stems = {photo.stem: photo for photo in photos}
+    if all(Path(name).stem in stems for name in names):
+        return [stems[Path(name).stem] for name in names]
+    if len(names) != len(photos):
+        raise InputError(
+            f"{photos[0].parent}: {len(photos)} photos, but the COLMAP model of {scene.name} has {len(names)} "
+            "under other names: unpack the scene again"
+        )
+    return list(photos)
+
+
+def _name(scene: Path, photo: Path) -> str:
+    return f"{scene.name}/{photo.stem}"

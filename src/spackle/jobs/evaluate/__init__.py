@@ -1,1 +1,0 @@
-"""`spackle evaluate` and `spackle tables`: datasets into figures, tables, sheets and a page."""
