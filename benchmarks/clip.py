@@ -31,9 +31,8 @@ from spackle.opencv import OpenCV
 from spackle.render import get_renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer
-from spackle.residual.carry import flicker
-from spackle.residual.motion import pixel_grid, sample
-from spackle.residual.weights import shipped_network
+from spackle.residual.network import shipped_network
+from spackle.residual.temporal import flicker, pixel_grid, sample
 from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0

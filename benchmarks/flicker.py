@@ -86,7 +86,7 @@ def by_view(stack: ViewStack) -> Tensor:
     """The paper's way of inference, each view completed by itself."""
     renderer = get_renderer()
     completer = Completer(stack.base, stack.photo_camera, renderer)
-    shields = [completer.photo_shield()]
+    shields = [completer.photo_guard()]
     with torch.no_grad():
         drawn = [completer.completed_view(view, shields)[1].rgb for view in stack.cameras]
     return torch.where(stack.mask[..., None], torch.stack(drawn), stack.rgb)

@@ -21,7 +21,7 @@ from spackle import Completer, Gaussians, get_renderer, hole_area_ratio, hole_ma
 from spackle.bases.rgbd import lift
 from spackle.formats import save_png
 from spackle.residual import ResidualNet
-from spackle.residual.weights import SHIPPED, load_residual
+from spackle.residual.network import SHIPPED, load_residual
 from spackle.scene import scene_path
 from spackle.training.distance import hole_distance, hole_psnr
 from spackle.training.features import FeatureNet, load_features

@@ -20,9 +20,18 @@ from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
 from spackle.opencv import OpenCV
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, hole_mask
-from spackle.residual.carry import Memory, carry, flicker
-from spackle.residual.motion import Track, extend, pixel_grid, sample, track
-from spackle.residual.steady import Stretch, align
+from spackle.residual.temporal import (
+    DepthAlignment,
+    FrameMemory,
+    Track,
+    align_depth,
+    extend_flow,
+    flicker,
+    pixel_grid,
+    propagate_colors,
+    sample,
+    track,
+)
 
 pytest.importorskip("cv2")
 CPU = CpuRenderer()
@@ -63,7 +72,7 @@ def test_a_hole_moves_as_the_camera_does_and_not_as_what_hides_it() -> None:
     seen = truth.clone()
     seen[20:44, 30:50] += 6.0
     seen[hole] = 99.0
-    motion = extend(Track(seen, torch.ones_like(hole)), inverse, ~hole, camera)
+    motion = extend_flow(Track(seen, torch.ones_like(hole)), inverse, ~hole, camera)
     assert float((motion - truth)[hole].norm(dim=-1).max()) < 0.2
     torch.testing.assert_close(motion[~hole], seen[~hole], atol=1e-3, rtol=0)
 
@@ -77,21 +86,21 @@ def test_depth_of_another_scale_and_shift_is_brought_back() -> None:
     now = (then - 0.03) / 1.3
     now[:12] = 1.5  # what has come between
     found = Track(torch.zeros(64, 96, 2), torch.ones(64, 96, dtype=torch.bool))
-    back = align(now, then, found)
+    back = align_depth(now, then, found)
     torch.testing.assert_close(back.of(now)[12:], then[12:], rtol=0.02, atol=0.0)
-    assert align(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure))) == Stretch()
+    assert align_depth(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure))) == DepthAlignment()
 
 
 def test_stretched_gaussians_look_the_same_from_the_photos_eye() -> None:
     scene = box_before_wall()
-    base, stretch = scene.base(), Stretch(1.2, 0.05)
+    base, stretch = scene.base(), DepthAlignment(1.2, 0.05)
     moved = stretch.of_gaussians(base)
     torch.testing.assert_close(1 / moved.means[:, 2], stretch.of(1 / base.means[:, 2]))
     torch.testing.assert_close(
         scene.camera.project(moved.means)[0], scene.camera.project(base.means)[0], rtol=1e-4, atol=1e-3
     )
-    assert Stretch().of_gaussians(base) is base
-    first, value = Stretch(0.9, -0.01), torch.tensor([0.3, 0.7])
+    assert DepthAlignment().of_gaussians(base) is base
+    first, value = DepthAlignment(0.9, -0.01), torch.tensor([0.3, 0.7])
     torch.testing.assert_close(stretch.after(first).of(value), stretch.of(first.of(value)))
 
 
@@ -107,12 +116,12 @@ def test_the_hole_of_a_clip_that_stands_still_keeps_its_colours() -> None:
     hole = hole_mask(before.alpha)
     still, restless = ([], [])
     for noise, views in ((0.0, still), (0.1, restless)):
-        past: Memory | None = None
+        past: FrameMemory | None = None
         for _ in range(5):
             hue = 1 + noise * torch.randn(3, generator=dice)
             mine = dataclasses.replace(aux, colors=(aux.colors * hue).clamp(0, 1))
             drawn = CPU.render([base, mine], camera)
-            frame = carry(base, mine, camera, CPU, (before, drawn), past, OpenCV("this").flow)
+            frame = propagate_colors(base, mine, camera, CPU, (before, drawn), past, OpenCV("this").flow)
             past = frame.memory
             views.append((drawn.rgb, frame.view.rgb))
             torch.testing.assert_close(frame.view.rgb[~hole], own.rgb[~hole], atol=0.02, rtol=0)

@@ -17,10 +17,9 @@ from spackle.camera import Camera
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds
 from spackle.residual.complete import SEEDS_HAR
-from spackle.residual.crops import Crop, crops_around
-from spackle.residual.network import STRIDE, predict_deltas
-from spackle.residual.rim import Rim
-from spackle.residual.weights import shipped_network
+from spackle.residual.network import STRIDE, predict_deltas, shipped_network
+from spackle.residual.seeds import Rim
+from spackle.residual.sparse import Crop, crops_around
 from spackle.trajectory import DepthRange, extremes
 
 

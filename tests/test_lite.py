@@ -173,7 +173,7 @@ def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, ha
 
 
 def test_weights_of_another_network_are_refused_in_a_line(tmp_path: Path) -> None:
-    from spackle.residual.weights import SHIPPED as RESIDUAL
+    from spackle.residual.network import SHIPPED as RESIDUAL
 
     with pytest.raises(InputError, match=r"lite weights .* are of another network"):
         LiteBase.load(RESIDUAL)

@@ -36,13 +36,20 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, hole_mask, make_seeds
-from spackle.residual.carve import CLEARANCE, MAX_REACH_PX, REACH, SHIELD_PX, STEPS, Shield, push_behind
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
-from spackle.residual.cues import CELL
+from spackle.residual.hole_features import CELL
 from spackle.residual.network import IN_CHANNELS, network_input
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import BEHIND, BLOB_CELLS, OPACITY, cell_centers
-from spackle.residual.visits import farthest_first
+from spackle.residual.occlusion_guard import (
+    CLEARANCE,
+    MAX_REACH_PX,
+    REACH,
+    STEPS,
+    WINDOW_PX,
+    OcclusionGuard,
+    push_behind,
+)
+from spackle.residual.seeds import BEHIND, BLOB_CELLS, OPACITY, Rim, cell_centers
+from spackle.residual.view_order import farthest_first
 from spackle.surface import surface_slope
 from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
@@ -479,12 +486,12 @@ def test_an_untrained_network_can_leave_zero() -> None:
 # Carving
 
 
-def plain_push(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> tuple[list[float], list[int]]:
+def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> tuple[list[float], list[int]]:
     """The factors and the survivors of `push_behind`, one Gaussian at a time."""
 
     def blocked(point: Tensor, covariance: Tensor) -> bool:
-        for shield in shields:
-            camera = shield.camera.to(dtype=torch.float64)
+        for guard in guards:
+            camera = guard.camera.to(dtype=torch.float64)
             local, (uv, z) = camera.to_camera(point), camera.project(point)
             if float(z) <= 0:
                 continue
@@ -496,13 +503,13 @@ def plain_push(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> tuple[
                 row[axis], row[2] = 1 / z, -local[axis] / z**2
                 deviation = float(camera.K[axis, axis] * (row @ spread @ row).clamp_min(0).sqrt())
                 reach.append(min(REACH * deviation + 1, MAX_REACH_PX))
-            (u, v), (height, width) = uv.tolist(), shield.depth.shape
+            (u, v), (height, width) = uv.tolist(), guard.depth.shape
             if not (-reach[0] <= u <= width + reach[0] and -reach[1] <= v <= height + reach[1]):
                 continue
-            across, down = (math.ceil(max(r - SHIELD_PX, 0) / (2 * SHIELD_PX)) for r in reach)
+            across, down = (math.ceil(max(r - WINDOW_PX, 0) / (2 * WINDOW_PX)) for r in reach)
             for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
-                row_, column = math.floor(v + 2 * SHIELD_PX * j), math.floor(u + 2 * SHIELD_PX * i)
-                seen = shield.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
+                row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
+                seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
                 if float(z) < float(seen) * (1 + CLEARANCE):
                     return True
         return False
@@ -534,10 +541,10 @@ def test_pushing_matches_a_plain_loop(seed: int) -> None:
     camera = Camera.from_focal(20, 16, 12)
     cameras = [camera, shifted(camera, 1.5), away(camera)]
     depths = [8 * torch.rand(12, 16, generator=generator) for _ in cameras]
-    shields = [Shield(c, d * (d > 3)) for c, d in zip(cameras, depths, strict=True)]
+    guards = [OcclusionGuard(c, d * (d > 3)) for c, d in zip(cameras, depths, strict=True)]
     eye = torch.randn(3, generator=generator)
-    factors, kept = plain_push(aux, eye, shields)
-    found, factor = push_behind(aux, eye, shields), torch.tensor(factors)[:, None]
+    factors, kept = plain_push(aux, eye, guards)
+    found, factor = push_behind(aux, eye, guards), torch.tensor(factors)[:, None]
     assert len(found) == len(kept)
     torch.testing.assert_close(found.means, eye + factor * (aux.means[kept] - eye), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(found.scales, aux.scales[kept] * factor, rtol=1e-4, atol=0)
@@ -549,26 +556,26 @@ def test_a_shield_is_the_farthest_depth_within_reach_and_none_over_holes() -> No
     depth, alpha = torch.full((20, 30), 3.0), torch.ones(20, 30)
     depth[10, 15] = 7.0
     alpha[:, 20:] = 0.5
-    shield = Shield.of(Rendering(torch.zeros(20, 30, 3), depth, alpha), Camera.from_focal(20, 30, 20))
+    guard = OcclusionGuard.of(Rendering(torch.zeros(20, 30, 3), depth, alpha), Camera.from_focal(20, 30, 20))
     block = torch.full((20, 30), 3.0)
-    block[:, 20 + SHIELD_PX :] = 0
-    block[10 - SHIELD_PX : 11 + SHIELD_PX, 15 - SHIELD_PX : 16 + SHIELD_PX] = 7
-    assert torch.equal(shield.depth, block)
+    block[:, 20 + WINDOW_PX :] = 0
+    block[10 - WINDOW_PX : 11 + WINDOW_PX, 15 - WINDOW_PX : 16 + WINDOW_PX] = 7
+    assert torch.equal(guard.depth, block)
 
 
 @PROPERTY
 @given(SEEDS, st.tuples(st.integers(1, 90), st.integers(1, 30)))
 def test_a_shield_is_the_maximum_over_windows(seed: int, size: tuple[int, int]) -> None:
     view = random_view(seed, *size)
-    shield = Shield.of(view, Camera.from_focal(20, size[1], size[0]))
+    guard = OcclusionGuard.of(view, Camera.from_focal(20, size[1], size[0]))
     seen = torch.where(hole_mask(view.alpha), 0.0, view.depth)[None, None]
-    assert torch.equal(shield.depth, max_pool2d(seen, 2 * SHIELD_PX + 1, stride=1, padding=SHIELD_PX)[0, 0])
+    assert torch.equal(guard.depth, max_pool2d(seen, 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0, 0])
 
 
 def test_pushing_changes_nothing_for_the_eye_that_asked() -> None:
     completer, camera = box_view()
     aux = completer.complete_view(camera, [])
-    pushed = push_behind(aux, camera.position, [completer.photo_shield()])
+    pushed = push_behind(aux, camera.position, [completer.photo_guard()])
     assert len(pushed) == len(aux)
     assert bool((camera.to_camera(pushed.means)[:, 2] > camera.to_camera(aux.means)[:, 2] + 0.1).any())
     uv, _ = camera.project(pushed.means)
@@ -580,14 +587,14 @@ def test_pushing_changes_nothing_for_the_eye_that_asked() -> None:
 def test_without_shields_or_gaussians_nothing_is_pushed() -> None:
     aux, eye = random_aux(5, 0), torch.zeros(3)
     assert same_bits(push_behind(aux, eye, []), aux)
-    shield = Shield(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
-    assert len(push_behind(Gaussians.empty(), eye, [shield])) == 0
+    guard = OcclusionGuard(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
+    assert len(push_behind(Gaussians.empty(), eye, [guard])) == 0
 
 
 def test_what_stands_behind_the_shields_camera_is_not_its_business() -> None:
     aux = dataclasses.replace(random_aux(1, 0), means=torch.tensor([[0.1, 0.2, -3.0]]))
-    shield = Shield(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
-    assert same_bits(push_behind(aux, torch.zeros(3), [shield]), aux)
+    guard = OcclusionGuard(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
+    assert same_bits(push_behind(aux, torch.zeros(3), [guard]), aux)
 
 
 # Completion of a view
@@ -598,7 +605,7 @@ def test_what_stands_behind_the_shields_camera_is_not_its_business() -> None:
 def test_completion_closes_a_view(disparity: float, side: int) -> None:
     completer, camera = box_view(disparity, side)
     before = CPU.render(completer.base, camera)
-    aux = completer.complete_view(camera, [completer.photo_shield()])
+    aux = completer.complete_view(camera, [completer.photo_guard()])
     after = CPU.render([completer.base, aux], camera)
     assert hole_area_ratio(after.alpha) < 0.03 * hole_area_ratio(before.alpha)
     seen = ~hole_mask(before.alpha)
@@ -645,7 +652,7 @@ def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network:
     completer = Completer(scene.base(), scene.camera, CPU, ResidualNet() if network else None)
     camera = away(scene.camera)
     assert hole_area_ratio(CPU.render(completer.base, camera).alpha) == 1
-    aux = completer.complete_view(camera, [completer.photo_shield()])
+    aux = completer.complete_view(camera, [completer.photo_guard()])
     assert all(bool(t.isfinite().all()) for t in aux.tensors)
     assert hole_area_ratio(CPU.render([completer.base, aux], camera).alpha) < 0.01
 
@@ -653,7 +660,7 @@ def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network:
 def test_an_empty_base_is_completed_too() -> None:
     camera = Camera.from_focal(60, 64, 48)
     completer = Completer(Gaussians.empty(), camera, CPU)
-    aux = completer.complete_view(camera, [completer.photo_shield()])
+    aux = completer.complete_view(camera, [completer.photo_guard()])
     assert hole_area_ratio(CPU.render(aux, camera).alpha) < 0.01
 
 
@@ -676,10 +683,10 @@ def test_completion_repeats_bit_for_bit(network: bool) -> None:
     completer, camera = box_view()
     if network:
         completer = dataclasses.replace(completer, network=trained())
-    shields = [completer.photo_shield()]
-    first = completer.complete_view(camera, shields)
+    guards = [completer.photo_guard()]
+    first = completer.complete_view(camera, guards)
     assert len(first) > 0
-    assert same_bits(completer.complete_view(camera, shields), first)
+    assert same_bits(completer.complete_view(camera, guards), first)
 
 
 # Completion of a scene
@@ -781,7 +788,7 @@ class Completed:
 def right_view() -> Completed:
     pair, found = motorcycle(), motorcycle_base()
     completer = Completer(found.gaussians, found.camera, CPU)
-    aux = completer.complete_view(pair.right, [completer.photo_shield()])
+    aux = completer.complete_view(pair.right, [completer.photo_guard()])
     views = [CPU.render(s, c) for c in (pair.right, found.camera) for s in (completer.base, [completer.base, aux])]
     return Completed(views[0], views[1], pair.right_rgb, views[2], views[3])
 

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.residual.cues import Cues
-from spackle.residual.rim import SAME_DEPTH, Rim
-from spackle.residual.seeds import Seeds, cell_centers
+from spackle.residual.hole_features import Cues
+from spackle.residual.seeds import SAME_DEPTH, Rim, Seeds, cell_centers
 
 HEIGHT, WIDTH = 12, 20  # cells
 CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)

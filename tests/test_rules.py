@@ -61,7 +61,7 @@ def test_the_base_comes_first_and_unchanged_in_what_is_merged(name: str, network
     subject = completer(name, network)
     kept = Gaussians(*(t.clone() for t in subject.base.tensors))
     path = path_of(subject, "swipe")
-    view = subject.complete_view(path[-1], [subject.photo_shield()])
+    view = subject.complete_view(path[-1], [subject.photo_guard()])
     for aux in (view, subject.complete_scene(path)):
         assert len(aux) > 0
         assert same_bits(subject.base, kept)
@@ -79,7 +79,7 @@ def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down
     subject = completer(name)
     camera = subject.photo_camera.looking(torch.tensor([right, down, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
     mask = Cues.of(CPU.render(subject.base, camera)).mask
-    aux = subject.complete_view(camera, [subject.photo_shield()] if shielded else [])
+    aux = subject.complete_view(camera, [subject.photo_guard()] if shielded else [])
     uv, z = camera.project(aux.means)
     column, row = (uv / 2).floor().long().unbind(-1)
     torch.testing.assert_close(uv, cell_centers(camera)[row, column], rtol=0, atol=0.02)
@@ -156,7 +156,7 @@ def test_even_an_untaught_network_leaves_the_photo_alone() -> None:
 def test_a_completed_view_behind_the_photos_shield_shows_the_photo_as_the_base_does(name: str, right: float) -> None:
     """As far as disparity 0.6 and a little, but looking elsewhere than a trajectory does."""
     subject = completer(name)
-    aux = subject.complete_view(shifted(subject.photo_camera, right), [subject.photo_shield()])
+    aux = subject.complete_view(shifted(subject.photo_camera, right), [subject.photo_guard()])
     assert len(aux) > 0
     before = CPU.render(subject.base, subject.photo_camera)
     assert psnr(CPU.render([subject.base, aux], subject.photo_camera).rgb, before.rgb) >= 45
@@ -177,9 +177,8 @@ TWINS = {
     "evaluation/suite/naive.py": "test_suite.py",
     "fill.py": "test_fill.py",
     "render": "test_render.py",
-    "residual/carve.py": "test_residual.py",
-    "residual/cues.py": "test_residual.py",
-    "residual/rim.py": "test_rim.py",
+    "residual/occlusion_guard.py": "test_residual.py",
+    "residual/hole_features.py": "test_residual.py",
     "residual/seeds.py": "test_residual.py",
     "surface.py": "test_surface.py",
     "training/depth/raycast.py": "test_lite_scenes.py",
@@ -198,7 +197,7 @@ def test_a_completed_scene_is_drawn_alike_by_the_plain_renderer_and_so_are_its_g
     scene = box_before_wall(width=32, height=24, focal=27)
     subject = Completer(scene.base(), scene.camera, CPU)
     camera = path_of(subject, "swipe", 0.2)[-1]
-    aux = subject.complete_view(camera, [subject.photo_shield()])
+    aux = subject.complete_view(camera, [subject.photo_guard()])
     assert len(aux) > 10
     renderers = (CPU, ReferenceRenderer())
     fast, plain = (renderer.render([subject.base, aux], camera) for renderer in renderers)

@@ -15,8 +15,8 @@ from spackle.render import CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, farthest_first, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.complete import WIDEST
-from spackle.residual.tuck import COARSE, REACH_CELLS, tucked
-from spackle.residual.visits import Visits, has_speck, reach_of
+from spackle.residual.rim_underlay import COARSE, REACH_CELLS, rim_underlay
+from spackle.residual.view_order import SettledFrames, has_speck, reach_of
 from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 CPU = CpuRenderer()
@@ -65,7 +65,7 @@ def wide_view() -> tuple[Completer, Camera, Rendering, Gaussians, Gaussians]:
     cues = Cues.of(before)
     assert 0.1 < float(cues.mask.float().mean()) < 0.5
     fill = completer.complete_view(camera, [], rendering=before)
-    return completer, camera, before, fill, tucked(cues, make_seeds(cues, camera, completer.photo_camera), camera)
+    return completer, camera, before, fill, rim_underlay(cues, make_seeds(cues, camera, completer.photo_camera), camera)
 
 
 def test_what_lies_beneath_the_rim_is_hidden_from_the_view_that_it_is_made_for() -> None:
@@ -115,7 +115,7 @@ def test_a_view_without_neighbours_gets_nothing_beneath_its_rims() -> None:
 
 
 def test_a_quiet_frame_speaks_for_those_half_of_the_way_to_the_next_known_ones() -> None:
-    visits = Visits(12)
+    visits = SettledFrames(12)
     visits.looked(0, 0.0)
     visits.looked(9, 0.0)
     assert [k for k in range(12) if visits.known(k)] == [0, 9]
@@ -126,7 +126,7 @@ def test_a_quiet_frame_speaks_for_those_half_of_the_way_to_the_next_known_ones()
 
 
 def test_one_with_hardly_a_hole_speaks_for_more() -> None:
-    visits = Visits(16)
+    visits = SettledFrames(16)
     visits.looked(1, 0.0)
     visits.looked(14, 0.0)
     visits.looked(5, 0.75)
@@ -135,7 +135,7 @@ def test_one_with_hardly_a_hole_speaks_for_more() -> None:
 
 @pytest.mark.parametrize("reach", [0.5, 0.75])
 def test_nobody_speaks_for_the_ends_of_a_path(reach: float) -> None:
-    visits = Visits(5)
+    visits = SettledFrames(5)
     visits.looked(2, reach)
     assert [visits.known(i) for i in range(5)] == [False, False, True, False, False]
 

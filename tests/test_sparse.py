@@ -16,10 +16,9 @@ from spackle.evaluation.suite.flops import counted
 from spackle.render import CpuRenderer
 from spackle.residual import Cues, ResidualNet, make_seeds
 from spackle.residual import network as residual_network
-from spackle.residual.network import IN_CHANNELS, network_input, predict_deltas
-from spackle.residual.rim import Rim
+from spackle.residual.network import IN_CHANNELS, network_input, predict_deltas, shipped_network
+from spackle.residual.seeds import Rim
 from spackle.residual.sparse import Cells, conv_rows, relu_rows, upsampled
-from spackle.residual.weights import shipped_network
 from spackle.trajectory import DepthRange, extremes
 
 

@@ -241,7 +241,7 @@ def test_the_stages_are_the_completers(network: ResidualNet, monkeypatch: pytest
     base, camera = holed_scene(96)
     renderer = CpuRenderer()
     view = HoledView(base, camera, find_view(base, camera, renderer, 0.05)[1], renderer, network)
-    shield = view.completer.photo_shield()
+    shield = view.completer.photo_guard()
     looks, rendering = check_fill(view, shield)
     aux, expected = view.completer.completed_view(view.camera, [shield])
     assert same_bits(Gaussians.cat([look.new for look in looks]), aux)

@@ -28,7 +28,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer
 from spackle.rendering import Rendering
 from spackle.residual.compose import DELTA_CHANNELS, compose
-from spackle.residual.cues import CELL, Cues
+from spackle.residual.hole_features import CELL, Cues
 from spackle.training import composites, sources
 from spackle.training.cache import HALVED, HOLE_SHARE, Cache, load_sample, random_crops, save_sample
 from spackle.training.composites import composite

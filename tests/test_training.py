@@ -24,8 +24,7 @@ from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, 
 from spackle.downloads.locks import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
-from spackle.residual.network import ResidualNet
-from spackle.residual.weights import load_residual
+from spackle.residual.network import ResidualNet, load_residual
 from spackle.training.cache import load_sample, save_sample
 from spackle.training.data import SampleFiles
 from spackle.training.learner import Learner

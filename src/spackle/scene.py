@@ -24,7 +24,7 @@ from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet
-from spackle.residual.weights import shipped_network
+from spackle.residual.network import shipped_network
 from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 PATH_FRAMES = 60

@@ -143,7 +143,7 @@ class ViewBench:
         photo_camera = self.base.prediction.camera
         completer = Completer(base, photo_camera, inside, self.network, precision=self.precision)
         before, view = timed(lambda: self.renderer.render(base, camera))
-        shield, photo = timed(completer.photo_shield)
+        shield, photo = timed(completer.photo_guard)
         inside.seconds = 0.0
         (aux, _), whole = timed(lambda: completer.completed_view(camera, [shield], rendering=before))
         seconds = {"view": view, "photo": photo, "completion": whole - inside.seconds, "rerender": inside.seconds}

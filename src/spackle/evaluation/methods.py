@@ -19,12 +19,11 @@ from spackle.pseudo.views import ViewStack
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
-from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
-from spackle.residual.cues import Cues
+from spackle.residual.hole_features import Cues
 from spackle.residual.network import predict_deltas
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import make_seeds
+from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
+from spackle.residual.seeds import Rim, make_seeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +40,9 @@ class Shot:
         return self.prediction.gaussians
 
     @functools.cached_property
-    def shield(self) -> Shield:
+    def shield(self) -> OcclusionGuard:
         """What the photo shows, which no completion may cover."""
-        return self.completer(None).photo_shield()
+        return self.completer(None).photo_guard()
 
     def completer(self, network: ResidualNet | None, precision: Precision = "auto") -> Completer:
         """What fills its holes; with seeds alone where there is no network."""

@@ -33,7 +33,7 @@ from spackle.jobs.setup import set_up
 from spackle.precision import PRECISIONS, pick_dtype
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
-from spackle.residual.weights import load_residual
+from spackle.residual.network import load_residual
 from spackle.training.features import FeatureNet, load_features
 from spackle.trajectory import MAX_DISPARITY
 

@@ -17,10 +17,19 @@ from spackle.precision import Precision
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
-from spackle.residual.carry import Frame, Memory, carry, flicker
-from spackle.residual.carve import Shield
-from spackle.residual.motion import Flow, pixel_grid, sample, track
-from spackle.residual.steady import Stretch, align
+from spackle.residual.occlusion_guard import OcclusionGuard
+from spackle.residual.temporal import (
+    CompletedFrame,
+    DepthAlignment,
+    Flow,
+    FrameMemory,
+    align_depth,
+    flicker,
+    pixel_grid,
+    propagate_colors,
+    sample,
+    track,
+)
 from spackle.scene import even_camera
 from spackle.trajectory import DepthRange, TrajectoryKind, view_at
 
@@ -69,9 +78,9 @@ class _Past:
 
     rgb: Tensor  # [H, W, 3] the input
     inverse_depth: Tensor  # [H, W] as the base said it, 0 where unknown
-    stretch: Stretch
+    stretch: DepthAlignment
     depths: DepthRange  # of the path
-    memory: Memory | None = None
+    memory: FrameMemory | None = None
     drawn: Drawn | None = None
 
 
@@ -110,7 +119,7 @@ class ClipCompleter:
         if choices.fill:
             with self.timed("carry"):
                 memory_before = None if past is None else past.memory
-                frame = carry(base, aux, camera, self._renderer, (before, alone), memory_before, self._flow)
+                frame = propagate_colors(base, aux, camera, self._renderer, (before, alone), memory_before, self._flow)
                 drawn, memory = _carried(drawn, frame, past), frame.memory
         self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
         self._count += 1
@@ -123,27 +132,29 @@ class ClipCompleter:
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def _steadied(self, rgb: Tensor, prediction: BasePrediction) -> tuple[Gaussians, Shield, _Past, _Past | None]:
+    def _steadied(
+        self, rgb: Tensor, prediction: BasePrediction
+    ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
         """The base with its depth held to the past, what the photo shows of it, what to keep, and the shot's past."""
         seen = self._renderer.render(prediction.gaussians, prediction.camera)
         known = ~hole_mask(seen.alpha) & (seen.depth > 0)
         inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
-        past, stretch = self._past, Stretch()
+        past, stretch = self._past, DepthAlignment()
         if past is not None:
             found = track(rgb, past.rgb, self._flow)
             if not found.same_shot():
                 past = None
             elif self._choices.steady:
-                stretch = past.stretch.after(align(inverse_depth, past.inverse_depth, found)).leaked()
+                stretch = past.stretch.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
         base = stretch.of_gaussians(prediction.gaussians)
-        shield = Shield.of(dataclasses.replace(seen, depth=stretch.of_depth(seen.depth)), prediction.camera)
+        shield = OcclusionGuard.of(dataclasses.replace(seen, depth=stretch.of_depth(seen.depth)), prediction.camera)
         depths = DepthRange.of(base)
         if past is not None:
             depths = past.depths.towards(depths, FOLLOW)
         return base, shield, _Past(rgb, inverse_depth, stretch, depths), past
 
 
-def _carried(drawn: Drawn, frame: Frame, past: _Past | None) -> Drawn:
+def _carried(drawn: Drawn, frame: CompletedFrame, past: _Past | None) -> Drawn:
     """What was drawn, with the colours of the past."""
     drawn = dataclasses.replace(drawn, gaussians=(drawn.gaussians[0], frame.aux), view=frame.view)
     if past is None or past.drawn is None or frame.flow is None:

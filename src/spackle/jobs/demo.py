@@ -24,7 +24,7 @@ from spackle.jobs.progress import Reporter
 from spackle.jobs.report import write_report
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.residual.weights import shipped_network
+from spackle.residual.network import shipped_network
 from spackle.scene import Scene, complete, even_camera, scene_path
 from spackle.training.distance import hole_psnr
 from spackle.trajectory import DepthRange, extremes

@@ -15,7 +15,7 @@ from spackle.jobs.bases import AUTO, HF, KINDS, NETWORKS, base_files, kind_of
 from spackle.jobs.names import check_name
 from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions, check_video_options
 from spackle.precision import PRECISIONS, Precision
-from spackle.residual.weights import SHIPPED
+from spackle.residual.network import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]

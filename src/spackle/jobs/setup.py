@@ -22,7 +22,7 @@ from spackle.jobs.request import shared_digest
 from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
-from spackle.residual.weights import load_residual
+from spackle.residual.network import load_residual
 
 
 @dataclasses.dataclass(frozen=True)

@@ -106,7 +106,7 @@ def complete(prediction: BasePrediction, plan: Plan, options: PredictOptions, to
     if options.mode == "scene":
         given = options.cameras is not None
         return Completed(base, completer.complete_scene(plan.cameras, exact=given, progress=step))
-    shields = [completer.photo_shield()]
+    shields = [completer.photo_guard()]
     by_view = []
     for index, camera in enumerate(plan.cameras):
         by_view.append(completer.complete_view(camera, shields))

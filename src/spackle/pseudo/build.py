@@ -19,7 +19,7 @@ from spackle.pseudo.photos import PhotoFile
 from spackle.pseudo.sample import to_members
 from spackle.pseudo.views import DISPARITY, VIEWS, PathChoice, ViewStack, draw_path, path_cameras, render_views
 from spackle.render import Renderer
-from spackle.residual.cues import MASK_THRESHOLD
+from spackle.residual.hole_features import MASK_THRESHOLD
 from spackle.trajectory import DepthRange, TrajectoryKind
 
 Seconds = dict[str, float]  # of each stage

@@ -14,7 +14,7 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual import hole_mask
-from spackle.residual.cues import MASK_THRESHOLD
+from spackle.residual.hole_features import MASK_THRESHOLD
 from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 
 VIEWS = 20  # the paper's, the photo's own view among them

@@ -13,14 +13,13 @@ from spackle.gaussians import Gaussians
 from spackle.precision import Precision
 from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
-from spackle.residual.carve import Shield, push_behind
 from spackle.residual.compose import compose
-from spackle.residual.cues import MASK_THRESHOLD, Cues, hole_area_ratio
+from spackle.residual.hole_features import MASK_THRESHOLD, Cues, hole_area_ratio
 from spackle.residual.network import ResidualNet, predict_deltas
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import Seeds, make_seeds
-from spackle.residual.tuck import tucked
-from spackle.residual.visits import QUIET_HAR, Visits, farthest_first, reach_of
+from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
+from spackle.residual.rim_underlay import rim_underlay
+from spackle.residual.seeds import Rim, Seeds, make_seeds
+from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first, reach_of
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
@@ -42,16 +41,16 @@ class Completer:
     threshold: float = MASK_THRESHOLD
     precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
 
-    def photo_shield(self) -> Shield:
+    def photo_guard(self) -> OcclusionGuard:
         """What the photo itself shows: no completion may stand in front of that."""
         rendering = self.renderer.render(self.base, self.photo_camera)
-        return Shield.of(rendering, self.photo_camera, self.threshold)
+        return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
     @torch.no_grad()
     def complete_view(
         self,
         camera: Camera,
-        shields: Sequence[Shield] | None = None,
+        guards: Sequence[OcclusionGuard] | None = None,
         aux: Gaussians | None = None,
         rendering: Rendering | None = None,
     ) -> Gaussians:
@@ -59,13 +58,13 @@ class Completer:
 
         The arguments are those of `completed_view`.
         """
-        return self.completed_view(camera, shields, aux, rendering)[0]
+        return self.completed_view(camera, guards, aux, rendering)[0]
 
     @torch.no_grad()
     def completed_view(
         self,
         camera: Camera,
-        shields: Sequence[Shield] | None = None,
+        guards: Sequence[OcclusionGuard] | None = None,
         aux: Gaussians | None = None,
         rendering: Rendering | None = None,
     ) -> tuple[Gaussians, Rendering]:
@@ -73,14 +72,14 @@ class Completer:
 
         Args:
             camera: the view to complete.
-            shields: views whose content must stay in front; the photo's alone where None.
+            guards: views whose content must stay in front; the photo's alone where None.
             aux: aux Gaussians that are there already.
             rendering: base and aux from this view, where that is at hand.
         """
-        if shields is None:
-            shields = [self.photo_shield()]
+        if guards is None:
+            guards = [self.photo_guard()]
         there = [self.base] if aux is None else [self.base, aux]
-        return self._fill(camera, shields, there, rendering or self.renderer.render(there, camera))
+        return self._fill(camera, guards, there, rendering or self.renderer.render(there, camera))
 
     @torch.no_grad()
     def complete_scene(
@@ -101,57 +100,59 @@ class Completer:
         if not cameras:
             return Gaussians.empty()
         order = farthest_first(cameras, self.photo_camera)
-        shields, view = self._first_shields(cameras, order)
-        visits = Visits(len(cameras))
+        guards, view = self._first_guards(cameras, order)
+        settled = SettledFrames(len(cameras))
         enough = CLOSED_HAR if exact else QUIET_HAR
         aux = Gaussians.empty()
         for count, index in enumerate(order):
-            if exact or not visits.known(index):
+            if exact or not settled.known(index):
                 camera = cameras[index]
                 view = self.renderer.render([self.base, aux], camera) if count else view
                 holes = hole_area_ratio(view.alpha, self.threshold)
                 # Nobody is spoken for where all are looked at.
                 reach = float(holes == 0) if exact else reach_of(holes, view.alpha, self.threshold)
                 if not reach:
-                    others = [shield for of, shield in shields.items() if of != index]
+                    others = [guard for of, guard in guards.items() if of != index]
                     chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
                     new, view = chosen._fill(camera, others, [self.base, aux], view, enough, len(cameras) > 1)
                     aux = Gaussians.cat([aux, new])
-                    shields[index] = Shield.of(view, camera, self.threshold)
-                visits.looked(index, reach)
+                    guards[index] = OcclusionGuard.of(view, camera, self.threshold)
+                settled.looked(index, reach)
             if progress:
                 progress(count + 1, len(order))
         return aux
 
-    def _first_shields(self, cameras: Sequence[Camera], order: Sequence[int]) -> tuple[dict[int, Shield], Rendering]:
+    def _first_guards(
+        self, cameras: Sequence[Camera], order: Sequence[int]
+    ) -> tuple[dict[int, OcclusionGuard], Rendering]:
         """What stays in front from the first: the photo (-1), and what the base shows from the widest views.
 
         Returns:
             These, and the base from the widest view of all.
         """
-        shields = {-1: self.photo_shield()}
+        guards = {-1: self.photo_guard()}
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
             view = self.renderer.render(self.base, cameras[index])
-            shields[index] = Shield.of(view, cameras[index], self.threshold)
-        return shields, view
+            guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
+        return guards, view
 
     def _fill(
         self,
         camera: Camera,
-        shields: Sequence[Shield],
+        guards: Sequence[OcclusionGuard],
         there: Sequence[Gaussians],
         rendering: Rendering,
         enough: float = CLOSED_HAR,
-        tuck: bool = False,
+        underlay: bool = False,
     ) -> tuple[Gaussians, Rendering]:
-        """New aux Gaussians for a view, and the view with them; with `tuck` also beneath the rims of its holes."""
+        """New aux Gaussians for a view, and the view with them; with `underlay` also beneath the rims of its holes."""
         added = [Gaussians.empty()]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = self._propose(rendering, camera, self.network if turn == 0 else None, tuck)
+            new = self._propose(rendering, camera, self.network if turn == 0 else None, underlay)
             if not len(new):
                 break
-            new = push_behind(new, camera.position, shields)
+            new = push_behind(new, camera.position, guards)
             added.append(new)
             tiles = touched_tiles(new, camera)  # the others keep what they show
             rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
@@ -159,7 +160,7 @@ class Completer:
                 break
         return Gaussians.cat(added), rendering
 
-    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None, tuck: bool) -> Gaussians:
+    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None, underlay: bool) -> Gaussians:
         """One Gaussian for each masked cell of a rendering, and those beneath the holes' rims."""
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
@@ -167,7 +168,7 @@ class Completer:
         seeds = make_seeds(cues, camera, self.photo_camera)
         deltas = None if network is None else self._deltas(network, cues, seeds, camera)
         new = compose(seeds.select(cues.mask), deltas, camera)
-        return Gaussians.cat([new, tucked(cues, seeds, camera)]) if tuck else new
+        return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new
 
     def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
         """[n, 14] for the masked cells."""

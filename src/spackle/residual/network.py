@@ -1,24 +1,29 @@
-"""The residual network f_res (paper, eq. 4): cues of a view in, a delta for every cell out."""
+"""The residual network f_res (paper, eq. 4): cues of a view in, a delta for every cell out.
+
+Weights of the residual network, as safetensors.
+"""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import itertools
 import math
+import os
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from spackle.network_file import read_network
 from spackle.precision import Precision, pick_dtype
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
-from spackle.residual.crops import crops_around
-from spackle.residual.cues import Cues
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import Seeds
-from spackle.residual.sparse import Cells, conv_rows, point_rows, relu_rows, upsampled
+from spackle.residual.hole_features import Cues
+from spackle.residual.seeds import Rim, Seeds
+from spackle.residual.sparse import Cells, conv_rows, crops_around, point_rows, relu_rows, upsampled
 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
@@ -165,7 +170,7 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells; nothing of use at the others.
 
-    The network looks only around the masked cells, see `spackle.residual.crops`; and on a processor it computes
+    The network looks only around the masked cells, see `spackle.residual.sparse`; and on a processor it computes
     what only the others need nowhere, see `ResidualNet.deltas_at`.
 
     Args:
@@ -255,3 +260,21 @@ def _initialise(network: ResidualNet) -> None:
         gain = 0.0 if zero else STEM_GAIN if name == "stem" else math.sqrt(2) if name.endswith("first") else 1.0
         nn.init.normal_(module.weight, std=gain / math.sqrt(module.weight[0].numel()))
         nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+
+
+SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
+
+
+@functools.cache
+def shipped_network() -> ResidualNet | None:
+    """The network with the weights that come with the package; None where a build has none."""
+    return load_residual(SHIPPED) if SHIPPED.is_file() else None
+
+
+def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
+    """Read a network; half precision is widened to single.
+
+    Raises:
+        InputError: a missing or broken file, or weights of another architecture.
+    """
+    return read_network(ResidualNet(), path, "residual", "a .safetensors file, 'seeds' or 'none'")

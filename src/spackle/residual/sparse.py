@@ -2,6 +2,8 @@
 
 Holes are thin, and the network's last, finest convolutions are half of its cost. Its encoder has to see everything,
 but its decoder and heads need to be right only around the masked cells: see `ResidualNet.deltas_at`.
+
+Where the network has to look: rectangles around the masked cells, so that a small hole costs little.
 """
 
 from __future__ import annotations
@@ -9,7 +11,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad
 
@@ -122,3 +126,141 @@ def _corners(cells: Cells) -> list[tuple[Tensor, Tensor, Tensor]]:
         far = 0.25 + 0.5 * (places % 2 == 0).float()  # of the higher one: three quarters where the cell is even
         sides.append(((low.clamp_min(0), 1 - far), ((low + 1).clamp_max(size // 2 - 1), far)))
     return [(row, column, wr * wc) for row, wr in sides[0] for column, wc in sides[1]]
+
+
+Mask = NDArray[np.bool_]
+Edges = NDArray[np.int64]
+
+# What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
+# changes it by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
+# See tests/test_crops.py.
+MARGIN = 64
+WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
+NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much
+CALL_BLOCKS = 8  # what a crop costs by itself, in blocks of 16×16 cells
+
+
+@dataclasses.dataclass(frozen=True)
+class Crop:
+    """A rectangle of cells; the last row and column are exclusive."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def area(self) -> int:
+        """In cells."""
+        return (self.bottom - self.top) * (self.right - self.left)
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """To index [h, w, ...] with."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def moved(self, down: int, right: int) -> Crop:
+        """The same rectangle elsewhere."""
+        return Crop(self.top + down, self.left + right, self.bottom + down, self.right + right)
+
+    def within(self, other: Crop) -> Crop:
+        """The same rectangle, counted from another one's corner."""
+        return self.moved(-other.top, -other.left)
+
+    def grown(self, margin: int, step: int, height: int, width: int) -> Crop:
+        """With a margin, outwards to multiples of `step`, as far as the grid goes."""
+
+        def down(place: int) -> int:
+            return max(place - margin, 0) // step * step
+
+        def up(place: int, end: int) -> int:
+            return min(-(-(place + margin) // step) * step, end)
+
+        return Crop(down(self.top), down(self.left), up(self.bottom, height), up(self.right, width))
+
+
+def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
+    """Rectangles that hold all masked cells, and what has to be looked at for each; few and small.
+
+    Args:
+        mask: [h, w] bool.
+        step: the network's stride: what it looks at begins at multiples of it, so that its grids stay where they are.
+        margin: how far around the masked cells it looks.
+
+    Returns:
+        Pairs (inner, outer): the inner ones cover each masked cell exactly once, or are the whole grid.
+    """
+    cells: Mask = mask.cpu().numpy()
+    whole = Crop(0, 0, *cells.shape)
+    if not cells.any():
+        return []
+    rest = [(0, -size % step) for size in cells.shape]
+    tall, wide = (-(-size // step) for size in cells.shape)
+    blocks: Mask = np.logical_or.reduce(np.pad(cells, rest).reshape(tall, step, wide, step), axis=(1, 3))
+    found = []
+    for part in _cut(blocks, _tight(blocks, Crop(0, 0, tall, wide)), -(-margin // step)):
+        inner = _tight(cells, Crop(*(step * edge for edge in dataclasses.astuple(part))))
+        found.append((inner, inner.grown(margin, step, *cells.shape)))
+    if sum(outer.area for _, outer in found) > WHOLE * whole.area:
+        return [(whole, whole)]
+    return found
+
+
+def _tight(cells: Mask, crop: Crop) -> Crop:
+    """Shrunk to its masked cells; there are some."""
+    rows, columns = (np.flatnonzero(cells[crop.slices].any(axis)) for axis in (1, 0))
+    edges = (int(edge) for edge in (rows[0], columns[0], rows[-1] + 1, columns[-1] + 1))
+    return Crop(*edges).moved(crop.top, crop.left)
+
+
+def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
+    """A rectangle that its masked blocks fill to all four sides, cut in two as long as that saves something.
+
+    A cut that costs something may be the way to others that save more, so it is judged by what comes of it.
+    """
+    own = crop.grown(reach, 1, *blocks.shape).area
+    if own <= NEARLY * _least(blocks, crop, reach):
+        return [crop]
+    halves = _halves(blocks[crop.slices]) + (crop.top, crop.left) * 2
+    if not len(halves):
+        return [crop]
+    best = halves[_looked_at(halves, reach, blocks.shape).sum(1).argmin()]
+    parts = [part for half in best for part in _cut(blocks, Crop(*map(int, half)), reach)]
+    cost = sum(part.grown(reach, 1, *blocks.shape).area + CALL_BLOCKS for part in parts)
+    return parts if cost < own + CALL_BLOCKS else [crop]
+
+
+def _least(blocks: Mask, crop: Crop, reach: int) -> int:
+    """Blocks that are looked at however a rectangle is cut."""
+    near = np.zeros_like(blocks)
+    near[crop.slices] = blocks[crop.slices]
+    return int(Cells(torch.from_numpy(near)).grown(reach).grid.sum())
+
+
+def _looked_at(edges: Edges, reach: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Blocks in each rectangle with its surroundings: [..., 4] to [...]."""
+    low, high = np.maximum(edges[..., :2] - reach, 0), np.minimum(edges[..., 2:] + reach, shape)
+    area: NDArray[np.int64] = (high - low).prod(-1)
+    return area
+
+
+def _halves(inside: Mask) -> Edges:
+    """All ways to cut a rectangle in two: [cuts, 2, 4], each half shrunk to its masked blocks."""
+    across = _row_halves(inside.T)[..., [1, 0, 3, 2]]
+    return np.concatenate([_row_halves(inside), across])
+
+
+def _row_halves(inside: Mask) -> Edges:
+    """Top, left, bottom and right of the masked blocks above and below each cut, [cuts, 2, 4]."""
+    height, width = inside.shape
+    row, filled = np.arange(height), inside.any(1)
+    left = np.where(filled, inside.argmax(1), width)
+    right = np.where(filled, width - inside[:, ::-1].argmax(1), 0)
+    upper, lower = (slice(None), slice(None, None, -1))
+    lefts = [np.minimum.accumulate(left[way])[way] for way in (upper, lower)]
+    rights = [np.maximum.accumulate(right[way])[way] for way in (upper, lower)]
+    last = np.maximum.accumulate(np.where(filled, row, 0))
+    first = np.minimum.accumulate(np.where(filled, row, height)[::-1])[::-1]
+    above = [np.zeros(height - 1, np.int64), lefts[0][:-1], last[:-1] + 1, rights[0][:-1]]
+    below = [first[1:], lefts[1][1:], np.full(height - 1, height), rights[1][1:]]
+    return np.stack([np.stack(above, 1), np.stack(below, 1)], 1)

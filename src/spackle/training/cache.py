@@ -19,9 +19,8 @@ from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
-from spackle.residual.cues import CELL, Cues
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import Seeds
+from spackle.residual.hole_features import CELL, Cues
+from spackle.residual.seeds import Rim, Seeds
 from spackle.training.sample import Sample
 from spackle.training.sources import Source
 

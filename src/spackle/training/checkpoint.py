@@ -118,7 +118,7 @@ def check_same_run(checkpoint: Checkpoint, method: str, recipe: dict[str, Any], 
 
 
 def export_weights(network: nn.Module, path: Path) -> None:
-    """Write weights with half precision, as `spackle.residual.weights.load_residual` reads them.
+    """Write weights with half precision, as `spackle.residual.network.load_residual` reads them.
 
     Raises:
         InputError: where the file cannot be written.

@@ -13,9 +13,8 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, TILE
 from spackle.rendering import Rendering
-from spackle.residual.cues import CELL, Cues, hole_mask
-from spackle.residual.rim import Rim
-from spackle.residual.seeds import Seeds, make_seeds
+from spackle.residual.hole_features import CELL, Cues, hole_mask
+from spackle.residual.seeds import Rim, Seeds, make_seeds
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
 FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which an opaque blob is no longer drawn

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual.compose import compose
-from spackle.residual.cues import Cues
+from spackle.residual.hole_features import Cues
 from spackle.residual.network import network_input
 from spackle.training.sample import Sample
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from spackle.residual.cues import hole_area_ratio
+from spackle.residual.hole_features import hole_area_ratio
 from spackle.training.distance import hole_psnr
 from spackle.training.step import Batch
 from spackle.training.validation import Judge

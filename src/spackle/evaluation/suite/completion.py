@@ -33,8 +33,8 @@ from spackle.render import Renderer
 from spackle.render.project import View
 from spackle.residual import CELL, ResidualNet, hole_area_ratio
 from spackle.residual.compose import DELTA_CHANNELS
-from spackle.residual.crops import crops_around
 from spackle.residual.network import STRIDE, compile_network, predict_deltas
+from spackle.residual.sparse import crops_around
 
 SHARE = 0.05  # of the view's pixels that are holes
 STAGES = (CUES, NETWORK, PLACE, REDRAW)
@@ -71,11 +71,11 @@ def completion_section(
     """
     disparity, camera = find_view(base, photo_camera, renderer, share)
     view = HoledView(base, photo_camera, camera, renderer, network)
-    shield = view.completer.photo_shield()
+    shield = view.completer.photo_guard()
     looks, after = check_fill(view, shield)
     tasks: dict[str, Task] = {
         "view": lambda lap: fill(view, shield, lap),
-        SHIELD: lambda _: view.completer.photo_shield(),
+        SHIELD: lambda _: view.completer.photo_guard(),
     }
     times = measure(runs, tasks, device)
     needs = _needs(view, looks)

@@ -15,11 +15,11 @@ from spackle.precision import Precision
 from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds
-from spackle.residual.carve import Shield, push_behind
 from spackle.residual.complete import CLOSED_HAR, PASSES
 from spackle.residual.compose import compose
 from spackle.residual.network import predict_deltas
-from spackle.residual.rim import Rim
+from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
+from spackle.residual.seeds import Rim
 from spackle.trajectory import MAX_DISPARITY, DepthRange, extremes
 
 RENDER = "base render of the view"
@@ -54,7 +54,7 @@ class Look:
     tiles: Tensor
 
 
-def fill(view: HoledView, shield: Shield, lap: Lap) -> tuple[list[Look], Rendering]:
+def fill(view: HoledView, shield: OcclusionGuard, lap: Lap) -> tuple[list[Look], Rendering]:
     """Render and complete a view; what `Completer.completed_view` does, in stages."""
     rendering = view.renderer.render(view.base, view.camera)
     lap(RENDER)
@@ -84,7 +84,7 @@ def fill(view: HoledView, shield: Shield, lap: Lap) -> tuple[list[Look], Renderi
     return looks, rendering
 
 
-def check_fill(view: HoledView, shield: Shield) -> tuple[list[Look], Rendering]:
+def check_fill(view: HoledView, shield: OcclusionGuard) -> tuple[list[Look], Rendering]:
     """What `fill` finds; RuntimeError where that is not what the completer finds: other work would be timed."""
     looks, rendering = fill(view, shield, lambda name: None)
     aux, expected = view.completer.completed_view(view.camera, [shield])

@@ -69,7 +69,7 @@ def video_section(
 
     def scratch(lap: Lap) -> None:
         for camera in path:
-            shield = completer.photo_shield()
+            shield = completer.photo_guard()
             lap(SHIELDS)
             completer.completed_view(camera, [shield])
             lap(EACH)

@@ -29,7 +29,7 @@ from spackle.jobs.dataset.options import weights_digest
 from spackle.jobs.demo import load_motorcycle
 from spackle.render import CpuRenderer, GsplatRenderer, Renderer
 from spackle.residual import ResidualNet
-from spackle.residual.weights import load_residual
+from spackle.residual.network import load_residual
 
 NO_SHARP = "no weights: -c FILE names some, --base sharp takes those that are installed"
 

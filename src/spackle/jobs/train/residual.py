@@ -11,8 +11,7 @@ from spackle.jobs.inputs import make_folder
 from spackle.jobs.progress import Reporter
 from spackle.jobs.train.judge import feature_name, judge_of
 from spackle.jobs.train.plan import Place, Start, parameters
-from spackle.residual.network import ResidualNet
-from spackle.residual.weights import load_residual
+from spackle.residual.network import ResidualNet, load_residual
 from spackle.training.data import SampleFiles, Supply
 from spackle.training.method import MethodName
 from spackle.training.recipe import Recipe

@@ -10,7 +10,7 @@ from spackle.camera import Camera
 from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.residual.compose import compose
-from spackle.residual.cues import CELL, Cues
+from spackle.residual.hole_features import CELL, Cues
 from spackle.residual.seeds import BLOB_CELLS, Seeds, placed_behind
 from spackle.residual.sparse import Cells
 from spackle.surface import surface_slope
@@ -20,7 +20,7 @@ COARSE = 3  # one Gaussian for COARSE × COARSE cells, as much larger: what lies
 EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 
-def tucked(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
+def rim_underlay(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
     """What goes on beneath the surfaces around the holes of a view, as the holes' seeds do, behind all that is seen.
 
     From beside, the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This closes

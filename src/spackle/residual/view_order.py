@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
-from spackle.residual.cues import MASK_THRESHOLD
+from spackle.residual.hole_features import MASK_THRESHOLD
 
 QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
 SURE_HAR = QUIET_HAR / 4  # so few that frames farther off need no look either
@@ -18,7 +18,7 @@ SPECK_PX = 4  # a square of holes as wide as this is seen, however little else i
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """An order that visits the widest view first and then always the one farthest from all visited.
+    """An order that settled the widest view first and then always the one farthest from all visited.
 
     Any beginning of it is spread evenly over the path.
     """
@@ -55,7 +55,7 @@ def has_speck(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> bool:
     return bool((max_pool2d(alpha[None], SPECK_PX, stride=SPECK_PX // 2) < threshold).any())
 
 
-class Visits:
+class SettledFrames:
     """Which frames of a path are known to be in order: looked at, or near one that needed nothing."""
 
     def __init__(self, frames: int) -> None:

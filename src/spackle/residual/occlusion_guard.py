@@ -14,58 +14,58 @@ from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
-from spackle.residual.cues import MASK_THRESHOLD
+from spackle.residual.hole_features import MASK_THRESHOLD
 from spackle.threads import run_chunks
 
-SHIELD_PX = 4  # radius of the shield's window: most aux Gaussians reach no farther than this
+WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
 MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
 CLEARANCE = 0.002  # relative distance behind the surface that counts as behind
-GRAIN, ROWS = 1024, 64  # Gaussians, and rows of a shield, that a thread takes at a time
+GRAIN, ROWS = 1024, 64  # Gaussians, and rows of a guard, that a thread takes at a time
 STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
 
 @dataclasses.dataclass(frozen=True)
-class Shield:
+class OcclusionGuard:
     """The farthest surface that a view shows near each pixel: nothing new may stand in front of it."""
 
     camera: Camera
     depth: Tensor  # [H, W]; 0 where the view shows only holes
 
     @staticmethod
-    def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> Shield:
-        """The shield of a rendered view."""
+    def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
+        """The guard of a rendered view."""
         images = (rendering.depth, rendering.alpha)
         depth, alpha = (image.detach().to("cpu", torch.float32).contiguous().numpy() for image in images)
         wide, low = np.empty_like(depth), np.float32(threshold)
         run_chunks(lambda start, stop: _widest(start, stop, depth, alpha, low, wide), len(depth), ROWS)
-        return Shield(camera, torch.from_numpy(wide).to(rendering.depth.device))
+        return OcclusionGuard(camera, torch.from_numpy(wide).to(rendering.depth.device))
 
 
 @kernel
 def _widest(start: int, stop: int, depth: Any, alpha: Any, threshold: Any, wide: Any) -> None:
     """Rows start..stop of the farthest depth in the window around each pixel, by columns and then along the row."""
     height, width = depth.shape
-    above, below = max(start - SHIELD_PX, 0), min(stop + SHIELD_PX, height)
+    above, below = max(start - WINDOW_PX, 0), min(stop + WINDOW_PX, height)
     seen = np.empty((below - above, width), np.float32)
     for y in range(above, below):
         for x in range(width):
             seen[y - above, x] = np.float32(0) if alpha[y, x] < threshold else depth[y, x]
-    row = np.zeros(width + 2 * SHIELD_PX, np.float32)
+    row = np.zeros(width + 2 * WINDOW_PX, np.float32)
     for y in range(start, stop):
-        row[SHIELD_PX : SHIELD_PX + width] = 0
-        for v in range(max(y - SHIELD_PX, 0), min(y + SHIELD_PX + 1, height)):
+        row[WINDOW_PX : WINDOW_PX + width] = 0
+        for v in range(max(y - WINDOW_PX, 0), min(y + WINDOW_PX + 1, height)):
             for x in range(width):
-                row[SHIELD_PX + x] = max(row[SHIELD_PX + x], seen[v - above, x])
+                row[WINDOW_PX + x] = max(row[WINDOW_PX + x], seen[v - above, x])
         for x in range(width):
             wide[y, x] = row[x]
-        for k in range(1, 2 * SHIELD_PX + 1):
+        for k in range(1, 2 * WINDOW_PX + 1):
             for x in range(width):
                 wide[y, x] = max(wide[y, x], row[x + k])
 
 
-def push_behind(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> Gaussians:
-    """Slide Gaussians away from the eye that wants them until no shield is blocked.
+def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
+    """Slide Gaussians away from the eye that wants them until no guard is blocked.
 
     Scaling about the eye moves and grows a Gaussian without changing how that eye sees it. Far enough
     out everything is behind everything, so a place is found for nearly all; the rest is dropped.
@@ -73,16 +73,16 @@ def push_behind(aux: Gaussians, eye: Tensor, shields: Sequence[Shield]) -> Gauss
     Args:
         aux: N Gaussians in the world's frame.
         eye: [3] position of the view that they were made for.
-        shields: the views to protect.
+        guards: the views to protect.
     """
-    if not len(aux) or not shields:
+    if not len(aux) or not guards:
         return aux
     eye = eye.to(aux.means)
     rays = (aux.means - eye).detach().cpu().double().numpy()
     quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
-    lenses = np.stack([_lens(shield.camera) for shield in shields])
-    depths = np.concatenate([shield.depth.detach().cpu().float().numpy().ravel() for shield in shields])
-    sizes = np.array([[shield.camera.height, shield.camera.width] for shield in shields])
+    lenses = np.stack([_lens(guard.camera) for guard in guards])
+    depths = np.concatenate([guard.depth.detach().cpu().float().numpy().ravel() for guard in guards])
+    sizes = np.array([[guard.camera.height, guard.camera.width] for guard in guards])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     place, factors = eye.cpu().double().numpy(), np.empty(len(rays))
     shown = (lenses, depths, sizes, starts)
@@ -106,7 +106,7 @@ def _free_factors(
     first: int, last: int, eye: Any, rays: Any, quats: Any, scales: Any,
     lenses: Any, depths: Any, sizes: Any, starts: Any, factors: Any,
 ) -> None:  # fmt: skip
-    """For the Gaussians first..last the least of 1 / (1 − k / STEPS) that no shield blocks; 0 where there is none."""
+    """For the Gaussians first..last the least of 1 / (1 − k / STEPS) that no guard blocks; 0 where there is none."""
     for n in range(first, last):
         factors[n] = 0
         covariance = _covariance(quats[n], scales[n])
@@ -144,7 +144,7 @@ def _covariance(quat: Any, scale: Any) -> Any:
 
 @kernel
 def _blocks(
-    lens: Any, shields: Any, start: int, height: int, width: int,
+    lens: Any, guards: Any, start: int, height: int, width: int,
     x: float, y: float, z: float, covariance: Any, factor: float,
 ) -> bool:  # fmt: skip
     """Whether a Gaussian would stand in front of what a view shows, anywhere in its reach."""
@@ -160,14 +160,14 @@ def _blocks(
     reach_v = _reach(lens, 8, lens[1] * factor / depth, tan_v, covariance)
     if u < -reach_u or v < -reach_v or u > width + reach_u or v > height + reach_v:
         return False
-    # Windows of the shield, side by side, cover the reach.
-    steps_u = int(np.ceil(max(reach_u - SHIELD_PX, 0.0) / (2 * SHIELD_PX)))
-    steps_v = int(np.ceil(max(reach_v - SHIELD_PX, 0.0) / (2 * SHIELD_PX)))
+    # Windows of the guard, side by side, cover the reach.
+    steps_u = int(np.ceil(max(reach_u - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
+    steps_v = int(np.ceil(max(reach_v - WINDOW_PX, 0.0) / (2 * WINDOW_PX)))
     for j in range(-steps_v, steps_v + 1):
-        row = min(max(int(np.floor(v + 2 * SHIELD_PX * j)), 0), height - 1)
+        row = min(max(int(np.floor(v + 2 * WINDOW_PX * j)), 0), height - 1)
         for i in range(-steps_u, steps_u + 1):
-            column = min(max(int(np.floor(u + 2 * SHIELD_PX * i)), 0), width - 1)
-            if depth < shields[start + row * width + column] * (1.0 + CLEARANCE):
+            column = min(max(int(np.floor(u + 2 * WINDOW_PX * i)), 0), width - 1)
+            if depth < guards[start + row * width + column] * (1.0 + CLEARANCE):
                 return True
     return False
 

@@ -1,0 +1,374 @@
+"""How a picture came about from the one before it: flow where it can be seen, and a guess of it in the holes.
+
+Carrying what fills the holes from one frame of a clip into the next, so that it does not flicker.
+
+Each frame's completion knows nothing of the others. Here its aux Gaussians keep their places but take on the colours
+that stood there a frame ago, followed back by the motion of what is behind. Where an earlier frame has seen what is
+hidden now, that is the truth, and it is carried as such. All blending is of linear light.
+
+Depth that a network says anew for each frame of a clip, held to that of the frames before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.fill import far_fill
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer, touched_tiles
+from spackle.rendering import Rendering
+from spackle.residual.hole_features import CELL, hole_mask
+
+# Of two sRGB pictures [H, W, 3]: how far from each pixel of the first its content lies in the second, [H, W, 2].
+Flow = Callable[[Tensor, Tensor], Tensor]
+
+RETURN_PX, RETURN_SHARE = 1.0, 0.05  # there and back again must end this near, plus this share of the way
+ALIKE = 0.1  # mean difference of sRGB between what is taken for the same thing
+SAME_SHOT = 0.3  # share of a picture that must be found again in the one before, or this is another shot
+THINNING = 4  # every fourth pixel each way is enough for six numbers
+ROUNDS = 8  # of reweighting
+FIT_PX = 0.5  # how far a pixel may be off the camera's motion and count half
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """Where a picture's content was in the one before."""
+
+    flow: Tensor  # [H, W, 2] pixels (x, y), from this picture's pixels to the earlier one's
+    sure: Tensor  # [H, W] bool: found there, and found here again from there
+
+    def same_shot(self, where: Tensor | None = None) -> bool:
+        """Whether enough of the picture, or of its pixels `where` [H, W] bool, was there before."""
+        sure = self.sure if where is None else self.sure[where]
+        return sure.numel() > 0 and float(sure.float().mean()) >= SAME_SHOT
+
+
+def track(picture: Tensor, earlier: Tensor, flow: Flow) -> Track:
+    """Follow a picture [H, W, 3] back into an earlier one of its size."""
+    back, forth = flow(picture, earlier), flow(earlier, picture)
+    target = pixel_grid(back) + back
+    gap = (back + sample(forth, target)).norm(dim=-1)
+    sure = gap < RETURN_PX + RETURN_SHARE * back.norm(dim=-1)
+    sure &= (sample(earlier, target) - picture).abs().mean(-1) < ALIKE
+    return Track(back, sure & inside(target, *picture.shape[:2]))
+
+
+def pixel_grid(image: Tensor) -> Tensor:
+    """Centres of the pixels of an image [H, W, ...]: [H, W, 2] as (x, y)."""
+    rows, columns = (torch.arange(n, device=image.device) + 0.5 for n in image.shape[:2])
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+
+
+def inside(uv: Tensor, height: int, width: int) -> Tensor:
+    """[...] bool: which pixel positions [..., 2] lie between the outermost pixels' centres."""
+    return ((uv >= 0.5) & (uv <= uv.new_tensor([width, height]) - 0.5)).all(-1)
+
+
+def sample(image: Tensor, uv: Tensor) -> Tensor:
+    """Bilinear values [h, w, C] of an image [H, W, C] at pixel positions [h, w, 2]; the border goes on outside."""
+    grid = 2 * uv / uv.new_tensor([image.shape[1], image.shape[0]]) - 1
+    found = grid_sample(image.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border")
+    return found[0].permute(1, 2, 0)
+
+
+def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
+    """The flow with a guess of it where nothing was seen: as the camera moved, and as the far rim differs from that.
+
+    Args:
+        found: what could be followed.
+        inverse_depth: [H, W] positive everywhere, in the holes that of what is to stand there.
+        known: [H, W] bool, where the flow is one of the scene's content.
+        camera: whose picture it is.
+
+    Returns:
+        [H, W, 2]; as found wherever it is known and sure.
+    """
+    trusted = known & found.sure
+    if not bool(trusted.any()):
+        return torch.zeros_like(found.flow)
+    basis = _motions(inverse_depth, camera)
+    rigid = basis @ _fit(basis, found.flow, trusted)
+    rest = (found.flow - rigid).permute(2, 0, 1)
+    _, filled = far_fill(inverse_depth, rest, trusted)
+    return rigid + filled.permute(1, 2, 0)
+
+
+def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
+    """The flow of each of the camera's six small motions, [H, W, 2, 6]: translation first (Longuet-Higgins, 1980)."""
+    fx, fy = camera.focal
+    center = camera.K[:2, 2].to(inverse_depth)
+    x, y = ((pixel_grid(inverse_depth) - center) / inverse_depth.new_tensor([fx, fy])).unbind(-1)
+    near, zero = inverse_depth, torch.zeros_like(x)
+    across = [near, zero, -near * x, x * y, -(1 + x * x), y]
+    down = [zero, near, -near * y, 1 + y * y, -x * y, -x]
+    return torch.stack([fx * torch.stack(across, -1), fy * torch.stack(down, -1)], dim=-2)
+
+
+def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
+    """The six numbers of the motion that most of the picture follows; what moves by itself is outvoted."""
+    chosen = torch.zeros_like(trusted)
+    chosen[::THINNING, ::THINNING] = True
+    chosen &= trusted
+    if int(chosen.sum()) < 6:
+        chosen = trusted
+    rows, wanted = basis[chosen].double(), flow[chosen].double()
+    size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # so that one small ridge suits all columns
+    rows = rows / size
+    weights = rows.new_ones(len(rows))
+    motion = rows.new_zeros(6)
+    for _ in range(ROUNDS):
+        weighted = rows * weights[:, None, None]
+        normal = torch.einsum("nci,ncj->ij", weighted, rows) + 1e-9 * torch.eye(6).to(rows)
+        motion = torch.linalg.solve(normal, torch.einsum("nci,nc->i", weighted, wanted))
+        off = (rows @ motion - wanted).norm(dim=-1)
+        scale = max(FIT_PX, 1.5 * float(off.median()))
+        weights = 1 / (1 + (off / scale) ** 2)
+    found: Tensor = motion / size
+    return found.to(flow.dtype)
+
+
+KEEP = 0.98  # of the trust in a colour, from frame to frame: what was seen outlives fifty frames
+GUESS = 0.9  # trust in what a completion made up; what was seen has 1
+NEARER = 0.1  # a past that stood this much nearer, relatively, is something else
+CARRIED = 0.5  # more weight than this on the past, and the pixel counts as carried
+THIN = 0.05  # least share of a pixel's light that is divided by
+FAINT = 0.25  # what has a smaller share of a pixel is too uncertain to be remembered
+MAX_GAIN = 2.0  # of the exposure, between two frames
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameMemory:
+    """What is known of a view once its frame is done."""
+
+    shown: Tensor  # [H, W, 3] sRGB of the completed view
+    light: Tensor  # [H, W, 3] linear: what was seen, and in the holes what stands behind their veil
+    inverse_depth: Tensor  # [H, W] of the same, positive
+    trust: Tensor  # [H, W] in 0..1: 1 where it was seen, about KEEP^n where that was n frames ago
+
+
+@dataclasses.dataclass(frozen=True)
+class CompletedFrame:
+    """A completed view whose holes are as they were, as far as they were there."""
+
+    aux: Gaussians
+    view: Rendering
+    memory: FrameMemory
+    flow: Tensor | None  # [H, W, 2] into the view before, holes included; None where there is none
+
+
+def propagate_colors(
+    base: Gaussians,
+    aux: Gaussians,
+    camera: Camera,
+    renderer: Renderer,
+    views: Sequence[Rendering],
+    past: FrameMemory | None,
+    flow: Flow,
+) -> CompletedFrame:
+    """Give the aux Gaussians of a frame the colours of the past.
+
+    Args:
+        base: the frame's own Gaussians.
+        aux: what completes them in this view, made without the past.
+        camera: the view.
+        renderer: draws the view again.
+        views: the view of the base alone, and with `aux`.
+        past: of the view before; None at the start. One of another shot is passed over, see `Track.same_shot`.
+        flow: finds the motion between two pictures.
+    """
+    before, own = views
+    hole = hole_mask(before.alpha)
+    made_up, inverse_depth = behind(before, own, hole)
+    share = torch.where(hole, own.alpha - before.alpha, 1.0).clamp_min(0)
+    start = FrameMemory(own.rgb, made_up, inverse_depth, _trust(hole, share, torch.zeros_like(share)))
+    found = None if past is None else track(own.rgb, past.shown, flow)
+    if past is None or found is None or not found.same_shot(~hole):
+        return CompletedFrame(aux, own, start, None)
+    motion = extend_flow(found, inverse_depth, ~hole, camera)
+    if not bool(hole.any()):
+        return CompletedFrame(aux, own, start, motion)
+    recalled, weight = _recall(past, pixel_grid(motion) + motion, inverse_depth)
+    recalled = recalled * _exposure(made_up, past, found, hole)
+    weight = torch.where(hole, KEEP * weight, 0.0)
+    fresh = made_up + _beside(recalled - made_up, hole, weight, inverse_depth)
+    blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
+    light = torch.where(hole[..., None], blended, made_up)
+    # In what is faint, a cell's own colour is all noise: no change can be told from it.
+    changed = _recoloured(aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0))
+    view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
+    return CompletedFrame(
+        changed, view, FrameMemory(view.rgb, light, inverse_depth, _trust(hole, share, weight)), motion
+    )
+
+
+def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
+    """[H, W] trust in a view's light: what is seen has 1, what fills a hole its past's weight or that of a guess."""
+    filled = torch.where(share < FAINT, 0.0, weight.clamp_min(GUESS))
+    return torch.where(hole, filled, 1.0)
+
+
+def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear light [H, W, 3] and inverse depth [H, W] of a view; in holes those of what was added to the base."""
+    share = (own.alpha - before.alpha).clamp_min(THIN)
+    there, now = srgb_to_linear(before.rgb), srgb_to_linear(own.rgb)
+    added = ((now - there) / share[..., None]).clamp(0, 1)
+    depth = (own.depth * own.alpha - before.depth * before.alpha) / share
+    depth = torch.where(hole & (depth > 0), depth, own.depth)
+    inverse = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+    smallest = inverse[inverse > 0].min() if bool((inverse > 0).any()) else inverse.new_tensor(1.0)
+    return torch.where(hole[..., None], added, now), torch.where(inverse > 0, inverse, smallest)
+
+
+def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Light [H, W, 3] that stood at uv [H, W, 2] in the past, and how far it is trusted, [H, W].
+
+    Of the four pixels around, those count that do not stand clearly nearer than what is looked for: they are
+    the edge of the thing that hides it.
+    """
+    height, width = past.trust.shape
+    corner = (uv - 0.5).floor()
+    part = uv - 0.5 - corner
+    light, mass, trust = torch.zeros_like(past.light), torch.zeros_like(past.trust), torch.zeros_like(past.trust)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            column = (corner[..., 0].long() + dx).clamp(0, width - 1)
+            row = (corner[..., 1].long() + dy).clamp(0, height - 1)
+            share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
+            nearer = (past.inverse_depth[row, column] / inverse_depth - 1).clamp_min(0)
+            share = share * torch.exp(-((nearer / NEARER) ** 2)) * (past.trust[row, column] > 0)
+            light += share[..., None] * past.light[row, column]
+            trust += share * past.trust[row, column]
+            mass += share
+    there = inside(uv, height, width)
+    return light / mass.clamp_min(1e-6)[..., None], torch.where(there, trust, 0.0)
+
+
+def _exposure(light: Tensor, past: FrameMemory, found: Track, hole: Tensor) -> Tensor:
+    """[3] how much brighter the frame is than the one before, where both show the same."""
+    same = found.sure & ~hole
+    was = sample(past.light, pixel_grid(light) + found.flow)[same]
+    gain = light[same].mean(0) / was.mean(0).clamp_min(1e-4)
+    return torch.nan_to_num(gain, nan=1.0).clamp(1 / MAX_GAIN, MAX_GAIN)
+
+
+def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
+    """The change [H, W, 3] of what is carried, spread over what is new, down to nothing at the rim: no seams."""
+    carried = weight > CARRIED
+    known = ~hole | carried
+    values = torch.where(carried[..., None], change, 0.0).permute(2, 0, 1)
+    if not bool(carried.any()) or bool(known.all()):
+        return torch.zeros_like(change)
+    _, spread = far_fill(inverse_depth, values, known, far_bias=0.0)
+    return torch.where(known[..., None], 0.0, spread.permute(1, 2, 0))
+
+
+def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -> Gaussians:
+    """Aux Gaussians whose colours change as the pixels [H, W, 3] of their cells do, on the mean over their shares."""
+    weighted = torch.cat([change * share[..., None], share[..., None]], dim=-1)
+    sums = avg_pool2d(weighted.permute(2, 0, 1)[None], CELL, ceil_mode=True)[0]
+    mean = sums[:3] / sums[3:].clamp_min(1e-6)
+    uv, _ = camera.project(aux.means)
+    column, row = (uv / CELL).floor().long().unbind(-1)
+    height, width = mean.shape[1:]
+    picked = mean[:, row.clamp(0, height - 1), column.clamp(0, width - 1)].T
+    return dataclasses.replace(aux, colors=(aux.colors + picked).clamp(0, 1))
+
+
+def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
+    """Mean absolute difference of a view [H, W, 3] from an earlier one that is warped by a flow [H, W, 2].
+
+    Args:
+        view: sRGB.
+        earlier: sRGB, of the same size.
+        flow: from the view's pixels to the earlier one's.
+        chosen: [H, W] bool, the pixels that count.
+
+    Returns:
+        In sRGB of 0..1; None where no pixel counts.
+    """
+    uv = pixel_grid(flow) + flow
+    chosen = chosen & inside(uv, *chosen.shape)
+    if not bool(chosen.any()):
+        return None
+    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean())
+
+
+LEAK = 0.95  # of the correction, from frame to frame: flicker goes, what changes slowly stays as the base has it
+FEWEST = 64  # followed pixels that a fit needs
+OFF = 0.02  # of the median inverse depth: a pixel that is off by this much counts half
+NO_SHIFT = 0.01  # weight of the wish for no shift, against all pixels: where depths are alike, scale explains all
+MAX_SCALE = 2.0  # between two frames
+LEAST = 0.25  # a shift takes at most this away from the farthest
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthAlignment:
+    """An affine map of inverse depth, seen from the photo's eye: scale · 1/z + shift."""
+
+    scale: float = 1.0
+    shift: float = 0.0  # 1/m
+
+    def of(self, inverse_depth: Tensor) -> Tensor:
+        """The mapped inverse depth; what is positive stays so."""
+        scaled = self.scale * inverse_depth
+        return torch.maximum(scaled + self.shift, LEAST * scaled)
+
+    def after(self, first: DepthAlignment) -> DepthAlignment:
+        """This map, applied to what the other one gives."""
+        return DepthAlignment(self.scale * first.scale, self.scale * first.shift + self.shift)
+
+    def leaked(self) -> DepthAlignment:
+        """A little nearer to no map at all."""
+        return DepthAlignment(self.scale**LEAK, LEAK * self.shift)
+
+    def of_depth(self, depth: Tensor) -> Tensor:
+        """Mapped depth of any shape; what is not in front of the eye only scales."""
+        front = depth > 0
+        return torch.where(front, 1 / self.of(1 / depth.where(front, 1.0)), depth / self.scale)
+
+    def of_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of a camera at the world's origin, moved along its rays: it sees them as before."""
+        if self == DepthAlignment():
+            return gaussians
+        z = gaussians.means[:, 2]
+        factor = torch.where(z == 0, 1.0, self.of_depth(z) / z.where(z != 0, 1.0))[:, None]
+        return dataclasses.replace(gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor)
+
+
+def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
+    """What brings the inverse depth of a frame to that of the one before, where it shows the same.
+
+    Robust least squares: what moves by itself, and where the two disagree in shape, is outvoted.
+
+    Args:
+        inverse_depth: [H, W], 0 where unknown.
+        earlier: [H, W], of the frame before.
+        found: where the frame's pixels were in that one.
+    """
+    was = sample(earlier[..., None], pixel_grid(earlier) + found.flow)[..., 0]
+    chosen = found.sure & (inverse_depth > 0) & (was > 0)
+    thin = torch.zeros_like(chosen)
+    thin[::THINNING, ::THINNING] = True
+    if int((chosen & thin).sum()) >= FEWEST:
+        chosen = chosen & thin
+    now, then = inverse_depth[chosen].double(), was[chosen].double()
+    if len(now) < FEWEST:
+        return DepthAlignment()
+    unit = float(then.median())
+    scale, shift = float((then / now).median()), 0.0
+    for _ in range(ROUNDS):
+        weights = 1 / (1 + ((scale * now + shift - then) / (OFF * unit)) ** 2)
+        mass, x, y = weights.sum(), (weights * now).sum(), (weights * then).sum()
+        normal = torch.stack([torch.stack([(weights * now * now).sum(), x]), torch.stack([x, mass * (1 + NO_SHIFT)])])
+        scale, shift = torch.linalg.solve(normal, torch.stack([(weights * now * then).sum(), y])).tolist()
+    if not (math.isfinite(scale) and math.isfinite(shift) and 1 / MAX_SCALE <= scale <= MAX_SCALE):
+        return DepthAlignment()
+    return DepthAlignment(scale, shift)
