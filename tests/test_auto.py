@@ -196,7 +196,7 @@ def test_depth_of_another_shape_than_the_photo_is_passed_over(tmp_path: Path, mo
         depth = torch.full((WIDTH, HEIGHT), 2.0)
         return DepthMap(depth, depth > 0, None, None, "depth", path)
 
-    monkeypatch.setattr("spackle.choose.load_photo_depth", wrong)
+    monkeypatch.setattr("spackle.bases.open.load_photo_depth", wrong)
     photo = write_photo(tmp_path / "photo.jpg")
     base, result = base_of(tmp_path, "-i", photo)
     assert base["name"] == "lite"

@@ -18,12 +18,13 @@ from stand_in import StandIn, base_of, predict, refuses, write_lite
 
 from spackle.bases.device import MemoryShort
 from spackle.bases.hf import HfBase
+from spackle.bases.open import KINDS
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.evaluation.setup import EvaluateOptions
 from spackle.image import Photo
-from spackle.jobs.bases import KINDS, base_files, public_name, says_of
+from spackle.jobs.bases import base_files, public_name, says_of
 from spackle.jobs.bench.options import BenchOptions
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import shared_digest

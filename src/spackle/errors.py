@@ -1,5 +1,10 @@
 """The one exception that means "your input, not our bug"."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class InputError(ValueError):
     """Bad input from a person: the message names the file or value, what is wrong and what to do.
@@ -11,3 +16,13 @@ class InputError(ValueError):
 def reason_in_a_line(error: object) -> str:
     """What somebody else's exception says, for the middle of a message of ours: at most 200 characters."""
     return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def check_name(option: str, name: str, known: Iterable[str]) -> None:
+    """InputError for a name that there is not, with the nearest one."""
+    names = list(known)
+    if name in names:
+        return
+    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    advice = f"did you mean {near[0]}? There" if near else "there"
+    raise InputError(f"{option} {name}: unknown: {advice} are {', '.join(names)}")

@@ -6,15 +6,15 @@ import dataclasses
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Literal
 
 import torch
 
-from spackle.bases.depth_maps import DepthMap, load_depth
+from spackle.bases.depth_maps import DepthMap
+from spackle.bases.open import BaseSettings, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
-from spackle.bases.rgbd import RgbdBase
 from spackle.camera import Camera
-from spackle.choose import auto_here, finite_prediction
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.formats.video import check_video
@@ -128,18 +128,12 @@ def predict(
     if isinstance(base, str):
         raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
     loaded = photo if isinstance(photo, Photo) else load_photo(photo)
-    if depth is not None:
-        base = RgbdBase(depth if isinstance(depth, DepthMap) else load_depth(depth))
-    prediction = _by_the_best_base(loaded) if base is None else finite_prediction(base, loaded)
+    source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
+    prediction, choice = (open_base(BaseSettings(depth=source)) if base is None else open_loaded(base)).predict(loaded)
+    if choice.news:
+        LOG.info("%s: %s", loaded.path.name, choice.news)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
     return complete(prediction, cameras, network=network, renderer=renderer)
-
-
-def _by_the_best_base(photo: Photo) -> BasePrediction:
-    """The photo's Gaussians by the best base that this machine has for it."""
-    prediction, choice = auto_here().search(photo, LOG.warning).predict()
-    LOG.info("%s: %s", photo.path.name, choice.line)
-    return prediction
 
 
 def complete(

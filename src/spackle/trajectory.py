@@ -23,6 +23,11 @@ MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
 MAX_ZOOM = 0.15  # forward motion of rotate_forward, in units of z_near
 
 
+def spelled(kind: TrajectoryKind) -> str:
+    """A trajectory as --trajectory spells it, and as everything does that a person reads."""
+    return kind.replace("_", "-")
+
+
 @dataclasses.dataclass(frozen=True)
 class DepthRange:
     """The two depths that a trajectory depends on."""

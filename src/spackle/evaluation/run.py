@@ -21,7 +21,8 @@ from torch import Tensor
 
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
-from spackle.choose import BaseError, Load
+from spackle.bases.open import BaseError
+from spackle.choose import Load
 from spackle.errors import InputError
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
@@ -58,7 +59,7 @@ from spackle.formats.png import to_bytes
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
-from spackle.jobs.request import digest_of, fingerprint
+from spackle.digest import digest_of, fingerprint
 from spackle.jobs.stopping import asked_to_stop
 from spackle.residual import hole_mask
 

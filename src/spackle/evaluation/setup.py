@@ -16,7 +16,8 @@ import torch
 
 import spackle
 from spackle.bases.sharp import SharpBase
-from spackle.choose import BaseError, Load
+from spackle.bases.open import BaseError
+from spackle.choose import Load
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, EvalDataset
 from spackle.evaluation.datasets import DATASETS, get_dataset
@@ -24,11 +25,12 @@ from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, PROTOCOLS, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
-from spackle.jobs.bases import NETWORKS, kind_of, public_name, says_of, title_of
+from spackle.jobs.bases import NETWORKS, public_name, says_of, title_of
+from spackle.bases.open import kind_of
 from spackle.jobs.dataset.options import base_digest, weights_digest
-from spackle.jobs.names import check_name
+from spackle.errors import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
-from spackle.jobs.request import digest_of
+from spackle.digest import digest_of
 from spackle.jobs.setup import set_up
 from spackle.precision import PRECISIONS, pick_dtype
 from spackle.render import Renderer, get_renderer

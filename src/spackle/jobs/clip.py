@@ -9,22 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import spackle
+from spackle.bases.open import Choice, all_finite
 from spackle.bases.protocol import BasePrediction
-from spackle.choose import Choice, Search, all_finite, finite_prediction
 from spackle.errors import InputError
 from spackle.formats.clip import Clip, clip_frames, read_clip
 from spackle.formats.clip_writer import ClipWriter
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.jobs.clip_frames import FIGURES, ClipChoices, ClipCompleter, Drawn
 from spackle.jobs.inputs import results_folder
-from spackle.jobs.names import spelled
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.report import focal_source, write_report
-from spackle.jobs.setup import Tools, search_base
+from spackle.jobs.setup import Tools
 from spackle.jobs.video_options import VideoOptions
 from spackle.opencv import OpenCV
 from spackle.residual import hole_area_ratio
+from spackle.trajectory import spelled
 
 FILES = ("video.mp4", "report.json")
 NOT_FOR_CLIPS = {
@@ -102,7 +102,7 @@ class _Run:
             precision=options.precision,
         )
         self._completer = ClipCompleter(choices, tools.renderer, OpenCV("a clip").flow)
-        self._search: Search | None = None
+        self._base = tools.opened
         self._first: tuple[Photo, BasePrediction, Choice] | None = None
         self._notes: list[dict[str, Any]] = []
         self._sound = False
@@ -140,15 +140,12 @@ class _Run:
 
     def _predict(self, photo: Photo) -> BasePrediction:
         """A frame's Gaussians, by the base that the first frame got."""
-        if self._search is not None and self._options.depth is None:
-            return finite_prediction(self._search.load(), photo)
-        search = search_base(photo, self._options, self._tools, self._reporter.say)
-        prediction, choice = search.predict()
-        if self._search is None:
-            self._search, self._first = search, (photo, prediction, choice)
+        prediction, choice = self._base.load(photo, log=self._reporter.say).predict()
+        if self._first is None:
+            self._base, self._first = self._base.only(choice), (photo, prediction, choice)
             name, focal = self._clip.path.name, prediction.camera.focal[0]
-            if self._tools.auto is not None and (news := self._tools.auto.news(choice)):
-                self._reporter.say(f"{name}: {news}")
+            if choice.news:
+                self._reporter.say(f"{name}: {choice.news}")
             self._reporter.say(
                 f"{name}: {len(self._clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
                 f"for each, focal length {focal:.0f} px ({focal_source(photo, prediction)})"

@@ -14,7 +14,6 @@ from spackle.errors import InputError
 from spackle.formats import check_writable
 from spackle.image import PHOTO_SUFFIXES
 
-DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 LOCK = ".lock"
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
 
@@ -39,23 +38,6 @@ def find_photos(path: Path) -> list[tuple[Path, str]]:
     names = {photo.name.casefold() for photo in photos}
     taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
     return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
-
-
-def find_depth(depth: Path, photo: Path) -> Path:
-    """The depth map of a photo: the file itself, or the one of its name in a folder.
-
-    Raises:
-        InputError: a folder without such a file.
-    """
-    if not os.path.isdir(depth):
-        return depth
-    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which a.png may mean too
-        for suffix in DEPTH_SUFFIXES:
-            candidate = depth / f"{name}{suffix}"
-            if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
-                return candidate
-    names = ", ".join(f"{photo.stem}{suffix}" for suffix in DEPTH_SUFFIXES)
-    raise InputError(f"{photo}: no depth map in {depth}: looked for {names}")
 
 
 @contextlib.contextmanager

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from spackle.bases.sharp.base import check_windows
+from spackle.bases.open import AUTO, BaseSettings
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.jobs.bases import AUTO, HF, KINDS, NETWORKS, base_files, kind_of
-from spackle.jobs.names import check_name
 from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions, check_video_options
-from spackle.precision import PRECISIONS, Precision
+from spackle.precision import Precision
 from spackle.residual.network import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
@@ -50,9 +48,19 @@ class PredictOptions:
     overwrite: bool = False  # in a folder, do again what is done already
 
     @property
-    def gives_focal(self) -> bool:
-        """Whether a person said what the focal length is."""
-        return any(value is not None for value in (self.focal_px, self.focal_mm, self.fov))
+    def settings(self) -> BaseSettings:
+        """What of this is the base's."""
+        return BaseSettings(
+            self.base,
+            self.depth,
+            self.calib,
+            self.checkpoint,
+            self.precision,
+            self.low_memory,
+            self.windows,
+            self.compiled,
+            self.device,
+        )
 
     @property
     def residual_weights(self) -> str:
@@ -67,22 +75,18 @@ class PredictOptions:
 
     @property
     def named(self) -> str:
-        """The base that is named: with --depth `auto` is `rgbd`, and with -c it is `sharp`."""
-        if self.base != AUTO:
-            return self.base
-        return "rgbd" if self.depth is not None else AUTO if self.checkpoint is None else "sharp"
+        """As `BaseSettings.named`."""
+        return self.settings.named
 
     @property
     def base_files(self) -> dict[str, Path]:
-        """As `spackle.jobs.bases.base_files` has it."""
-        return base_files(self.named, self.checkpoint)
+        """As `BaseSettings.files`."""
+        return self.settings.files
 
 
 def check_options(options: PredictOptions) -> None:
     """InputError for an option that cannot be used, whatever the photo."""
-    if not options.base.startswith(HF):
-        check_name("--base", options.base, (AUTO, *KINDS))
-    check_base_options(options)
+    options.settings.check()
     check_path_options(options.disparity, options.frames)
     check_view_options(options.cameras, options.path, options.video)
     video = options.video
@@ -92,46 +96,13 @@ def check_options(options: PredictOptions) -> None:
 
 
 def check_base_options(options: PredictOptions) -> None:
-    """InputError for a base that there is not, or that has no use for an option that is given."""
-    if options.precision not in PRECISIONS:
-        raise InputError(f"--precision {options.precision}: unknown: there are {', '.join(PRECISIONS)}")
-    refuses = {} if options.named == AUTO else kind_of(options.named).refuses
-    for option, value in _given(options).items():
-        if option in refuses:
-            who = options.named.partition(":")[0]
-            raise InputError(f"{option}{value}: the {who} base {refuses[option]}; leave the option out")
-    check_windows("--windows", options.windows, options.low_memory)
-    if options.calib is not None and options.depth is None:
-        raise InputError(f"--calib {options.calib}: is for a disparity map: give that with --depth")
-    if options.named == "sharp" and not options.base_files:
-        raise InputError(
-            "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
-            "(2.8 GB, for research only), -c FILE takes a local copy"
-        )
+    """As `BaseSettings.check`."""
+    options.settings.check()
 
 
 def check_has_depth(options: PredictOptions) -> None:
-    """InputError where the base takes depth and none is given."""
-    if not kind_of(options.named).network and options.depth is None:
-        raise InputError(
-            f"--base {options.base} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
-        )
-
-
-def _given(options: PredictOptions) -> dict[str, str]:
-    """What was given of the options that not every base has a use for, by their names."""
-    values = {
-        "--depth": options.depth,
-        "--calib": options.calib,
-        "-c": options.checkpoint,
-        "--windows": options.windows,
-    }
-    given = {name: f" {value}" for name, value in values.items() if value is not None}
-    if options.precision != "auto":
-        given["--precision"] = f" {options.precision}"
-    flags = {"--low-memory": options.low_memory, "--compile": options.compiled}
-    given |= {name: "" for name, value in flags.items() if value}
-    return given
+    """As `BaseSettings.check_has_depth`."""
+    options.settings.check_has_depth()
 
 
 def check_path_options(disparity: float, frames: int | None) -> None:

@@ -7,22 +7,21 @@ import dataclasses
 from pathlib import Path
 
 from spackle.bases.lite.base import LiteBase
+from spackle.bases.open import AUTO, BaseError, Choice, all_finite
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp import SharpBase
-from spackle.choose import BaseError, Choice, all_finite
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo, resize_photo
-from spackle.jobs.bases import AUTO
 from spackle.jobs.clip import check_clip_options, predict_clip
 from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.progress import Reporter
 from spackle.jobs.report import base_before, focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.request import request_of
-from spackle.jobs.setup import Tools, search_base, set_up
+from spackle.jobs.setup import Tools, set_up
 from spackle.jobs.views import (
     Completed,
     Plan,
@@ -158,13 +157,12 @@ def complete_photo(
         InputError: a photo or depth map that cannot be used.
     """
     with reporter.stage("prepare", seconds):
-        search = search_base(photo, options, tools, reporter.say)
-        search.load()
+        base = tools.opened.load(photo, log=reporter.say)
     with reporter.stage("base", seconds) as step:
-        prediction, choice = search.predict(step)
+        prediction, choice = base.predict(step)
     photo = resize_photo(photo)
-    if tools.auto is not None and (news := tools.auto.news(choice)):
-        reporter.say(f"{name}: {news}")
+    if choice.news:
+        reporter.say(f"{name}: {choice.news}")
     reporter.say(
         f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
         f"focal length {prediction.camera.focal[0]:.0f} px ({focal_source(photo, prediction)})"

@@ -8,20 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import spackle
+from spackle.bases.open import Choice
 from spackle.bases.protocol import BasePrediction
-from spackle.choose import Choice
 from spackle.formats import atomic_path
 from spackle.image import Photo
-from spackle.jobs.names import spelled
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.setup import Tools
 from spackle.jobs.views import Completed
+from spackle.trajectory import spelled
 
 
 def focal_source(photo: Photo, prediction: BasePrediction) -> str:
     """Who said what the focal length is: an option, the photo, the base's calibration, or nobody."""
-    if photo.focal_source.startswith("--"):  # a person's word beats the calibration's
-        return photo.focal_source
     return prediction.lens_source or photo.focal_source
 
 

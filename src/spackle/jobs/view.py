@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from spackle.bases.open import AUTO
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
-from spackle.jobs.bases import AUTO
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.predict import complete_photo
 from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.scene_file import SceneFile
-from spackle.jobs.setup import Tools, make_base, set_up
+from spackle.jobs.setup import Tools, set_up
 from spackle.jobs.stopping import asked_to_stop
 from spackle.jobs.view_open import announce
 from spackle.jobs.view_scene import is_scene, page_of
@@ -73,7 +73,7 @@ def _first(target: Path, options: PredictOptions, uploads: Uploads, reporter: Re
     with reporter.stage("load", seconds):
         photo = load_photo(target, focal_px=options.focal_px, focal_mm=options.focal_mm, fov=options.fov)
         if options.depth is not None:
-            make_base(photo, options, tools)  # what is wrong with a depth map is known before a page opens
+            tools.opened.load(photo)  # what is wrong with a depth map is known before a page opens
 
     def complete_first(tell: Tell) -> PageScene:
         return complete(photo, target.name, options, tools, Teller(reporter, tell))

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from spackle.choose import BaseError
+from spackle.bases.open import BaseError, kind_of
 from spackle.errors import InputError
 from spackle.evaluation.case import Case
 from spackle.evaluation.efficiency import Clock, Parameters, count_parameters
@@ -21,7 +21,6 @@ from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write
 from spackle.evaluation.run import inputs_digest, problem_of
 from spackle.evaluation.setup import Bench, metrics_device, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
-from spackle.jobs.bases import kind_of
 from spackle.jobs.bench.image import time_image
 from spackle.jobs.bench.options import BenchOptions, check_bench_options
 from spackle.jobs.inputs import alone_in, results_folder

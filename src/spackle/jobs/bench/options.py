@@ -9,7 +9,7 @@ from pathlib import Path
 from spackle.errors import InputError
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.setup import BASE, EvaluateOptions, check_evaluate_options
-from spackle.jobs.bases import kind_of
+from spackle.bases.open import kind_of
 from spackle.jobs.options import PredictOptions
 
 MAX_RUNS = 1000

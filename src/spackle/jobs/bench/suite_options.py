@@ -13,7 +13,7 @@ from spackle.evaluation.setup import BASE, split_words
 from spackle.evaluation.suite.scenes import SIDE
 from spackle.evaluation.suite.tables import TITLES
 from spackle.jobs.bench.options import MAX_RUNS
-from spackle.jobs.names import check_name
+from spackle.errors import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
 
 SIDES = (64, 8192)

@@ -8,22 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import spackle
+from spackle.bases.open import find_depth, kind_of
+from spackle.digest import digest_of, fingerprint
 from spackle.downloads import read_record
 from spackle.downloads.partial import digest
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE
-from spackle.jobs.bases import kind_of, public_name
-from spackle.jobs.inputs import find_depth
-from spackle.jobs.names import spelled
+from spackle.jobs.bases import public_name
 from spackle.jobs.options import PredictOptions, check_has_depth, check_options
-from spackle.jobs.request import digest_of, fingerprint
 from spackle.precision import Precision
 from spackle.pseudo.build import ViewChoices
 from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile
 from spackle.pseudo.propainter import MIN_SIDE, SIDE
 from spackle.pseudo.propainter_weights import weight_files
-from spackle.trajectory import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+from spackle.trajectory import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind, spelled
 
 MAX_VIEWS = 100  # two digits name a view
 MAX_PHOTOS = 1_000_000  # six digits name a photo

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from spackle.bases.open import kind_of
 from spackle.errors import InputError, reason_in_a_line
-from spackle.jobs.bases import kind_of
 from spackle.jobs.dataset.crew import Crew
 from spackle.jobs.dataset.options import DatasetOptions
 from spackle.jobs.dataset.worker import Job, Made

@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 
+from spackle.digest import fingerprint
 from spackle.errors import InputError
 from spackle.jobs.dataset.options import DatasetOptions, configuration, inputs_of
 from spackle.jobs.dataset.worker import Job, Made, Maker
-from spackle.jobs.request import fingerprint
 from spackle.pseudo.manifest import differences
 from spackle.pseudo.photos import PhotoFile
 

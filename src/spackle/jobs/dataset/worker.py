@@ -19,8 +19,8 @@ from pathlib import Path
 import torch
 
 from spackle.bases.device import MemoryShort
+from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
-from spackle.choose import BaseError
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import Photo

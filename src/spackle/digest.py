@@ -1,0 +1,28 @@
+"""Digests of what results depend on: so a folder that was interrupted goes on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from spackle.image import check_file
+
+MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed
+
+
+def fingerprint(file: Path, kind: str) -> str:
+    """The digest of what a file holds; of gigabytes, which would take seconds to read, size and time of change.
+
+    Raises:
+        InputError: no such file; `kind` names it in the message.
+    """
+    size = check_file(file, kind)
+    if size > MAX_HASHED:
+        return f"{size} bytes of {file.stat().st_mtime_ns}"
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def digest_of(value: object) -> str:
+    """SHA-256 of a value as JSON."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
