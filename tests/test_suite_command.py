@@ -16,9 +16,8 @@ from command import names_in, run
 
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
-from spackle.evaluation.results import begin
+from spackle.evaluation.results import KINDS, begin
 from spackle.evaluation.suite.tables import TITLES
-from spackle.jobs.bases import KINDS
 
 SIDE = 64
 

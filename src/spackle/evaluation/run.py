@@ -19,10 +19,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from spackle.bases.open import BaseError
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.rgbd import RgbdBase
-from spackle.bases.open import BaseError
 from spackle.choose import Load
+from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
@@ -59,7 +60,6 @@ from spackle.formats.png import to_bytes
 from spackle.jobs.inputs import alone_in, results_folder
 from spackle.jobs.machine import hardware, versions
 from spackle.jobs.progress import Reporter
-from spackle.digest import digest_of, fingerprint
 from spackle.jobs.stopping import asked_to_stop
 from spackle.residual import hole_mask
 

@@ -15,22 +15,20 @@ from typing import Any
 import torch
 
 import spackle
+from spackle.bases.open import NETWORKS, BaseError, kind_of
 from spackle.bases.sharp import SharpBase
-from spackle.bases.open import BaseError
 from spackle.choose import Load
-from spackle.errors import InputError
+from spackle.digest import digest_of
+from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset
 from spackle.evaluation.datasets import DATASETS, get_dataset
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, PROTOCOLS, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
-from spackle.jobs.bases import NETWORKS, public_name, says_of, title_of
-from spackle.bases.open import kind_of
+from spackle.jobs.bases import public_name, says_of, title_of
 from spackle.jobs.dataset.options import base_digest, weights_digest
-from spackle.errors import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
-from spackle.digest import digest_of
 from spackle.jobs.setup import set_up
 from spackle.precision import PRECISIONS, pick_dtype
 from spackle.render import Renderer, get_renderer

@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from spackle.bases.open import kind_of
 from spackle.errors import InputError
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.setup import BASE, EvaluateOptions, check_evaluate_options
-from spackle.bases.open import kind_of
 from spackle.jobs.options import PredictOptions
 
 MAX_RUNS = 1000

@@ -8,12 +8,11 @@ from collections.abc import Collection, Sequence
 import torch
 
 from spackle.bases.sharp.base import check_windows
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name
 from spackle.evaluation.setup import BASE, split_words
 from spackle.evaluation.suite.scenes import SIDE
 from spackle.evaluation.suite.tables import TITLES
 from spackle.jobs.bench.options import MAX_RUNS
-from spackle.errors import check_name
 from spackle.jobs.options import PredictOptions, check_base_options
 
 SIDES = (64, 8192)
