@@ -55,8 +55,8 @@ def main() -> None:
         if options.base == "rgbd":
             words += ["--depth", f"{folder}/depth"]
         else:
-            from spackle.jobs.progress import Reporter
             from spackle.jobs.weights import make_weights
+            from spackle.progress import Reporter
 
             make_weights(folder / "sharp.safetensors", "full", Reporter())
             words += ["-c", f"{folder}/sharp.safetensors"]

@@ -24,7 +24,7 @@ from spackle.evaluation.suite.renderer import renderer_section
 from spackle.evaluation.suite.scenes import SIDE, photo_scene
 from spackle.evaluation.suite.values import Row
 from spackle.gaussians import Gaussians
-from spackle.jobs.machine import hardware, versions
+from spackle.machine import hardware, versions
 from spackle.render import CpuRenderer
 
 AUX = 32768  # Gaussians that want gradients, over a frozen base

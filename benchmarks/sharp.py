@@ -187,8 +187,8 @@ def processor() -> str:
 def make_inputs(weights: Path | None, photo: Path | None, folder: Path) -> tuple[Path, Path]:
     """Deterministic weights and scikit-image's Motorcycle where nothing is given."""
     if weights is None:
-        from spackle.jobs.progress import Reporter
         from spackle.jobs.weights import make_weights
+        from spackle.progress import Reporter
 
         weights = Path(tempfile.gettempdir()) / "sharp_deterministic.pt"
         if not weights.exists():

@@ -22,7 +22,7 @@ import skimage.data
 import torch
 from PIL import Image
 
-from spackle.jobs.machine import hardware
+from spackle.machine import hardware
 from spackle.precision import PRECISIONS, pick_dtype
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet

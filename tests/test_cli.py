@@ -42,7 +42,7 @@ from safetensors.torch import save_file
 import spackle
 from spackle import cli
 from spackle.image import film_to_pixels
-from spackle.jobs.progress import Reporter
+from spackle.progress import Reporter
 from spackle.residual import ResidualNet
 
 SCRIPT = Path(sys.executable).with_name("spackle")

@@ -35,8 +35,8 @@ from spackle.downloads import connect, partial
 from spackle.downloads.fetch import Record, check_recorded, download, weights_folder
 from spackle.downloads.known import WEIGHTS, installed
 from spackle.errors import InputError
-from spackle.jobs.progress import Reporter
 from spackle.jobs.weights import get_weights
+from spackle.progress import Reporter
 
 CONTENT = random.Random(5).randbytes(1_000_003)
 FILE = WEIGHTS["sharp"].file

@@ -44,8 +44,8 @@ from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LIMIT, decode_spz, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
 from spackle.jobs.export import WRITERS, export_scene
-from spackle.jobs.progress import Reporter
 from spackle.jobs.scene_file import SceneFile
+from spackle.progress import Reporter
 from spackle.render import CpuRenderer
 
 CPU = CpuRenderer()

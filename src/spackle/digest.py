@@ -6,6 +6,8 @@ import hashlib
 import json
 from pathlib import Path
 
+from spackle.downloads import read_record
+from spackle.downloads.partial import digest
 from spackle.image import check_file
 
 MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed
@@ -21,6 +23,15 @@ def fingerprint(file: Path, kind: str) -> str:
     if size > MAX_HASHED:
         return f"{size} bytes of {file.stat().st_mtime_ns}"
     return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def weights_digest(path: Path) -> str:
+    """SHA-256 of a checkpoint: the recorded one of a download, else of the file."""
+    record = read_record(path)
+    if record is not None:
+        return record.sha256
+    with open(path, "rb") as file:
+        return digest(file).hexdigest()
 
 
 def digest_of(value: object) -> str:

@@ -79,7 +79,7 @@ def dataset_build(
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
     from spackle.jobs.dataset.build import build_dataset
     from spackle.jobs.dataset.options import DatasetOptions, base_options, view_choices
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     options = DatasetOptions(
         base=base_options(base, depth, checkpoint, precision.value, device.value),
@@ -112,7 +112,7 @@ def dataset_info(location: DatasetArgument) -> None:
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 where there is one."""
     from spackle.jobs.dataset.look import verify_dataset
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     if verify_dataset(location, Reporter()):
         raise typer.Exit(1)
@@ -127,7 +127,7 @@ def dataset_preview(
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
     from spackle.jobs.dataset.look import preview_dataset
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())
 

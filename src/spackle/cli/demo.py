@@ -19,7 +19,7 @@ def demo(
 ) -> None:
     """Complete the Middlebury Motorcycle photo and compare with the true second photo (needs scikit-image)."""
     from spackle.jobs.demo import run_demo
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     run_demo(output, Reporter(verbose, as_json=as_json))
 

@@ -87,7 +87,7 @@ def evaluate(
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
     from spackle.evaluation.run import evaluate as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     options = EvaluateOptions(
         dataset=dataset,
@@ -119,7 +119,7 @@ def tables(
 ) -> None:
     """Put several evaluations into the same tables: tables.md and tables.tex."""
     from spackle.evaluation.run import merge_tables
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     merge_tables(results, output, Reporter(), html)
 
@@ -179,7 +179,7 @@ def bench(
     from spackle.jobs.bench.options import BenchOptions
     from spackle.jobs.bench.suite import bench_suite
     from spackle.jobs.bench.suite_options import check_choice, suite_options
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     given = _given(context)
     check_choice(suite, given)

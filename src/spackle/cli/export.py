@@ -31,6 +31,6 @@ def export(
 ) -> None:
     """Write a scene in the formats that other viewers read."""
     from spackle.jobs.export import export_scene
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     export_scene(scene, output, Reporter(as_json=as_json))

@@ -112,7 +112,7 @@ def predict(
     """
     from spackle.jobs.options import PredictOptions
     from spackle.jobs.predict import predict_all
-    from spackle.jobs.progress import Reporter
+    from spackle.progress import Reporter
 
     kind, far = chosen_way(trajectory, disparity, frames, path, cameras)
     options = PredictOptions(

@@ -53,8 +53,8 @@ def render(
     verbose: VerboseOption = False,
 ) -> None:
     """Draw a saved scene along a camera path."""
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.render import RenderOptions, render_scene
+    from spackle.progress import Reporter
 
     kind, far = chosen_way(trajectory, disparity, frames, path, cameras)
     options = RenderOptions(

@@ -36,8 +36,8 @@ def train(
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual, SHARP itself or lite: best.safetensors, last.safetensors, run.json, pictures and logs."""
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.train.recipe import train_recipe
+    from spackle.progress import Reporter
 
     speaker, choices = Reporter(verbose), overrides or []
     ended = train_recipe(

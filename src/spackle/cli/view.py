@@ -40,9 +40,9 @@ def view(
 ) -> None:
     """Look at a scene, or complete a photo and look at that, on a page of this machine. Ctrl-C ends it."""
     from spackle.jobs.options import PredictOptions
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.view import ViewOptions
     from spackle.jobs.view import view as view_target
+    from spackle.progress import Reporter
 
     options = PredictOptions(
         base=base,

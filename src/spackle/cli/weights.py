@@ -32,8 +32,8 @@ def weights_get(
     as_json: JsonOption = False,
 ) -> None:
     """Download weights and record their SHA-256; a broken download goes on where it stopped."""
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.weights import get_weights
+    from spackle.progress import Reporter
 
     get_weights(name, output, Reporter(as_json=as_json), url=url, force=force)
 
@@ -44,8 +44,8 @@ def weights_make(
     size: Annotated[NetworkSize, typer.Option(help="The published size, or one for tests.")] = NetworkSize.full,
 ) -> None:
     """Make random weights of SHARP's shape, the same each time, to try everything without Apple's."""
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.weights import make_weights
+    from spackle.progress import Reporter
 
     make_weights(output, size.value, Reporter())
 
@@ -55,8 +55,8 @@ def weights_list(as_json: JsonOption = False) -> None:
     """Say which weights are known, and which of them are here."""
     from rich.console import Console
 
-    from spackle.jobs.progress import Reporter
     from spackle.jobs.weights import list_weights
+    from spackle.progress import Reporter
 
     list_weights(Reporter(as_json=as_json), Console(highlight=False))
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.jobs.inputs import make_folder, remove_half_written
+from spackle.output_folder import make_folder, remove_half_written
 from spackle.pseudo.manifest import differences
 
 

@@ -57,11 +57,11 @@ from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.tables import NOT_RUN, make_tables
 from spackle.formats import atomic_path, save_png
 from spackle.formats.png import to_bytes
-from spackle.jobs.inputs import alone_in, results_folder
-from spackle.jobs.machine import hardware, versions
-from spackle.jobs.progress import Reporter
-from spackle.jobs.stopping import asked_to_stop
+from spackle.machine import hardware, versions
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
 from spackle.residual import hole_mask
+from spackle.signals import asked_to_stop
 
 
 def examine(case: Case, bench: Bench) -> tuple[Record, dict[str, Tensor]]:

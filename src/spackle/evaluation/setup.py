@@ -18,7 +18,7 @@ import spackle
 from spackle.bases.open import NETWORKS, BaseError, kind_of
 from spackle.bases.sharp import SharpBase
 from spackle.choose import Load
-from spackle.digest import digest_of
+from spackle.digest import digest_of, weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset
 from spackle.evaluation.datasets import DATASETS, get_dataset
@@ -27,7 +27,7 @@ from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OW
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
 from spackle.jobs.bases import public_name, says_of, title_of
-from spackle.jobs.dataset.options import base_digest, weights_digest
+from spackle.jobs.dataset.options import base_digest
 from spackle.jobs.options import PredictOptions, check_base_options
 from spackle.jobs.setup import set_up
 from spackle.precision import PRECISIONS, pick_dtype

@@ -16,13 +16,13 @@ from spackle.formats.clip import Clip, clip_frames, read_clip
 from spackle.formats.clip_writer import ClipWriter
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.jobs.clip_frames import FIGURES, ClipChoices, ClipCompleter, Drawn
-from spackle.jobs.inputs import results_folder
 from spackle.jobs.options import PredictOptions
-from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.report import focal_source, write_report
 from spackle.jobs.setup import Tools
 from spackle.jobs.video_options import VideoOptions
 from spackle.opencv import OpenCV
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter, Step
 from spackle.residual import hole_area_ratio
 from spackle.trajectory import spelled
 

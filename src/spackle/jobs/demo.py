@@ -19,9 +19,9 @@ from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video
-from spackle.jobs.inputs import results_folder
-from spackle.jobs.progress import Reporter
 from spackle.jobs.report import write_report
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.residual.network import shipped_network

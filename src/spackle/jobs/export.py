@@ -17,8 +17,8 @@ from spackle.formats.ply_header import read_header
 from spackle.formats.sog import encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LARGEST, encode_spz, spz_grid
-from spackle.jobs.progress import Reporter
 from spackle.jobs.scene_file import SceneFile
+from spackle.progress import Reporter
 
 
 def _ply(scene: SceneFile, path: Path) -> None:

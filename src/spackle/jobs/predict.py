@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
+from collections import Counter
 from pathlib import Path
 
 from spackle.bases.lite.base import LiteBase
@@ -14,11 +16,9 @@ from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
 from spackle.gaussians import Gaussians
-from spackle.image import Photo, load_photo, resize_photo
+from spackle.image import PHOTO_SUFFIXES, Photo, load_photo, resize_photo
 from spackle.jobs.clip import check_clip_options, predict_clip
-from spackle.jobs.inputs import find_photos, results_folder
 from spackle.jobs.options import PredictOptions
-from spackle.jobs.progress import Reporter
 from spackle.jobs.report import base_before, focal_source, is_done, make_report, summary, write_report
 from spackle.jobs.request import request_of
 from spackle.jobs.setup import Tools, set_up
@@ -33,6 +33,8 @@ from spackle.jobs.views import (
     save_views,
     view_files,
 )
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
 
 FILES = ("base.ply", "scene.ply", "report.json")  # and the video
 
@@ -191,3 +193,25 @@ def _files(options: PredictOptions) -> tuple[str, ...]:
 
 def _video(options: PredictOptions) -> str:
     return f"video{options.video.suffix}"
+
+
+def find_photos(path: Path) -> list[tuple[Path, str]]:
+    """A photo, or the photos of a folder in order of their names, each with the name of its results.
+
+    Raises:
+        InputError: nothing there, or a folder without photos.
+    """
+    if not os.path.isdir(path):
+        return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
+    try:
+        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
+    if not photos:
+        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
+    stems = Counter(photo.stem.casefold() for photo in photos)
+    names = {photo.name.casefold() for photo in photos}
+    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
+    return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]

@@ -18,11 +18,11 @@ from spackle.formats.video import FORMATS, is_video_name
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.jobs.film import Film, cover, fly, make_film
-from spackle.jobs.inputs import results_folder
 from spackle.jobs.options import check_path_options, check_view_options, video_problem
-from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.video_options import VideoOptions, named_format
 from spackle.keyframes import KeyframePath, PathError
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.trajectory import TrajectoryKind
 

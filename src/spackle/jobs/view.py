@@ -13,12 +13,12 @@ from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.predict import complete_photo
-from spackle.jobs.progress import Reporter, Step
 from spackle.jobs.scene_file import SceneFile
 from spackle.jobs.setup import Tools, set_up
-from spackle.jobs.stopping import asked_to_stop
 from spackle.jobs.view_open import announce
 from spackle.jobs.view_scene import is_scene, page_of
+from spackle.progress import Reporter, Step
+from spackle.signals import asked_to_stop
 from spackle.viewer import PageScene, page_files, page_scene
 from spackle.viewer.events import Tell
 from spackle.viewer.server import HOST, ViewerServer

@@ -8,7 +8,7 @@ import sys
 import threading
 import webbrowser
 
-from spackle.jobs.progress import Reporter
+from spackle.progress import Reporter
 from spackle.viewer.server import ViewerServer
 
 OPEN_TO_ALL = (

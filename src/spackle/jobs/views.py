@@ -17,9 +17,9 @@ from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
 from spackle.jobs.film import Film, fly, make_film
 from spackle.jobs.options import PredictOptions
-from spackle.jobs.progress import Step
 from spackle.jobs.setup import Tools
 from spackle.keyframes import PathError
+from spackle.progress import Step
 from spackle.render import Renderer
 from spackle.residual import Completer, hole_area_ratio, hole_mask
 from spackle.scene import even_camera

@@ -26,8 +26,8 @@ from spackle.downloads import (
 )
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.jobs.inputs import results_folder
-from spackle.jobs.progress import Reporter
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
 
 
 def get_weights(

@@ -23,10 +23,10 @@ from spackle.evaluation.setup import Bench, metrics_device, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.jobs.bench.image import time_image
 from spackle.jobs.bench.options import BenchOptions, check_bench_options
-from spackle.jobs.inputs import alone_in, results_folder
-from spackle.jobs.machine import hardware, versions
-from spackle.jobs.progress import Reporter
-from spackle.jobs.stopping import asked_to_stop
+from spackle.machine import hardware, versions
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
 
 RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
 SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration

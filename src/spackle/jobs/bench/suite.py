@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 import spackle
+from spackle.digest import weights_digest
 from spackle.errors import InputError
 from spackle.evaluation.results import begin, write_json, write_text
 from spackle.evaluation.suite.limits import Peaks
@@ -23,11 +24,10 @@ from spackle.evaluation.suite.values import Found
 from spackle.evaluation.table import to_markdown
 from spackle.jobs.bench.suite_options import SuiteOptions, check_suite_options
 from spackle.jobs.bench.suite_sections import Sections
-from spackle.jobs.dataset.options import weights_digest
-from spackle.jobs.inputs import alone_in, results_folder
-from spackle.jobs.machine import hardware, versions, without_nan
-from spackle.jobs.progress import Reporter
-from spackle.jobs.stopping import asked_to_stop
+from spackle.machine import hardware, versions, without_nan
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
 
 SECTIONS = "sections"
 RESULTS, MARKDOWN, PLOT = "suite.json", "suite.md", "scaling.svg"

@@ -12,6 +12,7 @@ import torch
 
 from spackle.bases.rgbd import lift
 from spackle.bases.sharp import SharpBase
+from spackle.digest import weights_digest
 from spackle.errors import InputError
 from spackle.evaluation.suite import limits, scaling
 from spackle.evaluation.suite import renderer as drawing
@@ -25,7 +26,6 @@ from spackle.evaluation.suite.training import BATCH, CELLS, training_section
 from spackle.evaluation.suite.values import Found
 from spackle.evaluation.suite.video import FRAMES, video_section
 from spackle.jobs.bench.suite_options import SuiteOptions
-from spackle.jobs.dataset.options import weights_digest
 from spackle.jobs.demo import load_motorcycle
 from spackle.render import CpuRenderer, GsplatRenderer, Renderer
 from spackle.residual import ResidualNet

@@ -14,14 +14,14 @@ from spackle.errors import InputError
 from spackle.jobs.dataset.options import MAX_PHOTOS, DatasetOptions, check_dataset_options, configuration
 from spackle.jobs.dataset.ray import at_work_on_ray, cluster
 from spackle.jobs.dataset.worker import PARTS, Job, Made, Maker, at_work, part_file
-from spackle.jobs.inputs import alone_in, make_folder, remove_half_written, results_folder
-from spackle.jobs.progress import Reporter
-from spackle.jobs.stopping import asked_to_stop
+from spackle.output_folder import alone_in, make_folder, remove_half_written, results_folder
+from spackle.progress import Reporter
 from spackle.pseudo.build import Seconds, key_of, timed
 from spackle.pseudo.manifest import NAME, Manifest, ShardEntry, differences, load_manifest
 from spackle.pseudo.photos import PhotoFile, choose, find_photos
 from spackle.pseudo.propainter import NOTICE
 from spackle.pseudo.shards import shard_name, write_shard
+from spackle.signals import asked_to_stop
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
 NAMED = 5  # missing files that are spelled out

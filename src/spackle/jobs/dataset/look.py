@@ -15,8 +15,8 @@ from torch.nn.functional import interpolate
 
 from spackle.errors import InputError
 from spackle.formats import save_png, save_video
-from spackle.jobs.inputs import results_folder
-from spackle.jobs.progress import Reporter
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
 from spackle.pseudo.manifest import Manifest, load_manifest
 from spackle.pseudo.reader import PseudoFiles
 from spackle.pseudo.sample import PhotoGroup

@@ -9,9 +9,7 @@ from typing import Any
 
 import spackle
 from spackle.bases.open import find_depth, kind_of
-from spackle.digest import digest_of, fingerprint
-from spackle.downloads import read_record
-from spackle.downloads.partial import digest
+from spackle.digest import digest_of, fingerprint, weights_digest
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE
 from spackle.jobs.bases import public_name
@@ -144,15 +142,6 @@ def base_digest(base: PredictOptions) -> str | dict[str, str] | None:
     """SHA-256 of the base's weights, of each file where there are several; None where none are known."""
     digests = {name: weights_digest(file) for name, file in base.base_files.items()}
     return digests if len(digests) > 1 else next(iter(digests.values()), None)
-
-
-def weights_digest(path: Path) -> str:
-    """SHA-256 of a checkpoint: the recorded one of a download, else of the file."""
-    record = read_record(path)
-    if record is not None:
-        return record.sha256
-    with open(path, "rb") as file:
-        return digest(file).hexdigest()
 
 
 def inputs_of(photo: PhotoFile, base: PredictOptions) -> list[str]:

@@ -9,9 +9,9 @@ from typing import ClassVar
 from spackle.bases.sharp.decoder_file import Owner, owner_of
 from spackle.bases.sharp.tensor_file import read_tensors
 from spackle.bases.sharp.tuning import TunableSharp
+from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
-from spackle.jobs.dataset.options import weights_digest
 from spackle.jobs.train.judge import feature_name, judge_of
 from spackle.jobs.train.plan import Place, Start, parameters
 from spackle.training.direct_ft import DirectFt

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.lite.network import LiteNet
-from spackle.jobs.inputs import make_folder
 from spackle.jobs.train.plan import Place, Start, parameters
+from spackle.output_folder import make_folder
 from spackle.training.depth.files import LiteFiles
 from spackle.training.depth.frames import JUDGED_SIDE, LEARNED_SIDE, read_all
 from spackle.training.depth.guessed import GuessedPhotos

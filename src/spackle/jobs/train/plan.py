@@ -10,8 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from torch import nn
 
-from spackle.jobs.progress import Reporter
 from spackle.precision import pick_dtype
+from spackle.progress import Reporter
 from spackle.training.learner import even
 from spackle.training.method import Method, MethodName
 from spackle.training.ranks import Ranks

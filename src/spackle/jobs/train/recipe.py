@@ -10,13 +10,13 @@ import torch
 from rich.console import Console
 
 from spackle.errors import InputError
-from spackle.jobs.inputs import alone_in, results_folder
-from spackle.jobs.progress import Reporter
 from spackle.jobs.train.direct import DirectPlan
 from spackle.jobs.train.lite import LitePlan
 from spackle.jobs.train.plan import Place, Plan
 from spackle.jobs.train.residual import ResidualPlan
 from spackle.jobs.train.run import run_training
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
 from spackle.training.checkpoint import (
     BEST,
     LAST,

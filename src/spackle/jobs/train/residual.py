@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import torch
 
-from spackle.jobs.inputs import make_folder
-from spackle.jobs.progress import Reporter
 from spackle.jobs.train.judge import feature_name, judge_of
 from spackle.jobs.train.plan import Place, Start, parameters
+from spackle.output_folder import make_folder
+from spackle.progress import Reporter
 from spackle.residual.network import ResidualNet, load_residual
 from spackle.training.data import SampleFiles, Supply
 from spackle.training.method import MethodName

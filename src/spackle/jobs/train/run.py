@@ -6,10 +6,10 @@ import contextlib
 import dataclasses
 from typing import Any
 
-from spackle.jobs.machine import hardware, versions, without_nan
 from spackle.jobs.report import write_report
-from spackle.jobs.stopping import asked_to_stop
 from spackle.jobs.train.plan import Place, Start
+from spackle.machine import hardware, versions, without_nan
+from spackle.signals import asked_to_stop
 from spackle.training.checkpoint import LOGS, RUN, Checkpoint, Progress
 from spackle.training.learner import Learner
 from spackle.training.logs import NoLogs, open_logs

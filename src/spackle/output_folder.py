@@ -1,43 +1,19 @@
-"""Which files a command means, and where its results go."""
+"""Folders for results: made, checked and held before long work, and left without half-written files."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from spackle.downloads.locks import hold
 from spackle.errors import InputError
 from spackle.formats import check_writable
-from spackle.image import PHOTO_SUFFIXES
 
 LOCK = ".lock"
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
-
-
-def find_photos(path: Path) -> list[tuple[Path, str]]:
-    """A photo, or the photos of a folder in order of their names, each with the name of its results.
-
-    Raises:
-        InputError: nothing there, or a folder without photos.
-    """
-    if not os.path.isdir(path):
-        return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
-    try:
-        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
-        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
-    if not photos:
-        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
-    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
-    stems = Counter(photo.stem.casefold() for photo in photos)
-    names = {photo.name.casefold() for photo in photos}
-    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
-    return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
 
 
 @contextlib.contextmanager
