@@ -208,12 +208,13 @@ def test_an_exponent_is_a_slope_between_logarithms() -> None:
         assert sizes[-1] / sizes[0] == pytest.approx(32, rel=0.2)
         medians = [found.row(f"{size:,} {what}").median for size in sizes]
         assert found.row(f"exponent of {what}").median == pytest.approx(exponent(sizes, medians))
+    pytest.importorskip("matplotlib")
     svg = scaling_svg(found)
     parts = list(ElementTree.fromstring(svg).iter())
     written = [part.text or "" for part in parts if part.tag.endswith("}text")]
     for what in (GAUSSIANS, PIXELS):
         assert any(what in text and f"{found.row(f'exponent of {what}').median:.2f}" in text for text in written)
-    assert sum("mark" in part.get("class", "") for part in parts) == 12 + 2
+    assert sum(part.tag.endswith("}use") and "fill: #" in part.get("style", "") for part in parts) == 12 + 2
 
 
 def test_the_disparity_is_found_at_which_a_share_is_holes() -> None:

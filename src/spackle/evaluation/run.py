@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from PIL import Image
 from torch import Tensor
 
 from spackle.bases.open import BaseError
@@ -29,9 +28,18 @@ from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
+from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import NEAR, Wanted, large_views, measure
-from spackle.evaluation.report import Source, make_report
-from spackle.evaluation.report.pictures import SIDE, encode
+from spackle.evaluation.report import (
+    BENCH,
+    REPORT,
+    find_bench,
+    load_source,
+    picture_file,
+    save_picture,
+    source_of,
+    write_report,
+)
 from spackle.evaluation.results import (
     BEST,
     IMAGES,
@@ -44,19 +52,16 @@ from spackle.evaluation.results import (
     Run,
     begin,
     load_record,
-    load_run,
-    read_json,
     save_record,
     stem_of,
     write_json,
     write_text,
 )
 from spackle.evaluation.setup import Bench, EvaluateOptions, check_evaluate_options, metrics_device, open_evaluation
-from spackle.evaluation.sheets import CASES, TRUTH, columns, cut, rank, sheet, strip, thumbnail
+from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.tables import NOT_RUN, make_tables
 from spackle.formats import atomic_path, save_png
-from spackle.formats.png import to_bytes
 from spackle.machine import hardware, versions
 from spackle.output_folder import alone_in, results_folder
 from spackle.progress import Reporter
@@ -151,74 +156,6 @@ def _near_views(loaded: LoadedCase, prediction: BasePrediction, alignment: Align
     ]
 
 
-REPORT = "report.html"
-BENCH = "bench.json"  # of `spackle bench`
-
-
-def picture_suffix(name: str) -> str:
-    """How the file of a method's picture ends; "truth" is one of them."""
-    return f".{name}.webp"
-
-
-def save_picture(picture: Tensor, path: Path) -> None:
-    """[H, W, 3] sRGB 0..1 as WebP, smaller where it is large."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode(Image.fromarray(to_bytes(thumbnail(picture, SIDE)).numpy())))
-
-
-def load_pictures(run: Run, index: int, folder: Path) -> dict[str, bytes]:
-    """The pictures of an image, as WebP.
-
-    Args:
-        run: of that folder.
-        index: which of its images.
-        folder: where `evaluate` wrote. An image from before it kept pictures has thumbnails, which take their place.
-
-    Returns:
-        Method, or "truth", to a file's bytes; empty where the folder holds nothing.
-    """
-    stem = folder / IMAGES / stem_of(index, run.records[index].name)
-    files = {name: stem.with_name(stem.name + picture_suffix(name)) for name in columns(run)}
-    if all(file.is_file() for file in files.values()):
-        return {name: file.read_bytes() for name, file in files.items()}
-    try:
-        with Image.open(stem.with_name(stem.name + ".png")) as image:
-            parts = cut(image.convert("RGB"), columns(run))
-    except OSError:  # deleted, or moved away from its results
-        return {}
-    return {name: encode(part) for name, part in parts.items()}
-
-
-def source_of(run: Run, folder: Path, versions: Mapping[str, Any], machine: Mapping[str, Any]) -> Source:
-    """An evaluation for a report."""
-    return Source(run, lambda index: load_pictures(run, index, folder), versions, machine)
-
-
-def load_source(folder: Path) -> Source:
-    """A finished evaluation for a report.
-
-    Raises:
-        InputError: there is none.
-    """
-    run = load_run(folder)
-    about = read_json(folder / RESULTS).get("versions", {})
-    times = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
-    return source_of(run, folder, about, times.get("hardware", {}))
-
-
-def find_bench(folders: Sequence[Path]) -> dict[str, Any] | None:
-    """What `spackle bench` wrote into the first of the folders that has it."""
-    found = next((folder / BENCH for folder in folders if (folder / BENCH).is_file()), None)
-    content = None if found is None else read_json(found)
-    return content if isinstance(content, dict) else None
-
-
-def write_report(sources: Sequence[Source], bench: Mapping[str, Any] | None, output: Path) -> None:
-    """report.html."""
-    tables = make_tables([source.run for source in sources])
-    write_text(make_report(sources, tables, bench), output / REPORT)
-
-
 TABLES = (MARKDOWN, LATEX)
 
 
@@ -248,6 +185,8 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     """
     if not folders:
         raise InputError("no results: name the folders that `spackle evaluate` wrote")
+    if html:
+        check_matplotlib("--html")
     measured = [folder for folder in folders if not (html and _only_bench(folder))]
     sources = [load_source(folder) for folder in measured or folders]
     runs = [source.run for source in sources]
@@ -281,6 +220,8 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         InputError: options, a dataset or a folder that cannot be used; another evaluation in `output`.
     """
     check_evaluate_options(options)
+    if html:
+        check_matplotlib("--html")
     cases, bench, config = open_evaluation(options)
     _say_what_is_missing(bench, reporter)
     with results_folder(output, (RESULTS, TIMES, WORST, BEST, *TABLES, *page(html))), alone_in(output, "evaluation"):
@@ -348,7 +289,7 @@ class _Evaluation:
             self.reporter.say(f"{case.name}: {remark}")
         seconds = round(time.perf_counter() - start, 3)
         for name, picture in pictures.items():
-            save_picture(picture, self._file(index, picture_suffix(name)))
+            save_picture(picture, picture_file(self.output, index, case.name, name))
         save_png(strip(pictures), self._file(index, ".png"))
         save_record(record, inputs, seconds, self._file(index, ".json"))
         self.reporter.detail(f"  {case.name}: {seconds:.1f} s")

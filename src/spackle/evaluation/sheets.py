@@ -41,12 +41,6 @@ def strip(pictures: Mapping[str, Tensor]) -> Tensor:
     return torch.cat([pad(thumbnail(p, SIDE), (0, 0, 0, GAP), value=1.0) for p in pictures.values()], dim=1)
 
 
-def cut(strip: Image.Image, names: Sequence[str]) -> dict[str, Image.Image]:
-    """A strip's thumbnails again."""
-    step = strip.width // len(names)
-    return {name: strip.crop((k * step, 0, (k + 1) * step - GAP, strip.height)) for k, name in enumerate(names)}
-
-
 def columns(run: Run) -> list[str]:
     """What a strip shows: the methods, and the truth where there is one."""
     return [*run.methods, *([TRUTH] if run.near else [])]

@@ -16,6 +16,7 @@ import torch
 import spackle
 from spackle.digest import weights_digest
 from spackle.errors import InputError
+from spackle.evaluation.plots import has_matplotlib
 from spackle.evaluation.results import begin, write_json, write_text
 from spackle.evaluation.suite.limits import Peaks
 from spackle.evaluation.suite.plot import scaling_svg
@@ -115,7 +116,7 @@ class _Suite:
     def _finish(self, found: Mapping[str, Found], not_run: Mapping[str, str]) -> None:
         """Everything that is made of all sections; suite.json comes last and vouches for the rest."""
         head = _head(self.config)
-        if "scaling" in found:
+        if "scaling" in found and has_matplotlib():
             write_text(scaling_svg(found["scaling"]), self.output / PLOT)
             head += f"![Time against Gaussians and pixels]({PLOT})\n\n"
         write_text(head + to_markdown(suite_tables(found, not_run)), self.output / MARKDOWN)

@@ -1,0 +1,251 @@
+"""Plots as SVG files, drawn by matplotlib: holes against the move, Gaussians against holes, scene by scene."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import importlib.util
+import io
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from spackle.errors import InputError
+from spackle.evaluation import paper
+from spackle.evaluation.methods import METHODS
+from spackle.evaluation.results import Run
+from spackle.evaluation.sheets import UP, mean_of
+from spackle.evaluation.tables import ADDING, FILLING, method_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+
+# Okabe and Ito's colours, which the colour-blind tell apart, and a form for each method.
+STYLES = {
+    "base": ("#5b6066", "o"),
+    "spackle": ("#0072b2", "D"),
+    "spackle-scene": ("#3a9fd8", "P"),
+    "seeds": ("#008a66", "^"),
+    "dense": ("#b5568c", "s"),
+    "inpaint2d": ("#c87f00", "v"),
+    "direct-ft": ("#d55e00", "X"),
+}
+RC: Any = {
+    "svg.fonttype": "none",  # the letters stay text
+    "svg.hashsalt": "spackle",  # the same plot gives the same bytes
+    "text.parse_math": False,  # a $ in a scene's name is a $
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.color": "#d5d9de",
+    "lines.markersize": 5,
+}
+WIDTH, HEIGHT = 4.6, 3.4  # inches of a plot, about a phone's width
+ROW = 0.21  # inches of a scene's row
+DOTS, SCENES = 1000, 30  # at most in a plot: pages stay small, rows legible
+LETTERS = 14  # of a scene's name
+# Characters that neither HTML nor XML may hold; names of files may.
+UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
+SCENE_FIGURES = {  # titles of the plot and of its axis
+    "psnr_hole": ("PSNR in the hole, scene by scene", "PSNR (dB), higher is better"),
+    "distance": ("Distance in the hole, scene by scene", "distance (0 to 8), lower is better"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """A drawing with its words."""
+
+    title: str
+    alt: str
+    svg: bytes
+    note: str = ""
+
+    @property
+    def address(self) -> str:
+        """The drawing as a data address."""
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Points of one method."""
+
+    title: str
+    method: str  # of `STYLES`
+    points: Sequence[tuple[float, float]]
+    hollow: bool = False
+    line: str = ""  # "", "-" or "--"
+
+
+def has_matplotlib() -> bool:
+    """Whether matplotlib is installed: it comes with the extra `eval`."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def check_matplotlib(option: str) -> None:
+    """InputError where matplotlib is not installed."""
+    if not has_matplotlib():
+        raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
+
+
+def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None], height: float = HEIGHT) -> bytes:
+    """Series on a pair of axes, as an SVG file; the same values give the same bytes.
+
+    Args:
+        series: in the order of the legend.
+        x: title of the axis.
+        y: title of the axis.
+        finish: sets scales and ticks.
+        height: inches.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(RC), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a name has letters that matplotlib's font lacks; the browser's has them
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        axes = figure.subplots()
+        for one in series:
+            colour, form = STYLES[one.method]
+            places = ([p[0] for p in one.points], [p[1] for p in one.points])
+            face = "white" if one.hollow else colour
+            axes.plot(*places, form, color=colour, ls=one.line or "none", mfc=face, alpha=0.8, label=one.title)
+        axes.set(xlabel=x, ylabel=y)
+        finish(axes)
+        figure.legend(loc="outside lower left", frameon=False, ncols=1)
+        file = io.BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return file.getvalue()
+
+
+def plots_of(run: Run) -> list[Plot]:
+    """The plots of an evaluation that its figures allow."""
+    if run.near:
+        made = [overhead_plot(run), *(scenes_plot(run, figure) for figure in SCENE_FIGURES)]
+    else:
+        made = [holes_plot(run), overhead_plot(run)]
+    return [plot for plot in made if plot]
+
+
+def holes_plot(run: Run) -> Plot | None:
+    """HAR against disparity, before and after, and the paper's."""
+    moves = sorted(map(float, run.config["disparities"]))
+
+    def means(figure: str, method: str) -> list[tuple[float, float]]:
+        found = [(move, run.mean(figure, method, f"{move:g}").value) for move in moves]
+        return [(move, value) for move, value in found if value is not None]
+
+    def papers(place: int) -> list[tuple[float, float]]:
+        found = [(move, paper.at(paper.HOLES.get(run.title), move)[place]) for move in paper.DISPARITIES]
+        return [(move, value) for move, value in found if value is not None]
+
+    series = [Series(f"before: {run.base} alone", "base", means("har_before", run.methods[0]), line="--")]
+    filling = [method for method in run.methods if method in FILLING]
+    series += [Series(f"after: {method_name(run, m)}", m, means("har", m), line="-") for m in filling]
+    series.append(Series("before: SHARP (paper)", "base", papers(0), True, "--"))
+    series.append(Series("after: Spackle on SHARP (paper)", "spackle", papers(1), True, "-"))
+    series = [one for one in series if one.points]
+    if not series:
+        return None
+    values = [value for one in series for _, value in one.points]
+    positive = [value for value in values if value > 0]
+
+    def finish(axes: Axes) -> None:
+        """Decades; a hole of zero stands at the foot of the axis."""
+        if len(positive) == len(values):
+            axes.set_yscale("log")
+        elif positive:
+            axes.set_yscale("symlog", linthresh=10.0 ** math.floor(math.log10(min(positive))))
+            axes.set_ylim(bottom=0)
+        axes.set_xticks(sorted({move for one in series for move, _ in one.points}))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
+
+    svg = draw(series, "disparity of the view", "HAR, share of the pixels", finish)
+    return _plot("Hole Area Ratio against disparity", series, svg)
+
+
+def overhead_plot(run: Run) -> Plot | None:
+    """Added Gaussians against the size of the hole: a dot for each image and view."""
+    series, count = [], 0
+    for method in (name for name in run.methods if name in ADDING):
+        dots = list(_overheads(run, method))
+        count += len(dots)
+        kept = [dots[k] for k in evenly(len(dots), DOTS // len(ADDING))]
+        series.append(Series(method_name(run, method), method, kept))
+    series = [one for one in series if one.points]
+    if not series:
+        return None
+    shown = sum(len(one.points) for one in series)
+    note = "One dot for each image and view." if shown == count else f"{shown:,} of {count:,} images and views."
+    if not run.near and run.title in paper.HOLES:
+        found = [
+            (paper.at(paper.HOLES[run.title], m)[0], paper.at(paper.GAUSSIANS[run.title], m)[1])
+            for m in (paper.DISPARITIES)
+        ]
+        means = [(100 * hole, share) for hole, share in found if hole is not None and share is not None]
+        series.append(Series("Spackle on SHARP (paper), means", "spackle", means, True))
+
+    def finish(axes: Axes) -> None:
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+
+    svg = draw(series, "hole before, % of the pixels", "added Gaussians, % of the base's", finish)
+    return _plot("Added Gaussians against hole size", series, svg, note)
+
+
+def _overheads(run: Run, method: str) -> Iterator[tuple[float, float]]:
+    for record in run.measured:
+        for row in record.rows:
+            before, share = row.figures.get("har_before"), row.figures.get("aux_share")
+            if row.method == method and before is not None and share is not None:
+                yield 100 * before, 100 * share
+
+
+def scenes_plot(run: Run, figure: str) -> Plot | None:
+    """A figure of each scene by each method, in the order of Spackle, or else of the last method."""
+    values = {
+        method: {r.name: v for r in run.measured if (v := mean_of(r, figure, method)) is not None}
+        for method in run.methods
+    }
+    values = {method: found for method, found in values.items() if found}
+    if not values:
+        return None
+    leader = "spackle" if "spackle" in values else list(values)[-1]
+    lead, sign = values[leader], -1 if figure in UP else 1
+    order = sorted(lead, key=lambda name: (sign * lead[name], name))
+    names = [order[k] for k in evenly(len(order), SCENES)]
+    series = []
+    for method, found in values.items():
+        points = [(found[name], float(row)) for row, name in enumerate(names) if name in found]
+        series.append(Series(method_name(run, method), method, points))
+
+    def finish(axes: Axes) -> None:
+        axes.set_yticks(range(len(names)), [_short(name) for name in names])
+        axes.set_ylim(len(names) - 0.5, -0.5)
+
+    title, axis = SCENE_FIGURES[figure]
+    svg = draw(series, axis, "", finish, HEIGHT / 2 + ROW * len(names))
+    some = f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
+    return _plot(title, series, svg, f"In the order of {METHODS[leader].title}, best first.{some}")
+
+
+def _short(name: str) -> str:
+    """A name that fits beside its row: names differ at their ends as often as at their beginnings."""
+    name, half = UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", name), LETTERS // 2
+    return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"
+
+
+def _plot(title: str, series: Sequence[Series], svg: bytes, note: str = "") -> Plot:
+    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", svg, note)
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """At most so many of so many, evenly, the first and the last among them."""
+    if count <= most:
+        return list(range(count))
+    if most == 1:
+        return [0]
+    return [math.floor(k * (count - 1) / (most - 1) + 0.5) for k in range(most)]
