@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from spackle.viewer.events import Tell
-from spackle.viewer.limits import Limits
-from spackle.viewer.scene import PageScene
+from spackle.viewer.guard import Limits
+from spackle.viewer.page import PageScene
 from spackle.viewer.server import Complete, ViewerServer
+from spackle.viewer.work import Tell
 
 PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}
 QUICK = Limits(request=0.6, pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)

@@ -20,8 +20,8 @@ from spackle.jobs.view_scene import is_scene, page_of
 from spackle.progress import Reporter, Step
 from spackle.signals import asked_to_stop
 from spackle.viewer import PageScene, page_files, page_scene
-from spackle.viewer.events import Tell
 from spackle.viewer.server import HOST, ViewerServer
+from spackle.viewer.work import Tell
 
 Begin = Callable[[ViewerServer], object]
 LOOK = 0.05  # seconds between two looks whether somebody wants to stop

@@ -133,7 +133,7 @@ Edges = NDArray[np.int64]
 
 # What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
 # changes it by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
-# See tests/test_crops.py.
+# See tests/residual/test_sparse.py.
 MARGIN = 64
 WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
 NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much

@@ -1,4 +1,4 @@
-"""Who may ask: a page of ours, under a name of ours.
+"""Security of the viewer's server: who may ask, how much they may take, and which uploads are photos.
 
 A page of a stranger can make a browser send requests to this machine, and by DNS rebinding even under the stranger's
 own name. Such a request gives itself away by its Host, its Origin or its Sec-Fetch-Site.
@@ -6,14 +6,49 @@ own name. Such a request gives itself away by its Host, its Origin or its Sec-Fe
 
 from __future__ import annotations
 
+import dataclasses
 import ipaddress
 import re
 import socket
 from collections.abc import Collection
 from email.message import Message
+from http import HTTPStatus
+from io import BufferedIOBase
+from pathlib import Path, PurePosixPath
+from urllib.parse import parse_qs
+
+from PIL import Image
+
+from spackle.errors import InputError
+from spackle.image import PHOTO_SUFFIXES, read_image
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Times are in seconds. The server is for a few people: what is refused is far above what a page asks for."""
+
+    request: float = 15  # from one answer to the end of the next request's headers
+    pause: float = 10  # between two pieces of an upload
+    upload: float = 300  # all of an upload
+    send: float = 20  # for a piece of an answer: a client that never reads must not keep a thread
+    heartbeat: float = 10  # of a silent event stream; it is how a listener that has gone shows
+    stop: float = 0.5  # for work to end by itself once the server is stopped
+    connections: int = 64  # at a time, a thread each
+    listeners: int = 16  # of all event streams
+    upload_bytes: int = 100_000_000
+    kept_scenes: int = 2  # what is shown, and what a page may still be loading
+    kept_jobs: int = 4
+
+
+DEFAULT = Limits()
 
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
 OWN_SITES = ("same-origin", "none")  # none: typed by a person, or a bookmark
+PIECE = 1 << 18  # bytes
+MAX_NAME = 80  # characters that are shown
+# What Pillow may find in a file, whatever its name says: it knows formats that are read by other programs, too.
+FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
+KINDS = ", ".join(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES)
 
 # The page has its scripts and styles from us alone, sends nothing elsewhere and stands in no other page's frame.
 CONTENT_POLICY = "; ".join(
@@ -58,7 +93,7 @@ def refusal(headers: Message, names: Collection[str], *, local: bool) -> str | N
     """
     hosts = headers.get_all("Host", [])
     match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
-    if match is None or not _is_ours(match[1].lower(), names, local):
+    if match is None or not _is_own(match[1].lower(), names, local):
         return "this server does not go by that Host name"
     ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: by a tunnel
     if not {origin.strip().lower() for origin in headers.get_all("Origin", [])} <= ours:
@@ -68,9 +103,103 @@ def refusal(headers: Message, names: Collection[str], *, local: bool) -> str | N
     return None
 
 
-def _is_ours(name: str, names: Collection[str], local: bool) -> bool:
+def _is_own(name: str, names: Collection[str], local: bool) -> bool:
     try:
         address = ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
         return name.rstrip(".") in names
     return address.is_loopback or not local
+
+
+class RefusedError(Exception):
+    """An upload that is not taken: the answer's status, and one line."""
+
+    def __init__(self, status: HTTPStatus, line: str) -> None:
+        super().__init__(line)
+        self.status, self.line = status, line
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """What a request says of its photo."""
+
+    name: str  # for people; no file is ever called so
+    suffix: str  # one of PHOTO_SUFFIXES
+    length: int
+
+
+def declared(headers: Message, query: str, max_bytes: int) -> Declared:
+    """Read the request's promises.
+
+    Raises:
+        RefusedError: no length, too long, or a kind of file that is not taken.
+    """
+    lengths = headers.get_all("Content-Length", [])
+    if not lengths or "Transfer-Encoding" in headers:
+        raise RefusedError(HTTPStatus.LENGTH_REQUIRED, "send the photo with a Content-Length, not in chunks")
+    if len(lengths) > 1 or not re.fullmatch(r"[0-9]{1,18}", lengths[0].strip()):
+        raise RefusedError(HTTPStatus.BAD_REQUEST, "the Content-Length makes no sense")
+    name = shown_name(query)
+    suffix = PurePosixPath(name).suffix.lower()
+    if suffix not in PHOTO_SUFFIXES:
+        raise RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"{name}: not a photo: give {KINDS}")
+    length = int(lengths[0])
+    if length > max_bytes:
+        line = f"{name}: more than {max_bytes / 1e6:g} MB: shrink it first"
+        raise RefusedError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, line)
+    if length == 0:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: the file is empty")
+    return Declared(name, suffix, length)
+
+
+def shown_name(query: str) -> str:
+    """The last part of `name=…` in a form that no terminal, page or log can take for anything but a name."""
+    try:
+        values = parse_qs(query, errors="replace", max_num_fields=4).get("name", [])
+    except ValueError:
+        values = []
+    last = re.split(r"[/\\]", values[0])[-1] if values else ""
+    name = "".join(character for character in last if character.isprintable()).strip()
+    return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"
+
+
+def receive(stream: BufferedIOBase, path: Path, promise: Declared) -> None:
+    """Write the promised bytes to a file.
+
+    Raises:
+        RefusedError: fewer came, or the disk is full.
+        TimeoutError: as the stream does.
+    """
+    left = promise.length
+    try:
+        with path.open("xb") as file:
+            while left:
+                piece = stream.read(min(PIECE, left))
+                if not piece:
+                    raise RefusedError(HTTPStatus.BAD_REQUEST, f"{promise.name}: only a part of it has come")
+                left -= len(piece)
+                file.write(piece)
+    except (TimeoutError, ConnectionError):
+        raise
+    except OSError as error:
+        line = f"{promise.name}: cannot be kept here: {error.strerror}"
+        raise RefusedError(HTTPStatus.INSUFFICIENT_STORAGE, line) from error
+
+
+def check_photo(path: Path, name: str) -> None:
+    """Decode all of a file's pixels, within the limits of `spackle.image`.
+
+    Raises:
+        RefusedError: it is no photo of a kind that is taken.
+    """
+
+    def decode(image: Image.Image) -> None:
+        if image.format not in FORMATS:
+            raise InputError(f"{path}: a {image.format} picture: give {KINDS}")
+        image.load()
+
+    try:
+        read_image(path, decode)
+    except InputError as error:
+        line = str(error).replace(str(path), name)
+        raise RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, line) from error

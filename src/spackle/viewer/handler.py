@@ -1,41 +1,116 @@
-"""One connection to the viewer's server: GET and HEAD of what is in the table, a job's events, and POST /photos."""
+"""One connection to the viewer's server: GET and HEAD of its routes, a job's events, and POST /photos."""
 
 from __future__ import annotations
 
+import contextlib
 import io
+import json
 import re
+import socket
 import threading
+import time
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from typing import Any, Protocol, cast
 
-from spackle.viewer.answers import JSON, Table, as_json
-from spackle.viewer.events import Channel
-from spackle.viewer.guard import HEADERS, refusal
-from spackle.viewer.limits import Limits
-from spackle.viewer.patience import PatientReader
-from spackle.viewer.upload import PIECE, Declared, RefusedError, declared
-from spackle.viewer.work import Worker
+from spackle.image import PHOTO_SUFFIXES
+from spackle.viewer.guard import HEADERS, PIECE, Declared, Limits, RefusedError, declared, refusal
+from spackle.viewer.page import PageScene
+from spackle.viewer.work import Channel, Worker
 
+JSON = "application/json; charset=utf-8"
+Body = tuple[str, bytes]  # content type, bytes
 EVENTS = re.compile(r"/jobs/([1-9][0-9]{0,8})/events")
 DRAINED = 1 << 26  # bytes of a refused upload that are read, so that the client gets to read why
+
+
+def as_json(value: object) -> bytes:
+    """JSON in plain ASCII that means nothing to a reader of HTML, whatever names there are in it."""
+    text = json.dumps(value, allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text.encode("ascii")
+
+
+class Routes:
+    """Every path that can be asked, to its bytes: a path is looked up as it came, and no file is ever opened."""
+
+    def __init__(self, pages: Mapping[str, Body], limits: Limits) -> None:
+        self._lock = threading.Lock()
+        self._bodies: dict[str, Body] = dict(pages)
+        self._scenes: list[str] = []
+        self._count = 0
+        self._limits = limits
+
+    def get(self, path: str) -> Body | None:
+        """Content type and bytes; None where there is nothing of that name."""
+        with self._lock:
+            return self._bodies.get(path)
+
+    def add(self, scene: PageScene) -> str:
+        """A scene becomes the one that is shown; the path of its description."""
+        description = as_json(scene.description)
+        with self._lock:
+            self._count += 1
+            root = f"/scenes/{self._count}"
+            self._bodies[f"{root}.json"] = (JSON, description)
+            for name, content in scene.files.items():
+                self._bodies[f"{root}/{name}"] = ("application/octet-stream", content)
+            self._scenes.append(root)
+            while len(self._scenes) > self._limits.kept_scenes:
+                old = self._scenes.pop(0)
+                for path in [path for path in self._bodies if path.startswith((f"{old}/", f"{old}.json"))]:
+                    del self._bodies[path]
+            return f"{root}.json"
+
+    def state(self, worker: Worker) -> bytes:
+        """scene.json: what is shown, what is at work, and what may be sent."""
+        newest = worker.newest()
+        with self._lock:
+            scene = f"{self._scenes[-1]}.json" if self._scenes else None
+        # One that failed is named as long as there is nothing else to see, so that a late page learns why.
+        busy = newest is not None and (not newest[1].ended or scene is None)
+        upload = {"suffixes": list(PHOTO_SUFFIXES), "max_bytes": self._limits.upload_bytes}
+        return as_json({"scene": scene, "job": f"/jobs/{newest[0]}" if newest and busy else None, "upload": upload})
+
+
+class TimeoutReader(io.RawIOBase):
+    """A socket's bytes, each piece and all of them within the time that is allowed; TimeoutError after that.
+
+    A timeout of the socket alone would let a client that sends a byte a second go on for ever.
+    """
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._pause, self._until = 0.0, 0.0
+
+    def allow(self, pause: float, whole: float) -> None:
+        """Seconds from now: for a piece, and for all that is read until this is called again."""
+        self._pause, self._until = pause, time.monotonic() + whole
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        left = self._until - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("the client is too slow")
+        self._connection.settimeout(min(self._pause, left))
+        return self._connection.recv_into(buffer)
 
 
 class Site(Protocol):
     """What the handlers of a server share."""
 
-    table: Table
+    routes: Routes
     worker: Worker
     limits: Limits
     listeners: threading.BoundedSemaphore
     names: frozenset[str]
     local: bool
     log: Callable[[str], None]
-
-    def take(self, stream: io.BufferedIOBase, promise: Declared) -> int:
-        """Receive a photo in the place that has been claimed, and start its job."""
-        ...
+    take: Callable[[io.BufferedIOBase, Declared], int]  # receives a photo in the claimed place, and starts its job
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -50,25 +125,27 @@ class Handler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         super().setup()
-        self.patience = PatientReader(self.connection)
-        self.rfile = io.BufferedReader(self.patience)
+        self.reader = TimeoutReader(self.connection)
+        self.rfile = io.BufferedReader(self.reader)
 
     def handle_one_request(self) -> None:
         limits = self.site.limits
-        self.patience.allow(limits.request, limits.request)
+        self.reader.allow(limits.request, limits.request)
         super().handle_one_request()
 
     def handle_expect_100(self) -> bool:
         return True  # said only once the upload is going to be taken
 
     def do_GET(self) -> None:
-        self._check_body()
+        # What follows a GET with a body, or one that asks for another protocol, is no request: do not read it.
+        if {"Content-Length", "Transfer-Encoding", "Upgrade"} & {name.title() for name in self.headers}:
+            self.close_connection = True
         if problem := self._refusal():
             return self._refuse(*problem)
         path = self.path.partition("?")[0]
         if path == "/scene.json":
-            return self._answer(HTTPStatus.OK, JSON, self.site.table.state(self.site.worker))
-        if body := self.site.table.get(path):
+            return self._answer(HTTPStatus.OK, JSON, self.site.routes.state(self.site.worker))
+        if body := self.site.routes.get(path):
             return self._answer(HTTPStatus.OK, *body)
         match = EVENTS.fullmatch(path)
         if match and (channel := self.site.worker.channel(int(match[1]))):
@@ -101,7 +178,7 @@ class Handler(BaseHTTPRequestHandler):
             if self.headers.get("Expect", "").lower() == "100-continue":
                 self.send_response_only(HTTPStatus.CONTINUE)
                 super().end_headers()
-            self.patience.allow(site.limits.pause, site.limits.upload)
+            self.reader.allow(site.limits.pause, site.limits.upload)
             return site.take(self.rfile, promise)
         except BaseException:
             site.worker.release()
@@ -131,11 +208,6 @@ class Handler(BaseHTTPRequestHandler):
         line = refusal(self.headers, self.site.names, local=self.site.local)
         return (HTTPStatus.FORBIDDEN, line) if line else None
 
-    def _check_body(self) -> None:
-        """What follows a GET with a body, or one that asks for another protocol, is no request: do not read it."""
-        if {"Content-Length", "Transfer-Encoding", "Upgrade"} & {name.title() for name in self.headers}:
-            self.close_connection = True
-
     def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
         self._start(status, {"Content-Type": kind, "Content-Length": str(len(body))})
         if self.command != "HEAD":
@@ -145,8 +217,14 @@ class Handler(BaseHTTPRequestHandler):
 
     def _refuse(self, status: HTTPStatus, line: str) -> None:
         self._answer(status, JSON, as_json({"error": line}))
-        if self.command == "POST":
-            self._drain()
+        if self.command != "POST":
+            return
+        # Read some of what the client still sends: closing at once would take the answer away from it.
+        self.reader.allow(self.site.limits.pause / 10, self.site.limits.pause / 5)
+        with contextlib.suppress(OSError):
+            for _ in range(0, DRAINED, PIECE):
+                if not self.rfile.read1(PIECE):
+                    return
 
     def _start(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
         self.connection.settimeout(self.site.limits.send)
@@ -156,16 +234,6 @@ class Handler(BaseHTTPRequestHandler):
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-
-    def _drain(self) -> None:
-        """Read some of what a refused client still sends: closing at once would take the answer away from it."""
-        self.patience.allow(self.site.limits.pause / 10, self.site.limits.pause / 5)
-        try:
-            for _ in range(0, DRAINED, PIECE):
-                if not self.rfile.read1(PIECE):
-                    return
-        except OSError:
-            return
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """What the base class finds wrong with a request: too long, broken, or an unknown method."""

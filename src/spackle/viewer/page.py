@@ -1,25 +1,152 @@
-"""The page's files, and the page as one file."""
+"""A scene as the page takes it: its description, its Gaussians in 20 bytes each, and the page as one file."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import json
+import math
 import zlib
 from importlib import resources
 
-from spackle.viewer.scene import PageScene
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
-TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "txt": "text/plain"}
-FILES = ("index.html", "viewer.js", "viewer.css", "licenses.txt")
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+
+SAMPLES = 121  # of a path, between which the page goes straight
+USUAL, FOREIGN = 0.3, 0.6  # disparities that a scene is good for if nobody says: a completed one, one of others
+LEAST, MOST = 0.1, 1.0
+BEYOND = 1.3  # how much farther than that the eye never goes
+BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
+SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
+BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
+
+FILES = {
+    "index.html": "text/html",
+    "viewer.js": "text/javascript",
+    "viewer.css": "text/css",
+    "licenses.txt": "text/plain",
+}
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
 
 
+@dataclasses.dataclass(frozen=True)
+class PageScene:
+    """A scene as the page takes it."""
+
+    description: dict[str, object]  # what becomes JSON
+    files: dict[str, bytes]  # the layers, by the names that the description gives them
+
+
+def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None) -> PageScene:
+    """A scene for the page.
+
+    The description's `paths` hold, for each trajectory, eye positions [SAMPLES, 3] in metres: the eye stands at
+    still + disparity · moving, since what goes sideways grows with the disparity and what goes forward does not.
+
+    Args:
+        name: what the page calls it.
+        base: what the photo shows.
+        aux: what completion added; may be empty.
+        camera: the photo's, at the world's origin.
+        disparity: how far it was completed: up to there the eye follows the hand, and little farther.
+
+    Raises:
+        InputError: where no Gaussian stands in front of the camera.
+    """
+    if not bool((base.means[:, 2] > 0).any()):
+        raise InputError(f"{name}: no Gaussian stands in front of the photo's camera: nothing can be shown")
+    depths = DepthRange.of(base)
+    free = min(max((USUAL if len(aux) else FOREIGN) if disparity is None else disparity, LEAST), MOST)
+    files, layers = {}, []
+    for layer, gaussians in {"base": base, "aux": aux}.items():
+        file = f"{layer}.splats"
+        files[file], low, step = encode_layer(gaussians)
+        layers.append({"name": layer, "file": file, "count": len(gaussians), "scaleLow": low, "scaleStep": step})
+    description: dict[str, object] = {
+        "name": name,
+        "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height},
+        "focus": depths.focus,
+        "zNear": depths.near,
+        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": BEYOND * free},
+        "paths": {kind: _path(kind, camera, depths) for kind in TRAJECTORIES},
+        "layers": layers,
+    }
+    return PageScene(description, files)
+
+
+def _path(kind: TrajectoryKind, camera: Camera, depths: DepthRange) -> dict[str, list[list[float]]]:
+    """Eyes at disparity 0, and what a disparity of 1 adds to them. Nine digits are plenty, and keep the page small."""
+    still, wide = (
+        torch.stack([each.position for each in trajectory(kind, camera.to("cpu", torch.float64), far, depths, SAMPLES)])
+        for far in (0.0, 1.0)
+    )
+    parts = {"still": still, "moving": wide - still}
+    return {name: [[float(f"{x:.9g}") + 0.0 for x in eye] for eye in eyes.tolist()] for name, eyes in parts.items()}
+
+
+@torch.no_grad()
+def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
+    """Pack N Gaussians for the page, one byte plane after the other: planes compress well.
+
+    Planes of N bytes each: x, y, z with three planes each from the lower byte to the upper one, of float32's upper 24
+    bits; the logarithms of the three scales; the index of the quaternion's largest part (wxyz), which is made
+    positive, and the other three parts, ±127 for ±1/√2; red, green, blue in sRGB; opacity. Without its last 8 bits a
+    centre is wrong by 2⁻¹⁶ of its distance to the photo's eye, which is a hundredth of a pixel, near and far alike.
+
+    Returns:
+        The bytes [BYTES, N]; the logarithm of the scale that byte 0 stands for; what one step adds to it.
+    """
+    means, quats, scales, opacities, colors = (t.detach().to("cpu", torch.float32) for t in gaussians.tensors)
+    low, step = _scale_range(scales)
+    planes = np.empty((BYTES, len(gaussians)), np.uint8)
+    for start in range(0, len(gaussians), BLOCK):
+        part = slice(start, start + BLOCK)
+        bits = (means[part].T.contiguous().numpy().view(np.uint32) + np.uint32(0x80)).view(np.uint8)  # little-endian
+        planes[0:9, part] = bits.reshape(3, -1, 4)[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
+        logs = scales[part].clamp(SMALLEST_SCALE, LARGEST_SCALE).log()
+        planes[9:12, part] = _bytes((logs - low) / step)
+        planes[12:16, part] = _rotations(quats[part])
+        planes[16:19, part] = _bytes(linear_to_srgb(colors[part]) * 255)
+        planes[19, part] = _bytes(opacities[part, None] * 255)
+    return planes.tobytes(), low, step
+
+
+def _scale_range(scales: Tensor) -> tuple[float, float]:
+    if not scales.numel():
+        return 0.0, 1.0
+    low, high = (math.log(min(max(float(end), SMALLEST_SCALE), LARGEST_SCALE)) for end in torch.aminmax(scales))
+    return low, max(high - low, 1e-3) / 255
+
+
+def _bytes(values: Tensor) -> NDArray[np.uint8]:
+    """[rows, C] rounded to [C, rows] in 0..255."""
+    return values.round().clamp(0, 255).to(torch.uint8).T.numpy()
+
+
+def _rotations(quats: Tensor) -> NDArray[np.uint8]:
+    """[4, rows]: which part is the largest, and the other three in their order."""
+    quats = torch.nn.functional.normalize(quats, dim=-1)
+    largest = quats.abs().argmax(dim=-1, keepdim=True)
+    quats = quats * torch.where(quats.gather(-1, largest) < 0, -1.0, 1.0)
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
+    small = quats.gather(-1, others) * (127 * math.sqrt(2)) + 128
+    return np.concatenate([largest.to(torch.uint8).T.numpy(), _bytes(small)])
+
+
 def page_files() -> dict[str, tuple[str, bytes]]:
     """What a server hands out: URL path to content type and bytes; "/" is the page."""
-    kinds = {name: f"{TYPES[name.rpartition('.')[2]]}; charset=utf-8" for name in FILES}
-    return {"/" if name == "index.html" else f"/{name}": (kinds[name], _read(name)) for name in FILES}
+    paths = {name: "/" if name == "index.html" else f"/{name}" for name in FILES}
+    return {paths[name]: (f"{kind}; charset=utf-8", _read(name)) for name, kind in FILES.items()}
 
 
 def single_html(scene: PageScene) -> bytes:

@@ -1,15 +1,53 @@
-"""One job at a time, in a thread of its own."""
+"""One job at a time in a thread of its own, and the events by which it tells any number of listeners how far it is."""
 
 from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.viewer.events import Channel, Event, Tell
 
+Event = Mapping[str, object]  # {"stage", "done", "total"} | {"line"} | {"ready"} | {"error"}
+Tell = Callable[[Event], None]
+KEPT = 50  # lines for late listeners
+PACE = 0.05  # seconds between two looks of a listener: a fast job must not drown a slow page
 STOPPED = "the viewer has been stopped"
+
+
+class Channel:
+    """The newest stage, the last lines and the end of one job; late listeners get them too."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._events: list[tuple[int, Event]] = []  # numbered in the order they came
+        self._count = 0
+        self.ended = False
+
+    def tell(self, event: Event) -> None:
+        """Add an event. A stage takes the place of the stage before it; what comes after the end is dropped."""
+        with self._changed:
+            if self.ended:
+                return
+            if "stage" in event:
+                self._events = [(number, old) for number, old in self._events if "stage" not in old]
+            self.ended = "ready" in event or "error" in event
+            self._count += 1
+            self._events = [*self._events, (self._count, event)][-KEPT:]
+            self._changed.notify_all()
+
+    def listen(self, heartbeat: float) -> Iterator[Event | None]:
+        """What is known and then what comes, until the end; None where nothing has come for `heartbeat` seconds."""
+        seen, pace = 0, threading.Event()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda seen=seen: self._count > seen, heartbeat)  # type: ignore[misc]
+                fresh: list[Event | None] = [event for number, event in self._events if number > seen]
+                seen, ended = self._count, self.ended
+            yield from fresh or [None]
+            if ended:
+                return
+            pace.wait(PACE)
 
 
 class Stopped(BaseException):
@@ -17,7 +55,7 @@ class Stopped(BaseException):
 
 
 class Worker:
-    """The place for a job, and the channels of the last ones."""
+    """The place for one job, and the channels of the last `kept` ones; `log` gets the traceback of a job's bug."""
 
     def __init__(self, log: Callable[[str], None], kept: int) -> None:
         self._log, self._kept = log, kept
@@ -69,15 +107,15 @@ class Worker:
         with self._lock:
             return next(reversed(self._channels.items())) if self._channels else None
 
-    def stop(self, patience: float) -> bool:
-        """Ask the job to end and tell its listeners; whether it has ended within `patience` seconds."""
+    def stop(self, timeout: float) -> bool:
+        """Ask the job to end and tell its listeners; whether it has ended within `timeout` seconds."""
         with self._lock:
             self._stopping = True
             channels = list(self._channels.values())
         for channel in channels:
             channel.tell({"error": STOPPED})
         if self._thread is not None:
-            self._thread.join(patience)
+            self._thread.join(timeout)
         return self._thread is None or not self._thread.is_alive()
 
     def _run(self, job: Callable[[Tell], str], channel: Channel, done: Callable[[], None]) -> None:

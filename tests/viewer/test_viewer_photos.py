@@ -35,9 +35,9 @@ from viewer_client import (
 )
 
 from spackle.errors import InputError
-from spackle.viewer.events import KEPT, Channel, Tell
-from spackle.viewer.scene import PageScene
-from spackle.viewer.upload import shown_name
+from spackle.viewer.guard import shown_name
+from spackle.viewer.page import PageScene
+from spackle.viewer.work import KEPT, Channel, Tell
 
 
 @pytest.fixture(scope="module")

@@ -31,10 +31,10 @@ from viewer_client import (
 )
 
 from spackle.errors import InputError
-from spackle.viewer.events import Tell
-from spackle.viewer.patience import PatientReader
-from spackle.viewer.scene import PageScene
+from spackle.viewer.handler import TimeoutReader
+from spackle.viewer.page import PageScene
 from spackle.viewer.server import ViewerServer
+from spackle.viewer.work import Tell
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +326,7 @@ def test_the_log_cannot_play_with_a_terminal(server: ViewerServer) -> None:
 def test_patience_is_for_the_whole_too() -> None:
     one, other = socket.socketpair()
     with one, other:
-        reader = PatientReader(one)
+        reader = TimeoutReader(one)
         reader.allow(60, 0.1)
         with pytest.raises(TimeoutError):
             reader.read(1)
