@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap
-from spackle.bases.rgbd import lift
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.formats import save_png

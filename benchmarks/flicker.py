@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from spackle.bases.depth_maps import DepthMap
-from spackle.bases.rgbd import lift
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.pseudo.inpainters import get_inpainter
 from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from spackle import Completer, Gaussians, get_renderer, hole_area_ratio, hole_mask
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.formats import save_png
 from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual

@@ -3,7 +3,7 @@
     python benchmarks/stereo_pairs.py FOLDER
 
 FOLDER holds one folder a scene: a left and a right photo, a disparity map and a `scene.json` that names them and gives
-disparity_scale, focal_px, cx, cy, doffs_px and baseline_m (see `spackle.bases.depth_maps.load_depth`). Needs OpenCV
+disparity_scale, focal_px, cx, cy, doffs_px and baseline_m (see `spackle.bases.depth_map.load_depth`). Needs OpenCV
 for the 2D inpainting beside it: pip install opencv-python-headless.
 """
 
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from spackle import complete, get_renderer, hole_area_ratio, hole_mask
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.scene import scene_path
 from spackle.training.distance import hole_psnr
 from spackle.training.sources import load_pair

@@ -23,7 +23,7 @@ import torch
 from PIL import Image
 
 from spackle.machine import hardware
-from spackle.precision import PRECISIONS, pick_dtype
+from spackle.device import PRECISIONS, pick_dtype
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.training.cache import Cache, load_sample

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import spackle
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.formats import save_gray_png, save_png
 from spackle.jobs.demo import load_motorcycle
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 import spackle
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.formats import save_png
 from spackle.jobs.demo import load_motorcycle

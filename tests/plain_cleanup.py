@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 
-from spackle.bases import edges, noise, sharpen, sky, upsample
-from spackle.bases.edges import Bools, Edges, Floats
-from spackle.bases.upsample import Sampled
+from spackle.bases import cleanup, edges, sky
+from spackle.bases.edges import Bools, Edges, Floats, Sampled
 from spackle.surface import EDGE
 
 
@@ -76,7 +75,7 @@ def _side(gaps: list) -> tuple[float | None, int]:
 
 
 def plain_sample(inverse: Floats, known: Bools, found: Edges, height: int, width: int) -> Sampled:
-    """See `spackle.bases.upsample.sample`; for a map of another size than the photo's."""
+    """See `spackle.bases.edges.sample`; for a map of another size than the photo's."""
     rows, columns = inverse.shape
     sound = known & (found.step == 0)
     slopes = (_flattest(inverse, sound, found.across), _flattest(inverse.T, sound.T, found.down.T).T)
@@ -97,11 +96,11 @@ def plain_sample(inverse: Floats, known: Bools, found: Edges, height: int, width
         covered = bool(away) and min(away.values()) < 0.5 + 1e-6
         if mass < 0.5 * sum(weight.values()):
             if covered:
-                state[y, x], values[y, x] = upsample.SETTLED, plane[min(away, key=away.__getitem__)]
+                state[y, x], values[y, x] = edges.SETTLED, plane[min(away, key=away.__getitem__)]
             continue
         split = any(found.across[r, c] for r, c in corners if c == x0 < columns - 1)
         split |= any(found.down[r, c] for r, c in corners if r == y0 < rows - 1)
-        state[y, x] = upsample.SETTLED
+        state[y, x] = edges.SETTLED
         if not split and not any(found.step[corner] for corner in seen):
             if len(seen) == 4:
                 upper, lower = (inverse[r, x0] + (u - x0) * (inverse[r, x0 + 1] - inverse[r, x0]) for r in (y0, y0 + 1))
@@ -112,7 +111,7 @@ def plain_sample(inverse: Floats, known: Bools, found: Edges, height: int, width
         if covered:
             values[y, x] = plane[min(away, key=away.__getitem__)]
         else:
-            state[y, x], values[y, x] = upsample.OPEN, sum(weight[c] * inverse[c] for c in seen) / mass
+            state[y, x], values[y, x] = edges.OPEN, sum(weight[c] * inverse[c] for c in seen) / mass
             spread = max(inverse[c] for c in seen) - min(inverse[c] for c in seen)
             heights[y, x] = max(spread, *(found.step[c] for c in seen))
     near = [[int((k + 0.5) * n / size) for k in range(size)] for n, size in ((rows, height), (columns, width))]
@@ -134,23 +133,23 @@ def _flattest(inverse: Floats, sound: Bools, edge: Bools) -> Floats:
 
 
 def plain_settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools, Bools]:
-    """See `spackle.bases.sharpen.settle`; thirdly, where two paths are as good as equal."""
+    """See `spackle.bases.edges.settle`; thirdly, where two paths are as good as equal."""
     height, width = sampled.state.shape
-    depth, known = sampled.inverse_depth.astype(float), sampled.state != upsample.HOLE
+    depth, known = sampled.inverse_depth.astype(float), sampled.state != edges.HOLE
     origin, tied = _cheapest(sampled, rgb)
-    pixels = [p for p in itertools.product(range(height), range(width)) if sampled.state[p] == upsample.OPEN]
+    pixels = [p for p in itertools.product(range(height), range(width)) if sampled.state[p] == edges.OPEN]
     for y, x in pixels:
         if (y, x) not in origin:
             known[y, x] = False
             continue
         v, u = origin[y, x]
         lean = sampled.slope[0][v, u] * (x - u) + sampled.slope[1][v, u] * (y - v)
-        limit = sharpen.LEAN * sampled.inverse_depth[v, u]
+        limit = edges.LEAN * sampled.inverse_depth[v, u]
         depth[y, x] = sampled.inverse_depth[v, u] + min(max(lean, -limit), limit)
     pixels = [p for p in pixels if known[p]]
-    for _ in range(sharpen.VOTES):
+    for _ in range(edges.VOTES):
         depth = _voted(depth, known, rgb, pixels)
-    for _ in range(sharpen.RELAXATIONS):
+    for _ in range(edges.RELAXATIONS):
         for y, x in pixels:
             means = []
             for a, b in (((y, x - 1), (y, x + 1)), ((y - 1, x), (y + 1, x))):
@@ -164,7 +163,7 @@ def plain_settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools, Bools]:
 def _cheapest(sampled: Sampled, rgb: Floats) -> tuple[dict, Bools]:
     """The settled pixel that each open one is cheapest to reach from, by Dijkstra's algorithm, and the ties."""
     (height, width), tied = sampled.state.shape, np.zeros(sampled.state.shape, bool)
-    starts = [(int(y), int(x)) for y, x in np.argwhere(sampled.state == upsample.SETTLED)]
+    starts = [(int(y), int(x)) for y, x in np.argwhere(sampled.state == edges.SETTLED)]
     cost, origin = dict.fromkeys(starts, 0.0), {p: p for p in starts}
     queue = [(0.0, p) for p in starts]
     while queue:
@@ -172,11 +171,11 @@ def _cheapest(sampled: Sampled, rgb: Floats) -> tuple[dict, Bools]:
         if total > cost[y, x]:
             continue
         for v, u in itertools.product((y - 1, y, y + 1), (x - 1, x, x + 1)):
-            if not (0 <= v < height and 0 <= u < width) or sampled.state[v, u] != upsample.OPEN:
+            if not (0 <= v < height and 0 <= u < width) or sampled.state[v, u] != edges.OPEN:
                 continue
             climb = abs(float(sampled.inverse_depth[v, u]) - float(sampled.inverse_depth[y, x])) / sampled.step[v, u]
-            new = total + math.hypot(v - y, u - x) + sharpen.DEPTH_COST * climb
-            new += sharpen.COLOR_COST * float(np.abs(rgb[v, u] - rgb[y, x]).sum())
+            new = total + math.hypot(v - y, u - x) + edges.DEPTH_COST * climb
+            new += edges.COLOR_COST * float(np.abs(rgb[v, u] - rgb[y, x]).sum())
             old = cost.get((v, u), math.inf)
             tied[v, u] |= abs(new - old) < 1e-3 and origin[v, u] != origin[y, x]
             if new < old:
@@ -186,14 +185,14 @@ def _cheapest(sampled: Sampled, rgb: Floats) -> tuple[dict, Bools]:
 
 
 def _voted(depth: Floats, known: Bools, rgb: Floats, pixels: list[tuple[int, int]]) -> Floats:
-    result, size = depth.copy(), 2 * sharpen.VOTERS + 1
+    result, size = depth.copy(), 2 * edges.VOTERS + 1
     for y, x in pixels:
         box = itertools.product(range(y - size // 2, y + size // 2 + 1), range(x - size // 2, x + size // 2 + 1))
         near = [(v, u) for v, u in box if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1] and known[v, u]]
         low, high = min(depth[p] for p in near), max(depth[p] for p in near)
         if high - low <= EDGE * high:
             continue
-        votes = {p: (1 + (np.abs(rgb[p] - rgb[y, x]).sum() / sharpen.SAME_COLOR) ** 2) ** -2 for p in near}
+        votes = {p: (1 + (np.abs(rgb[p] - rgb[y, x]).sum() / edges.SAME_COLOR) ** 2) ** -2 for p in near}
         others = [p for p in near if (depth[p] > (low + high) / 2) != (depth[y, x] > (low + high) / 2)]
         if sum(votes.values()) < 2 * sum(votes[p] for p in others):
             result[y, x] = depth[max(others, key=lambda p: votes[p] / ((p[0] - y) ** 2 + (p[1] - x) ** 2))]
@@ -201,8 +200,8 @@ def _voted(depth: Floats, known: Bools, rgb: Floats, pixels: list[tuple[int, int
 
 
 def plain_planes(inverse: Floats, known: Bools, tolerance: float) -> Floats:
-    """See `spackle.bases.noise.smooth_noise`: least squares on each neighbourhood."""
-    result, radius = inverse.copy(), noise.RADIUS
+    """See `spackle.bases.cleanup.smooth_noise`: least squares on each neighbourhood."""
+    result, radius = inverse.copy(), cleanup.RADIUS
     for y, x in itertools.product(*map(range, inverse.shape)):
         if not known[y, x]:
             continue
@@ -210,10 +209,10 @@ def plain_planes(inverse: Floats, known: Bools, tolerance: float) -> Floats:
         columns = range(max(x - radius, 0), min(x + radius + 1, inverse.shape[1]))
         near = np.array([(1, u - x, v - y, inverse[v, u]) for v in rows for u in columns if known[v, u]], float)
         plane = np.array([inverse[y, x], 0, 0], float)
-        for fit in range(noise.FITS):
+        for fit in range(cleanup.FITS):
             steep = 0 if fit else EDGE * np.abs(near[:, 1:3]).max(1)
             fits = near[np.abs(near[:, :3] @ plane - near[:, 3]) <= (tolerance + steep) * inverse[y, x]]
-            if len(fits) < noise.ENOUGH or np.linalg.matrix_rank(fits[:, :3]) < 3:
+            if len(fits) < cleanup.ENOUGH or np.linalg.matrix_rank(fits[:, :3]) < 3:
                 break
             plane = np.linalg.lstsq(fits[:, :3], fits[:, 3], rcond=None)[0]
         if abs(plane[0] - inverse[y, x]) <= tolerance * inverse[y, x]:

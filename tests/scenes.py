@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
-from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering

@@ -11,10 +11,10 @@ from command import Run, report_of, run
 from photos import box
 from safetensors.torch import save_file
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.bases.lite.network import LiteNet
 from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.rgbd import lift
 from spackle.image import Photo, resize_photo
 
 QUICK = ("--no-render", "--residual", "none")

@@ -14,7 +14,7 @@ from photos import HEIGHT, WIDTH, metres, picture, read_ply, write_depth, write_
 from scenes import psnr, same_bits
 
 import spackle
-from spackle.bases.rgbd import RgbdBase
+from spackle.bases.lift import RgbdBase
 from spackle.formats import load_ply_camera
 from spackle.residual import ResidualNet
 from spackle.trajectory import TrajectoryKind

@@ -21,12 +21,12 @@ from sharp_weights import gaussians_of, write_tiny
 from stand_in import StandIn, base_of, predict, refuses, write_lite
 
 import spackle
-from spackle.bases.depth_maps import DepthMap
-from spackle.bases.device import MemoryShort
+from spackle.bases.depth_map import DepthMap
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.layers import TINY
+from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.image import Photo
 

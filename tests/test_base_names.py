@@ -16,10 +16,10 @@ from safetensors.torch import load_file, save_file
 from sharp_weights import write_tiny
 from stand_in import StandIn, base_of, predict, refuses, write_lite
 
-from spackle.bases.device import MemoryShort
 from spackle.bases.hf import HfBase
 from spackle.bases.open import KINDS
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.device import MemoryShort
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.evaluation.setup import EvaluateOptions

@@ -16,7 +16,7 @@ from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
 
 from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.layers import TINY
 from spackle.evaluation import efficiency, paper
 from spackle.evaluation import paper_efficiency as published
 from spackle.evaluation.efficiency import Clock, TimedBase, ViewBench, count_parameters, time_base

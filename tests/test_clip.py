@@ -11,9 +11,9 @@ import torch
 from scenes import box_before_wall
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
-from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn

@@ -30,7 +30,7 @@ from scenes import box_before_wall, psnr, shifted
 from sharp_weights import write_tiny
 from torch.utils.data import DataLoader
 
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
@@ -347,7 +347,7 @@ def test_another_configuration_is_refused_and_the_difference_shown(place: Path, 
 
 
 def test_a_folder_in_which_a_build_is_at_work_is_refused(place: Path, tmp_path: Path) -> None:
-    from spackle.downloads.locks import hold
+    from spackle.downloads.fetch import hold
 
     (tmp_path / "out").mkdir()
     with hold(tmp_path / "out" / ".lock"):

@@ -27,10 +27,17 @@ from torch import Tensor
 from training_runs import killed_at, started, state
 
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.checkpoint import expected_shapes, load_network
-from spackle.bases.sharp.config import CONFIGS
-from spackle.bases.sharp.decoder_file import NOTE, PARTS, Owner, decoder_bytes, link_owner
-from spackle.bases.sharp.recipe import deterministic_weights
+from spackle.bases.sharp.checkpoint import (
+    NOTE,
+    PARTS,
+    Owner,
+    decoder_bytes,
+    deterministic_weights,
+    expected_shapes,
+    link_owner,
+    load_network,
+)
+from spackle.bases.sharp.layers import CONFIGS
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.camera import Camera
 from spackle.errors import InputError
@@ -63,9 +70,9 @@ optim: {steps: 4, batch: 4, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
 run: {validate_every: 4, save_every: 2, log_every: 1}
 """
 SMALL = """
-from spackle.bases.sharp import config
+from spackle.bases.sharp import layers
 import dataclasses
-config.CONFIGS["tiny"] = dataclasses.replace(config.TINY, window=128)
+layers.CONFIGS["tiny"] = dataclasses.replace(layers.TINY, window=128)
 """  # for other processes, as the fixture `small` does it in this one
 
 

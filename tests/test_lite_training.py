@@ -17,8 +17,7 @@ from lite_data import write_data
 from PIL import Image
 from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
 
-from spackle.bases.lite.network import LiteNet
-from spackle.bases.lite.weights import load_networks
+from spackle.bases.lite.network import LiteNet, load_networks
 from spackle.training.depth.export import save_networks
 from spackle.training.depth.mixture import DepthBatch, Mixture
 from spackle.training.depth.recipe import LiteRecipe

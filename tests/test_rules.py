@@ -166,13 +166,10 @@ def test_a_completed_view_behind_the_photos_shield_shows_the_photo_as_the_base_d
 
 TWINS = {
     "_numba.py": "the decorators",
+    "bases/cleanup.py": "test_cleanup.py",
     "bases/edges.py": "test_cleanup.py",
-    "bases/missing.py": "test_rgbd.py",
-    "bases/noise.py": "test_cleanup.py",
-    "bases/sharp/jacobi.py": "test_sharp_unproject.py",
-    "bases/sharpen.py": "test_cleanup.py",
+    "bases/sharp/unproject.py": "test_sharp_unproject.py",
     "bases/sky.py": "test_sky.py",
-    "bases/upsample.py": "test_cleanup.py",
     "evaluation/suite/counts.py": "test_suite.py",
     "evaluation/suite/naive.py": "test_suite.py",
     "fill.py": "test_fill.py",

@@ -14,10 +14,10 @@ from sharp_weights import gaussians_of, tiny_weights, write_tiny
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.config import TINY
+from spackle.bases.sharp.layers import TINY
+from spackle.device import pick_dtype
 from spackle.image import Photo
 from spackle.jobs import predict
-from spackle.precision import pick_dtype
 
 QUICK = ("--no-render", "--residual", "none")
 

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from spackle.bases.depth_maps import load_depth
+from spackle.bases.depth_map import load_depth
 from spackle.errors import InputError
 from spackle.formats import VideoWriter, save_depth_png, save_gray_png, save_png, save_video
 

@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from spackle.bases.depth_maps import DepthMap, load_depth
+    from spackle.bases.depth_map import DepthMap, load_depth
     from spackle.bases.hf import HfBase
     from spackle.bases.lite.base import LiteBase
     from spackle.bases.protocol import Base, BasePrediction
@@ -34,7 +34,7 @@ _HOMES = {
     "BasePrediction": "spackle.bases.protocol",
     "Camera": "spackle.camera",
     "Completer": "spackle.residual",
-    "DepthMap": "spackle.bases.depth_maps",
+    "DepthMap": "spackle.bases.depth_map",
     "Gaussians": "spackle.gaussians",
     "HfBase": "spackle.bases.hf",
     "InputError": "spackle.errors",
@@ -49,7 +49,7 @@ _HOMES = {
     "hole_area_ratio": "spackle.residual",
     "hole_mask": "spackle.residual",
     "load_cameras": "spackle.formats",
-    "load_depth": "spackle.bases.depth_maps",
+    "load_depth": "spackle.bases.depth_map",
     "load_photo": "spackle.image",
     "load_ply": "spackle.formats",
     "predict": "spackle.scene",

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from spackle.downloads import read_record
-from spackle.downloads.partial import digest
+from spackle.downloads.transfer import digest
 from spackle.image import check_file
 
 MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has changed

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle._numba import kernel
-from spackle.threads import run_chunks
+from spackle.device import run_chunks
 
 FAR_BIAS = 80.0  # how sharply the far side of a rim wins: a sample 5 % nearer than the fill counts 1/50
 SWEEPS = 12  # relaxation sweeps at each resolution; more gain nothing

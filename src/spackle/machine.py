@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import spackle
-from spackle.threads import thread_count
+from spackle.device import thread_count
 
 
 def versions() -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import BaseSettings, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera

@@ -11,8 +11,8 @@ from torch.nn.functional import pad
 
 from spackle._numba import kernel
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians, quat_from_matrix
-from spackle.threads import run_chunks
 
 EDGE = 0.03  # a relative jump of inverse depth between neighbours beyond this is a depth edge
 CREASE = 0.01  # where the two sides' slopes differ by more than this, only the flatter one counts

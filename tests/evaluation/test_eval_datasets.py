@@ -17,7 +17,7 @@ from PIL import Image
 from scenes import motorcycle
 from torch.nn.functional import grid_sample
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation import paper

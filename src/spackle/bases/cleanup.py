@@ -1,10 +1,22 @@
-"""From a depth map as measured to a surface that can be seen from the side."""
+"""From a depth map as measured to a surface that can be seen from the side.
+
+Evening out what a sensor's noise does to a surface.
+
+Filling the gaps of a depth map along what the photo shows.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from spackle._numba import kernel
+from spackle.bases.edges import Bools, Floats
+from spackle.fill import far_fill
 from spackle.surface import EDGE, neighbours
 
 SWEEPS = 200  # enough for steps about 30 pixels apart
@@ -87,3 +99,160 @@ def undo_quantisation(inverse_depth: Tensor, valid: Tensor, quantum: float, swee
         total = sum((w * n for w, n in zip(weights, around, strict=True)), 1e-6 * smooth)
         smooth = torch.minimum(torch.maximum(total / mass, low), high)
     return torch.where(valid, smooth, inverse_depth)
+
+
+LEAST_NOISE = 5e-4  # of the inverse depth; less leaves no gaps between the Gaussians
+MOST_NOISE = 0.03  # more is no noise but what the photo shows: leaves, meshes
+RADIUS = 2  # pixels to each side that a plane is fitted to
+FITS = 2
+OUTLIERS = 4.0  # standard deviations of the noise from the plane to what belongs to another surface
+ENOUGH = 6  # pixels that say where a plane is
+
+
+def noise_level(inverse_depth: Floats, known: Bools) -> float:
+    """Standard deviation of the noise of most pixels, relative to the inverse depth.
+
+    The second difference by both x and y is nought on every plane and along every crease and edge that is
+    straight, and little on what is curved; the median leaves out the rest.
+    """
+    if min(inverse_depth.shape) < 3:
+        return 0.0
+    bend, seen = _second_difference(inverse_depth), known
+    bend = _second_difference(bend.T).T
+    for axis in (0, 1):
+        seen = np.logical_and.reduce([np.take(seen, range(n, seen.shape[axis] - 2 + n), axis) for n in range(3)])
+    if not seen.any():
+        return 0.0
+    return float(np.median(np.abs(bend[seen]) / inverse_depth[1:-1, 1:-1][seen])) / (0.6745 * 6)
+
+
+def _second_difference(image: Floats) -> Floats:
+    return image[:-2] - 2 * image[1:-1] + image[2:]
+
+
+def smooth_noise(inverse_depth: Floats, known: Bools) -> Floats:
+    """Put every pixel on the plane that its neighbourhood lies on, where the map is noisy; else leave the map as it is.
+
+    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through.
+    Pixels further from the plane than noise would explain are on another surface: they neither count
+    nor move.
+
+    Args:
+        inverse_depth: [h, w], positive where known.
+        known: [h, w] bool; others neither count nor move.
+    """
+    noise = noise_level(inverse_depth, known)
+    if not LEAST_NOISE <= noise <= MOST_NOISE:
+        return inverse_depth
+    planes: Floats = _on_planes(inverse_depth, known, OUTLIERS * noise)
+    return planes
+
+
+@kernel
+def _on_planes(depths: Any, known: Any, tolerance: float) -> Any:
+    height, width = depths.shape
+    result = depths.copy()
+    for y in range(height):
+        for x in range(width):
+            if not known[y, x]:
+                continue
+            here = depths[y, x]
+            at, across, down = here, 0.0, 0.0
+            for fit in range(FITS):
+                count, sx, sy, sd, sxx, syy, sxy, sxd, syd = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for dy in range(max(-RADIUS, -y), min(RADIUS, height - 1 - y) + 1):
+                    for dx in range(max(-RADIUS, -x), min(RADIUS, width - 1 - x) + 1):
+                        if not known[y + dy, x + dx]:
+                            continue
+                        off = depths[y + dy, x + dx] - (at + across * dx + down * dy)
+                        # As long as the slope is not known any that is no edge has to be allowed for.
+                        steep = EDGE * max(abs(dx), abs(dy)) if fit == 0 else 0.0
+                        if abs(off) > (tolerance + steep) * here:
+                            continue
+                        d = depths[y + dy, x + dx] - here
+                        count += 1
+                        sx, sy, sd = sx + dx, sy + dy, sd + d
+                        sxx, syy, sxy = sxx + dx * dx, syy + dy * dy, sxy + dx * dy
+                        sxd, syd = sxd + dx * d, syd + dy * d
+                if count < ENOUGH:
+                    break
+                cxx, cyy, cxy = sxx - sx * sx / count, syy - sy * sy / count, sxy - sx * sy / count
+                cxd, cyd = sxd - sx * sd / count, syd - sy * sd / count
+                determinant = cxx * cyy - cxy * cxy
+                if determinant < 1e-3:
+                    break
+                across = (cxd * cyy - cyd * cxy) / determinant
+                down = (cyd * cxx - cxd * cxy) / determinant
+                at = here + (sd - across * sx - down * sy) / count
+            if abs(at - here) <= tolerance * here:
+                result[y, x] = at
+    return result
+
+
+COLOR_COST = 60.0  # pixels of detour that a change from 0 to 1 in one channel is worth
+NEAR_COST = 300.0  # and this many before a depth is taken that is far too near
+ROUNDS = 4  # sweeps down and up; a path may turn as often
+MEDIAN = 5  # window that removes specks from what was filled
+
+
+def fill_missing(inverse_depth: Tensor, rgb: Tensor, valid: Tensor) -> Tensor:
+    """Give every pixel without depth the depth of the measured pixel that it is best connected to.
+
+    Stereo misses the strips beside silhouettes and whatever shines. A path over the image costs its
+    length plus the colour change along it, so depth spreads within things and stops at their outlines;
+    starting from a surface nearer than the far side of the gap costs extra, because most gaps are
+    background that the second camera could not see.
+
+    Args:
+        inverse_depth: [H, W], positive where valid.
+        rgb: [H, W, 3] sRGB.
+        valid: [H, W] bool.
+
+    Returns:
+        [H, W], positive; valid pixels as they were.
+
+    Raises:
+        ValueError: where nothing is valid.
+    """
+    if bool(valid.all()):
+        return inverse_depth
+    far, _ = far_fill(inverse_depth, inverse_depth[None], valid)
+    spread = _spread(inverse_depth.numpy(), rgb.contiguous().numpy(), valid.numpy(), far.numpy())
+    filled = torch.where(valid, inverse_depth, torch.from_numpy(spread))
+    return torch.where(valid, inverse_depth, _median(filled))
+
+
+@kernel
+def _spread(inverse_depth: Any, rgb: Any, valid: Any, far: Any) -> Any:
+    """Cheapest paths from valid pixels by sweeps over the image, down and up; returns their depths."""
+    height, width = inverse_depth.shape
+    cost = np.where(valid, np.float32(0), np.float32(np.inf))
+    result = inverse_depth.copy()
+    for sweep in range(2 * ROUNDS):
+        for i in range(height * width):
+            n = i if sweep % 2 == 0 else height * width - 1 - i
+            y, x = n // width, n % width
+            if valid[y, x]:
+                continue
+            for k in range(9):
+                v, u = y + k // 3 - 1, x + k % 3 - 1
+                if k == 4 or v < 0 or u < 0 or v >= height or u >= width or cost[v, u] == np.inf:
+                    continue
+                change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
+                change += abs(rgb[y, x, 2] - rgb[v, u, 2])
+                total = cost[v, u] + (1.0 if k % 2 else 1.4142135) + COLOR_COST * change
+                if valid[v, u]:
+                    total += NEAR_COST * max(0.0, 1.0 - far[y, x] / result[v, u])
+                if total < cost[y, x]:
+                    cost[y, x] = total
+                    result[y, x] = result[v, u]
+    return result
+
+
+def _median(image: Tensor) -> Tensor:
+    """Median over a square window, [H, W]; borders repeat."""
+    margin = MEDIAN // 2
+    wide = pad(image[None, None], (margin, margin, margin, margin), mode="replicate")[0, 0]
+    height, width = image.shape
+    shifts = [wide[dy : dy + height, dx : dx + width] for dy in range(MEDIAN) for dx in range(MEDIAN)]
+    return torch.stack(shifts).median(dim=0).values

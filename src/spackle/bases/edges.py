@@ -1,4 +1,9 @@
-"""Where a depth map has edges, and where an edge is smeared over several pixels."""
+"""Where a depth map has edges, and where an edge is smeared over several pixels.
+
+A depth map of any size on the photo's grid, without mixing what stands in front with what stands behind.
+
+Deciding on which side of a depth edge a pixel stands, by what the photo shows.
+"""
 
 from __future__ import annotations
 
@@ -109,3 +114,265 @@ def _foot(gaps: Any, peak: int, way: int) -> Any:
             break
         foot += way
     return flattest, foot
+
+
+SLOPE_REACH = 3  # pixels of the map beside an edge in which its side's slope is sought
+HOLE, OPEN, SETTLED = 0, 1, 2  # what is known of a pixel's depth: nothing, no more than its two sides, all
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampled:
+    """A map's inverse depth on the photo's grid. Open pixels have what the map says, mixed as it may be."""
+
+    inverse_depth: Floats  # [H, W]
+    state: NDArray[np.uint8]  # [H, W] HOLE, OPEN or SETTLED
+    step: Floats  # [H, W] height of the edge that an open pixel hangs in
+    slope: tuple[Floats, Floats]  # [H, W] each: change of the inverse depth by pixel x and y, as flat as it is near
+
+
+def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width: int) -> Sampled:
+    """Resample a map to height×width.
+
+    Between four pixels of one surface the inverse depth is bilinear, so a plane stays the plane it is.
+    Where an edge runs between them, or one hangs in an edge, the photo's pixel stays open unless a
+    sound pixel of the map is right there; what that one says is continued along its surface. Unknown
+    pixels never count; where they have more than half of the weight, the photo's pixel is a hole, unless it
+    covers one that is known.
+
+    Args:
+        inverse_depth: [h, w], positive where known.
+        known: [h, w] bool.
+        edges: of this map.
+    """
+    sound = known & (edges.step == 0)
+    across = _flattest(inverse_depth, sound, edges.across)
+    down = _flattest(*(np.ascontiguousarray(a.T) for a in (inverse_depth, sound, edges.down))).T
+    rows, columns = inverse_depth.shape
+    if (rows, columns) == (height, width):
+        state = np.where(known, np.where(sound, SETTLED, OPEN), HOLE).astype(np.uint8)
+        return Sampled(inverse_depth, state, edges.step, (across, np.ascontiguousarray(down)))
+    fields = (inverse_depth, known, edges.step, edges.across, edges.down, across, np.ascontiguousarray(down))
+    values, state, step = _sample(*fields, height, width)
+    y, x = (((np.arange(n) + 0.5) * size / n).astype(int) for n, size in ((height, rows), (width, columns)))
+    slope = (across[y][:, x] * np.float32(columns / width), down[y][:, x] * np.float32(rows / height))
+    return Sampled(values, state, step, slope)
+
+
+@kernel
+def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
+    """The flattest slope along its row that each pixel's surface has within reach.
+
+    The flattest, because what a smeared edge leaves beside its foot is always steeper than the surface.
+    """
+    height, width = inverse_depth.shape
+    slope = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            best = np.float32(np.inf)
+            for way in (-1, 1):
+                for n in range(SLOPE_REACH):
+                    left = x + way * n - (way < 0)
+                    if left < 0 or left + 1 >= width or edge[y, left] or not (sound[y, left] and sound[y, left + 1]):
+                        break
+                    change = inverse_depth[y, left + 1] - inverse_depth[y, left]
+                    if abs(change) < abs(best):
+                        best = change
+            slope[y, x] = best if best < np.inf else 0
+    return slope
+
+
+@kernel
+def _sample(
+    depths: Any, known: Any, steps: Any, across: Any, down: Any, sx: Any, sy: Any, height: int, width: int
+) -> Any:
+    rows, columns = depths.shape
+    values: Any = np.zeros((height, width), np.float32)
+    state = np.zeros((height, width), np.uint8)
+    heights = np.zeros((height, width), np.float32)
+    for y in range(height):
+        v = (y + 0.5) * rows / height - 0.5
+        y0 = min(max(int(np.floor(v)), 0), max(rows - 2, 0))
+        y1 = min(y0 + 1, rows - 1)
+        for x in range(width):
+            u = (x + 0.5) * columns / width - 0.5
+            x0 = min(max(int(np.floor(u)), 0), max(columns - 2, 0))
+            x1 = min(x0 + 1, columns - 1)
+            between = (x1 > x0 and (across[y0, x0] or across[y1, x0])) or (y1 > y0 and (down[y0, x0] or down[y0, x1]))
+            here, closest = np.float32(0), np.inf
+            step, low, high = np.float32(0), np.float32(np.inf), np.float32(0)
+            count, bilinear, total, mass, mixed, planes = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(4):
+                r, c = (y1 if k >= 2 else y0), (x1 if k % 2 else x0)
+                # Beyond the outermost pixels' centres `linear` extrapolates and `weight` does not.
+                linear = (v - y0 if k >= 2 else y0 + 1 - v) * (u - x0 if k % 2 else x0 + 1 - u)
+                weight = max(1 - abs(v - r), 0.0) * max(1 - abs(u - c), 0.0)
+                total += weight
+                if not known[r, c]:
+                    continue
+                depth = depths[r, c]
+                low, high, step = min(low, depth), max(high, depth), max(step, steps[r, c])
+                plane = max(depth + sx[r, c] * (u - c) + sy[r, c] * (v - r), 0.5 * depth)
+                count += 1
+                bilinear += linear * depth
+                mass += weight
+                mixed += weight * depth
+                planes += weight * plane
+                away = max(abs(u - c) * width / columns, abs(v - r) * height / rows)
+                if steps[r, c] == 0 and away < closest:
+                    here, closest = np.float32(plane), away
+            if mass < 0.5 * total:
+                if closest < 0.5 + 1e-6:  # the only one that is known of those that the photo's pixel covers
+                    values[y, x], state[y, x] = here, SETTLED
+                continue
+            state[y, x] = SETTLED
+            if not between and step == 0:
+                values[y, x] = max(bilinear, 0.5 * low) if count == 4 else planes / mass
+            elif closest < 0.5 + 1e-6:  # no pixel of the photo is closer to that pixel of the map
+                values[y, x] = here
+            else:
+                values[y, x], state[y, x], heights[y, x] = mixed / mass, OPEN, max(step, high - low)
+    return values, state, heights
+
+
+COLOR_COST = 100.0  # pixels of detour that a change from 0 to 1 in one channel is worth
+DEPTH_COST = 40.0  # and the way from one side of a smeared edge to the other
+ROUNDS = 4  # sweeps down and up; a path may turn as often
+LEAN = 0.25  # how far a side's surface may be continued into an edge, relative to its inverse depth
+VOTERS = 2  # pixels to each side that are heard on where an outline runs
+SAME_COLOR = 0.1  # sum of the channels' differences at which a vote counts a quarter
+VOTES, RELAXATIONS = 2, 10
+SAME_SURFACE = EDGE / 2
+
+
+def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
+    """Give every open pixel the depth of the side that it is best connected to.
+
+    A path over the image costs its length, the colour change along it and the change of the smeared
+    depth: so a side's depth, continued along its surface, spreads to the colour edge, and where there
+    is none to the middle of what was smeared. Then neighbours of a like colour outvote the few that
+    stand alone, and what came from several places of one surface is evened out.
+
+    Args:
+        sampled: the map on the photo's grid.
+        rgb: [H, W, 3] sRGB.
+
+    Returns:
+        Inverse depth [H, W] and where it is known; settled pixels as they were.
+    """
+    open_pixels = np.flatnonzero(sampled.state == OPEN)
+    known = sampled.state != HOLE
+    if not len(open_pixels):
+        return sampled.inverse_depth, known
+    source = _spread(sampled.inverse_depth, sampled.state, sampled.step, rgb, open_pixels)
+    reached = source >= 0
+    known.reshape(-1)[open_pixels[~reached]] = False
+    open_pixels, source = open_pixels[reached], source[reached]
+    depth = _continued(sampled, open_pixels, source)
+    for _ in range(VOTES):
+        depth = _vote(depth, known, rgb, open_pixels)
+    _relax(depth, known, open_pixels)
+    return depth, known
+
+
+def _continued(sampled: Sampled, pixels: NDArray[np.int64], source: NDArray[np.int64]) -> Floats:
+    """Each pixel on the plane of its source."""
+    width = sampled.state.shape[1]
+    at_source = sampled.inverse_depth.reshape(-1)[source]
+    across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
+    lean = across * (pixels % width - source % width) + down * (pixels // width - source // width)
+    depth = sampled.inverse_depth.copy()
+    depth.reshape(-1)[pixels] = at_source + np.clip(lean, -LEAN * at_source, LEAN * at_source)
+    return depth
+
+
+@kernel
+def _spread(depths: Any, state: Any, steps: Any, rgb: Any, pixels: Any) -> Any:
+    """For each open pixel the settled one, as y·W + x, that the cheapest path leads to; −1 for none."""
+    height, width = depths.shape
+    cost = np.where(state == SETTLED, np.float32(0), np.float32(np.inf))
+    source = np.arange(height * width)
+    for sweep in range(2 * ROUNDS):
+        way = 1 if sweep % 2 else -1  # the neighbours that this sweep has already visited
+        changed = False
+        for i in range(len(pixels)):
+            n = pixels[i if way < 0 else len(pixels) - 1 - i]
+            y, x = n // width, n % width
+            for k in range(4):
+                v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)
+                if v < 0 or u < 0 or v >= height or u >= width or cost[v, u] == np.inf:
+                    continue
+                change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
+                change += abs(rgb[y, x, 2] - rgb[v, u, 2])
+                climb = abs(depths[y, x] - depths[v, u]) / max(steps[y, x], np.float32(1e-12))
+                length = 1.0 if v == y or u == x else 1.4142135
+                total = np.float32(cost[v, u] + length + COLOR_COST * change + DEPTH_COST * climb)
+                if total < cost[y, x]:
+                    cost[y, x] = total
+                    source[n] = source[v * width + u]
+                    changed = True
+        if not changed and sweep > 0:
+            break
+    found = source[pixels]
+    for i in range(len(pixels)):
+        if cost[pixels[i] // width, pixels[i] % width] == np.inf:
+            found[i] = -1
+    return found
+
+
+@kernel
+def _vote(depths: Any, known: Any, rgb: Any, pixels: Any) -> Any:
+    """Open pixels near an edge change sides where most neighbours, by colour and distance, stand on the other."""
+    height, width = depths.shape
+    result = depths.copy()
+    for n in pixels:
+        y, x = n // width, n % width
+        top, bottom = max(y - VOTERS, 0), min(y + VOTERS + 1, height)
+        left, right = max(x - VOTERS, 0), min(x + VOTERS + 1, width)
+        low = high = depths[y, x]
+        for v in range(top, bottom):
+            for u in range(left, right):
+                if known[v, u]:
+                    low, high = min(low, depths[v, u]), max(high, depths[v, u])
+        if high - low <= EDGE * high:
+            continue
+        middle = 0.5 * (low + high)
+        balance, strongest = 0.0, 0.0
+        for v in range(top, bottom):
+            for u in range(left, right):
+                if not known[v, u]:
+                    continue
+                change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
+                change = (change + abs(rgb[y, x, 2] - rgb[v, u, 2])) / SAME_COLOR
+                vote = 1 / (1 + change * change) ** 2
+                if (depths[v, u] > middle) == (depths[y, x] > middle):
+                    balance += vote
+                    continue
+                balance -= vote
+                vote /= (v - y) ** 2 + (u - x) ** 2
+                if vote > strongest:
+                    strongest, other = vote, depths[v, u]
+        if balance < 0:
+            result[y, x] = other
+    return result
+
+
+@kernel
+def _relax(depths: Any, known: Any, pixels: Any) -> None:
+    """Move open pixels to the mean of opposite neighbours on their surface, in place; a plane stays as it is."""
+    height, width = depths.shape
+    for _ in range(RELAXATIONS):
+        for n in pixels:
+            y, x = n // width, n % width
+            here = depths[y, x]
+            total, count = np.float32(0), 0
+            for dy, dx in ((0, 1), (1, 0)):
+                if y - dy < 0 or x - dx < 0 or y + dy >= height or x + dx >= width:
+                    continue
+                if not (known[y - dy, x - dx] and known[y + dy, x + dx]):
+                    continue
+                before, after = depths[y - dy, x - dx], depths[y + dy, x + dx]
+                if max(abs(before - here), abs(after - here)) < SAME_SURFACE * here:
+                    total += before + after
+                    count += 2
+            if count:
+                depths[y, x] = total / count

@@ -1,26 +1,52 @@
-"""The hf base: a depth model of transformers looks at the photo, and its depth is lifted as a measured one is."""
+"""The hf base: a depth model of transformers looks at the photo, and its depth is lifted as a measured one is.
+
+Depth models by way of transformers (optional: pip install 'spackle-nvs[hf]').
+
+Where a model's files are: in a folder, in the hub's cache on this machine, or on the hub, from where they are copied
+into the cache (optional: pip install 'spackle-nvs[hf]').
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import logging
 import math
+import os
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
-from spackle.bases.device import own_arithmetic, pick_device
-from spackle.bases.hf_input import crop
-from spackle.bases.hf_kinds import scale_note, to_depth_map
-from spackle.bases.hf_load import DepthModel, load_model, one_line
+import torch
+from torch import Tensor, nn
+
+from spackle.bases.hf_models import (
+    SQUARE_ANTIALIAS,
+    Meaning,
+    Prepare,
+    Window,
+    by_processor,
+    by_settings,
+    crop,
+    meaning_of,
+    scale_note,
+    to_depth_map,
+)
+from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.rgbd import lift
 from spackle.camera import Camera
-from spackle.errors import InputError
+from spackle.device import MemoryShort, Precision, memory_is_short, own_arithmetic, pick_device, pick_dtype
+from spackle.errors import InputError, reason_in_a_line
 from spackle.image import LENSES, Photo, resize_photo
-from spackle.precision import Precision, pick_dtype
 
 LENS_SOURCE = "Depth Pro"  # the only kind of model that gives a lens
 
 
 class HfBase:
-    """Any depth model that transformers runs and whose output has a known meaning (see `hf_kinds`), frozen."""
+    """Any depth model that transformers runs and whose output has a known meaning (see `hf_models`), frozen."""
 
     def __init__(self, name: str, model: DepthModel, precision: str) -> None:
         """Use a model that is loaded already; `precision` is what the report says."""
@@ -89,3 +115,295 @@ class HfBase:
                 "give the focal length with --focal-mm"
             )
         return Camera.from_focal(focal, photo.width, photo.height)
+
+
+FIT = "give the weights that belong to its config.json"
+_PROBE = (64, 64)  # height and width of a picture that only has to reach every weight
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthModel:
+    """A depth network in evaluation mode, with all that is needed to ask it."""
+
+    network: nn.Module
+    prepare: Prepare
+    meaning: Meaning
+
+    @torch.no_grad()
+    def __call__(self, rgb: Tensor) -> tuple[Tensor, float | None, Window]:
+        """What the network says about a photo, [H, W, 3] sRGB in 0..1.
+
+        Returns:
+            its numbers [h, w] float32 on the processor, the horizontal field of view in degrees where it gives one,
+            and the part of them that is the photo.
+        """
+        pixels, window = self.prepare(rgb)
+        with quiet():
+            output = self.network(pixel_values=pixels.to(next(self.network.parameters()).device))
+        raw, fov = output.predicted_depth.float().cpu(), getattr(output, "field_of_view", None)
+        if raw.ndim != 3 or len(raw) != 1:
+            raise ValueError(f"an output of shape {tuple(raw.shape)}")
+        return raw[0], None if fov is None else float(fov), window
+
+
+def load_model(model: str, name: str, device: torch.device, dtype: torch.dtype) -> DepthModel:
+    """Read a depth model from safetensors; nothing of its own code is run.
+
+    Args:
+        model: a folder, or owner/name on the hub.
+        name: what messages call it.
+        device: where it runs.
+        dtype: of the products of matrices, which are most of the work; all else stays in float32.
+
+    Raises:
+        InputError: a package or file is missing, or the model is broken, not a depth model, or too large.
+    """
+    meaning_of(read_settings(settings_folder(model), "config.json", name), name)  # before the weights come
+    folder = weights_folder(model)
+    settings = read_settings(folder, "config.json", name)
+    meaning, kind = meaning_of(settings, name), str(settings["model_type"])
+    transformers = _transformers()
+    with one_line(name, "cannot be loaded", "give its files again, or another model"), _silent(transformers):
+        prepare = _prepare(transformers, folder, kind, name)
+        # Anything but float32 on disk is widened: what is not a product of matrices is cheap, and coarse in 16 bits.
+        network, info = transformers.AutoModelForDepthEstimation.from_pretrained(
+            folder,
+            dtype=torch.float32,
+            use_safetensors=True,
+            weights_only=True,
+            trust_remote_code=False,
+            local_files_only=True,
+            ignore_mismatched_sizes=True,  # only so that they can be named
+            output_loading_info=True,
+        )
+        found = DepthModel(network.eval().requires_grad_(False), prepare, meaning)
+        if info["mismatched_keys"]:
+            key = min(info["mismatched_keys"])[0]
+            raise InputError(f"{name}: its weights have another shape than its config.json says, {key} for one: {FIT}")
+        missing = sorted(info["missing_keys"])
+        if missing and _matters(found, missing):
+            lacks = missing[0] if len(missing) == 1 else f"{missing[0]} and {len(missing) - 1} more"
+            raise InputError(f"{name}: its weights lack {lacks}: {FIT}")
+        lower_linear(network, dtype)
+        network.to(device)
+    return found
+
+
+@contextmanager
+def one_line(who: str, what: str, advice: str) -> Iterator[None]:
+    """Turn whatever transformers and torch raise over a stranger's files into one line.
+
+    Raises:
+        InputError: `who`, `what` went wrong, why, and the advice.
+        MemoryShort: memory was short.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = reason_in_a_line(error)
+        if memory_is_short(error):
+            raise MemoryShort(f"{who}: not enough memory: give a smaller model, or close other programs") from error
+        raise InputError(f"{who} {what} ({reason}): {advice}") from error
+
+
+def lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
+    """Let the linear layers, where a transformer spends its time, multiply in `dtype`, in place.
+
+    What they take and give stays float32. The last layers of all these models are convolutions, which stay
+    float32 too: eight bits would turn slanted surfaces into stairs.
+    """
+    if dtype == torch.float32:
+        return
+    for module in network.modules():
+        if type(module) is nn.Linear:
+            module.to(dtype)
+            module.register_forward_pre_hook(lambda _, args: tuple(x.to(dtype) for x in args))
+            module.register_forward_hook(lambda _module, _args, output: output.float())
+
+
+def _prepare(transformers: Any, folder: Path, kind: str, name: str) -> Prepare:
+    if kind in SQUARE_ANTIALIAS:
+        settings, _ = transformers.ImageProcessingMixin.get_image_processor_dict(str(folder), local_files_only=True)
+        return by_settings(settings, SQUARE_ANTIALIAS[kind])
+    # Pillow's, everywhere: torchvision's differ from it in the last digits, and cannot be had beside every torch.
+    try:
+        processor = transformers.AutoImageProcessor.from_pretrained(
+            folder, backend="pil", trust_remote_code=False, local_files_only=True
+        )
+    except (ImportError, ValueError) as error:
+        if "torchvision" not in str(error):
+            raise
+        raise InputError(
+            f"{name}: its image processor needs torchvision: install the one that was built for torch "
+            f"{torch.__version__}, or give another model"
+        ) from error
+    return by_processor(processor, kind)
+
+
+def _matters(model: DepthModel, missing: list[str]) -> bool:
+    """Whether the output depends on tensors that the file lacks: DPT has some, in its code, that are never used.
+
+    They have random numbers now. With NaN in their place the answer is NaN if one of them is used.
+    """
+    tensors = model.network.state_dict()
+    for key in missing:
+        if key in tensors and tensors[key].is_floating_point():
+            tensors[key].fill_(torch.nan)
+    raw, fov, _ = model(torch.rand(*_PROBE, 3, generator=torch.Generator().manual_seed(0)))
+    return not bool(torch.isfinite(raw).all()) or (fov is not None and fov != fov)
+
+
+def _transformers() -> Any:
+    try:
+        with quiet():
+            import transformers
+            import transformers.utils.logging
+    except Exception as error:  # a torchvision of another build raises RuntimeError
+        if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
+            raise InputError(NOT_INSTALLED) from error
+        raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
+    return transformers
+
+
+@contextmanager
+def _silent(transformers: Any) -> Iterator[None]:
+    """`quiet`, and transformers' own progress bars with it."""
+    bars = transformers.utils.logging
+    enabled = bars.is_progress_bar_enabled()
+    try:
+        with quiet():
+            bars.disable_progress_bar()
+            yield
+    finally:
+        if enabled:
+            bars.enable_progress_bar()
+
+
+NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
+SETTINGS = ["config.json", "preprocessor_config.json", "processor_config.json"]
+WEIGHTS = ["model.safetensors", "model-*.safetensors", "model.safetensors.index.json"]
+_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
+
+
+def settings_folder(model: str) -> Path:
+    """The folder with a model's settings, for a look at them before gigabytes are copied.
+
+    Raises:
+        InputError: no such folder, no such model, the hub cannot be reached, or the settings are not there.
+    """
+    return _find(model, SETTINGS, _lacks_settings)
+
+
+def weights_folder(model: str) -> Path:
+    """The folder with a model's settings and weights; raises as `settings_folder` does."""
+    return _find(model, [*SETTINGS, *WEIGHTS], lambda folder: _lacks_settings(folder) or _lacks_weights(folder))
+
+
+def read_settings(folder: Path, file: str, name: str) -> dict[str, Any]:
+    """What a JSON file of a model says.
+
+    Raises:
+        InputError: not a JSON object; `name` is the model's.
+    """
+    try:
+        settings = json.loads((folder / file).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{name}: {file} cannot be read ({reason_in_a_line(error)}): give the model's files again"
+        ) from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{name}: {file} is no JSON object: give the model's files again")
+    return settings
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep the packages from printing warnings, logs and progress bars; what matters is raised."""
+    from huggingface_hub import utils
+
+    loggers = [logging.getLogger(name) for name in ("transformers", "huggingface_hub", "httpx")]
+    levels, bars = [logger.level for logger in loggers], not utils.are_progress_bars_disabled()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for logger in loggers:
+                logger.setLevel(logging.CRITICAL)
+            utils.disable_progress_bars()
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+        if bars:
+            utils.enable_progress_bars()
+
+
+def _find(model: str, files: list[str], lacks: Callable[[Path], str]) -> Path:
+    """A folder that lacks nothing; what is in the cache is taken from there without asking the hub."""
+    if os.path.isdir(model) or model.startswith(("./", "../", "/", "~")):
+        folder = Path(model).expanduser()
+        if not folder.is_dir():
+            raise InputError(f"hf:{model}: no such folder: check the name")
+    elif _HUB_NAME.fullmatch(model):
+        cached = _from_cache(model, files)
+        folder = cached if cached is not None and not lacks(cached) else _from_hub(model, files)
+    else:
+        raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
+    if problem := lacks(folder):
+        raise InputError(f"hf:{model}: {problem}")
+    return folder
+
+
+def _lacks_settings(folder: Path) -> str:
+    if not (folder / "config.json").is_file():
+        return "has no config.json, so it is no model of transformers: give another"
+    if not any((folder / name).is_file() for name in SETTINGS[1:]):
+        return f"has no {SETTINGS[1]}, which says how to prepare a photo: give it, or another model"
+    return ""
+
+
+def _lacks_weights(folder: Path) -> str:
+    index = folder / WEIGHTS[-1]
+    if index.is_file():
+        parts = read_settings(folder, index.name, str(folder)).get("weight_map")
+        names = {str(name) for name in parts.values()} if isinstance(parts, dict) else set()
+        absent = sorted(name for name in names if not (folder / name).is_file())
+        if absent or not names:
+            return f"{index.name} names weights that are not there ({', '.join(absent)[:80]}): give its files again"
+        return ""
+    if not (folder / WEIGHTS[0]).is_file():
+        return f"has no {WEIGHTS[0]}, the only kind of weights that runs no code when it is read: give another model"
+    return ""
+
+
+def _from_cache(model: str, files: list[str]) -> Path | None:
+    """The model's folder in the cache, whatever of it is there; None where nothing is."""
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError as error:
+        raise InputError(NOT_INSTALLED) from error
+    try:
+        with quiet():
+            return Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
+    except OSError:  # what huggingface_hub says of it is one
+        return None
+
+
+def _from_hub(model: str, files: list[str]) -> Path:
+    """The model's folder in the cache, after what is not in it has been copied there."""
+    from huggingface_hub import errors, snapshot_download
+
+    try:
+        with quiet():
+            return Path(snapshot_download(model, allow_patterns=files))
+    except Exception as error:  # of three libraries, one of them about the network
+        if isinstance(error, errors.LocalEntryNotFoundError):
+            problem = "not on this machine yet, and the hub cannot be reached: connect, or give a folder"
+        elif isinstance(error, errors.GatedRepoError):
+            problem = "its owner asks for consent: give it on the model's page, then log in with hf auth login"
+        elif isinstance(error, errors.RepositoryNotFoundError):
+            problem = "the hub has no such model, or only for its owner: check the name, or log in with hf auth login"
+        else:
+            problem = f"cannot be fetched from the hub ({reason_in_a_line(error)}): try again, or give a folder"
+        raise InputError(f"hf:{model}: {problem}") from error

@@ -1,14 +1,21 @@
-"""Big files from the web: gone on with after a break, whole under their name or not there, and recorded."""
+"""Big files from the web: gone on with after a break, whole under their name or not there, and recorded.
+
+Weights that others publish and Spackle can use: where from, and under what terms.
+
+One at a time: a lock file that is free again when its holder ends, however it ends.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
-from spackle.downloads.connect import check_url
-from spackle.downloads.locks import hold
-from spackle.downloads.partial import Progress, digest, read_json, receive, version_file, write_json
+from spackle.downloads.transfer import Progress, check_url, digest, read_json, receive, version_file, write_json
 from spackle.errors import InputError
 
 AGAIN = "run `spackle weights get` again"
@@ -124,3 +131,99 @@ def _real(path: str | os.PathLike[str]) -> Path:
 
 def _beside(file: Path, suffix: str) -> Path:
     return file.with_name(file.name + suffix)
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownWeights:
+    """One published file."""
+
+    name: str
+    url: str
+    file: str  # its name in the folder of weights
+    licence: str  # in a few words
+    notice: tuple[str, ...]  # lines that a person sees before the download
+
+
+WEIGHTS = {
+    known.name: known
+    for known in (
+        KnownWeights(
+            name="sharp",
+            url="https://ml-site.cdn-apple.com/models/sharp/sharp_2572gikvuh.pt",
+            file="sharp_2572gikvuh.pt",
+            licence="Apple, research only",
+            notice=(
+                "SHARP's weights are Apple's, under the Apple Machine Learning Research Model licence:",
+                "for non-commercial scientific research only. Spackle's own licence does not cover them.",
+                "Read its terms: https://github.com/apple/ml-sharp/blob/main/LICENSE_MODEL",
+            ),
+        ),
+    )
+}
+
+
+def known_weights(name: str) -> KnownWeights:
+    """The entry of that name.
+
+    Raises:
+        InputError: no such name.
+    """
+    if name not in WEIGHTS:
+        raise InputError(f"{name}: no weights of that name are known: choose from {', '.join(WEIGHTS)}")
+    return WEIGHTS[name]
+
+
+def installed(name: str) -> Path | None:
+    """The file of known weights in the folder of weights; None where it is not there.
+
+    Raises:
+        InputError: no such name.
+    """
+    path = weights_folder() / known_weights(name).file
+    return path if os.path.isfile(path) else None
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(file: BinaryIO) -> None:
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            raise BlockingIOError(*error.args) from error
+else:
+    import fcntl
+
+    def _lock(file: BinaryIO) -> None:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Hold the lock file `path` during the block.
+
+    The system keeps the lock, not the file's being there: one that a killed process left is free.
+
+    Raises:
+        BlockingIOError: somebody else holds it.
+        OSError: the file cannot be created, or the file system has no locks.
+    """
+    file = _acquire(path)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows deletes no open file, and it may stay
+            path.unlink()
+        file.close()
+
+
+def _acquire(path: Path) -> BinaryIO:
+    while True:
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(open(path, "ab"))
+            _lock(file)
+            # Its last holder may have removed it between these two steps: then what we hold has no name.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                    stack.pop_all()
+                    return file

@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE, Photo, load_photo, resize_photo

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from spackle.bases.protocol import Base, BasePrediction
-from spackle.bases.sharp.config import FULL
+from spackle.bases.sharp.checkpoint import unused_shapes
+from spackle.bases.sharp.layers import FULL
 from spackle.bases.sharp.network import SharpNetwork
-from spackle.bases.sharp.unused import unused_shapes
 from spackle.camera import Camera
+from spackle.device import Precision
 from spackle.evaluation.efficiency_results import ViewCost
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.precision import Precision
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet

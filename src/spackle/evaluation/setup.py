@@ -30,7 +30,7 @@ from spackle.jobs.bases import public_name, says_of, title_of
 from spackle.jobs.dataset.options import base_digest
 from spackle.jobs.options import PredictOptions, check_base_options
 from spackle.jobs.setup import set_up
-from spackle.precision import PRECISIONS, pick_dtype
+from spackle.device import PRECISIONS, pick_dtype
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.network import load_residual

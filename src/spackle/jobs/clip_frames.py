@@ -12,8 +12,8 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.precision import Precision
 from spackle.render import Renderer
 from spackle.rendering import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask

@@ -13,9 +13,9 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
-from spackle.bases.rgbd import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video

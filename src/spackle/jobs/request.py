@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import spackle
-from spackle.bases.depth_maps import calibrations_beside
+from spackle.bases.depth_map import calibrations_beside
 from spackle.bases.open import find_depth
 from spackle.digest import digest_of, fingerprint
 from spackle.jobs.options import PredictOptions

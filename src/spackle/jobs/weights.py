@@ -11,9 +11,8 @@ from rich.filesize import decimal
 from rich.table import Table
 from safetensors.torch import save_file
 
-from spackle.bases.sharp.checkpoint import expected_shapes
-from spackle.bases.sharp.config import CONFIGS
-from spackle.bases.sharp.recipe import deterministic_weights
+from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
+from spackle.bases.sharp.layers import CONFIGS
 from spackle.downloads import (
     WEIGHTS,
     KnownWeights,

@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from spackle.bases.device import enough_memory, pick_device
 from spackle.camera import Camera
+from spackle.device import enough_memory, pick_device
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import working_size
 from spackle.pseudo.propainter_weights import NETWORKS, give_weights, weight_files

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from spackle.device import run_chunks, thread_count
 from spackle.gaussians import Gaussians
 from spackle.render.blend_backward import backward_tiles, collect_sums, count_wanted
 from spackle.render.paste import tile_mask
@@ -20,7 +21,6 @@ from spackle.render.project import View
 from spackle.render.project_backward import project_backward
 from spackle.render.walk import SUMS
 from spackle.rendering import Rendering
-from spackle.threads import run_chunks, thread_count
 
 Array = npt.NDArray[Any]
 

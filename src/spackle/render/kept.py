@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spackle._numba import kernel
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import Canvas, Drawing, blend, project
 from spackle.render.project import DEPTH, Splats, View
@@ -18,7 +19,6 @@ from spackle.render.sort import sort_by_depth
 from spackle.render.tiles import TileLists, list_tiles
 from spackle.render.unchanged import Snapshot
 from spackle.rendering import Rendering
-from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.render.blend import blend_tiles
 from spackle.render.project import Splats, View, count_before
@@ -19,7 +20,6 @@ from spackle.render.project_forward import project_chunk
 from spackle.render.sort import sort_by_depth
 from spackle.render.tiles import TileLists, list_tiles
 from spackle.rendering import Rendering
-from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spackle._numba import kernel
-from spackle.threads import run_chunks
+from spackle.device import run_chunks
 
 Array = npt.NDArray[Any]
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spackle._numba import kernel
+from spackle.device import run_chunks, thread_count
 from spackle.render.sort import even_spans, starts_of
-from spackle.threads import run_chunks, thread_count
 
 Array = npt.NDArray[Any]
 

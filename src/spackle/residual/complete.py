@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.precision import Precision
 from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
 from spackle.residual.compose import compose

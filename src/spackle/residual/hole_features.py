@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from spackle._numba import kernel
+from spackle.device import run_chunks
 from spackle.render.approx import decode_srgb, encode_srgb
 from spackle.rendering import Rendering
-from spackle.threads import run_chunks
 
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3

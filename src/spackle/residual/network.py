@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from spackle.network_file import read_network
-from spackle.precision import Precision, pick_dtype
+from spackle.device import Precision, pick_dtype
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.hole_features import Cues
 from spackle.residual.seeds import Rim, Seeds

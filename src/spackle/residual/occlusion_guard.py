@@ -15,7 +15,7 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
 from spackle.residual.hole_features import MASK_THRESHOLD
-from spackle.threads import run_chunks
+from spackle.device import run_chunks
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre

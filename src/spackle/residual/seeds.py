@@ -14,10 +14,10 @@ from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
-from spackle.threads import run_chunks
 
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 BLOB_CELLS = 2  # "close by": as far as a blob reaches

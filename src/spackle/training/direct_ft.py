@@ -18,9 +18,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.bases.device import enough_memory
-from spackle.bases.sharp.decoder_file import Owner, decoder_bytes, link_owner
+from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
+from spackle.device import enough_memory
 from spackle.formats import atomic_path
 from spackle.pseudo import PseudoSample
 from spackle.render import Renderer

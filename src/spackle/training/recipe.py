@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from spackle.precision import Precision
+from spackle.device import Precision
 from spackle.training.losses import LossWeights
 
 FeatureName = Literal["resnet50", "squeezenet", "none"]

@@ -56,7 +56,7 @@ def with_backing(seen: Tensor, z: Tensor, height: int, width: int) -> Tensor:
 
     Args:
         seen: [N] as `seen_from` gives it.
-        z: [N] depths in the photo's camera: H·W pixels, then the backing (see `spackle.bases.rgbd.lift`).
+        z: [N] depths in the photo's camera: H·W pixels, then the backing (see `spackle.bases.lift.lift`).
         height: of the photo in pixels.
         width: likewise.
     """

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.depth_maps import DepthMap, load_depth
-from spackle.bases.rgbd import lift
+from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.image import film_to_pixels, load_photo

@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.depth_maps import DepthMap
-from spackle.bases.device import own_arithmetic, pick_device
-from spackle.bases.lite.network import STRIDE, LiteNet
-from spackle.bases.lite.weights import load_networks
-from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.relative import NEAREST_M, nearest
-from spackle.bases.rgbd import lift
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
+from spackle.bases.lite.network import STRIDE, LiteNet, load_networks
+from spackle.bases.protocol import NEAREST_M, BasePrediction, Progress, nearest
+from spackle.device import own_arithmetic, pick_device
 from spackle.image import Photo, resize_photo
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "lite.safetensors"

@@ -1,4 +1,4 @@
-"""Depth as a photo stores it: a picture of codes, and what the codes mean."""
+"""A depth map as a photo stores it: codes, their meaning, and how the map is turned."""
 
 from __future__ import annotations
 
@@ -14,12 +14,56 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.bases.depth_maps import ASPECT_TOLERANCE, grid_step
-from spackle.bases.photo_depth.turn import UPRIGHT, Turn
+from spackle.bases.depth_map import ASPECT_TOLERANCE, grid_step
 from spackle.errors import reason_in_a_line
 from spackle.image import LENSES, MAX_PIXELS
 
 Array = NDArray[Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Turn:
+    """Rows and columns swapped first, then mirrored."""
+
+    transpose: bool = False
+    mirror_x: bool = False  # left and right
+    mirror_y: bool = False  # top and bottom
+
+    def grid(self, values: Tensor) -> Tensor:
+        """[H, W] to [H, W] or [W, H]."""
+        values = values.T if self.transpose else values
+        axes = [axis for axis, mirrored in enumerate((self.mirror_y, self.mirror_x)) if mirrored]
+        return values.flip(axes).contiguous()
+
+    def matrix(self, K: Tensor, width: int, height: int) -> Tensor:
+        """Intrinsics [3, 3] of a width×height map, after the turn."""
+        (fx, cx), (fy, cy) = (float(K[0, 0]), float(K[0, 2])), (float(K[1, 1]), float(K[1, 2]))
+        if self.transpose:
+            fx, cx, fy, cy, width, height = fy, cy, fx, cx, height, width
+        cx = width - cx if self.mirror_x else cx
+        cy = height - cy if self.mirror_y else cy
+        return K.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def then(self, after: Turn) -> Turn:
+        """This turn followed by another."""
+        x, y = (self.mirror_y, self.mirror_x) if after.transpose else (self.mirror_x, self.mirror_y)
+        return Turn(self.transpose != after.transpose, x != after.mirror_x, y != after.mirror_y)
+
+
+UPRIGHT = Turn()
+# How a picture with this EXIF orientation is turned upright.
+BY_ORIENTATION = {
+    2: Turn(mirror_x=True),
+    3: Turn(mirror_x=True, mirror_y=True),
+    4: Turn(mirror_y=True),
+    5: Turn(transpose=True),
+    6: Turn(transpose=True, mirror_x=True),
+    7: Turn(transpose=True, mirror_x=True, mirror_y=True),
+    8: Turn(transpose=True, mirror_y=True),
+}
+# HEIF's `irot`: so many quarter turns anticlockwise. Its `imir`: 0 swaps top and bottom, 1 left and right.
+BY_IROT = (UPRIGHT, BY_ORIENTATION[8], BY_ORIENTATION[3], BY_ORIENTATION[6])
+BY_IMIR = (BY_ORIENTATION[4], BY_ORIENTATION[2])
 
 
 class BrokenDepth(Exception):

@@ -10,11 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from spackle.bases.depth_maps import ASPECT_TOLERANCE, DepthMap, StrPath
-from spackle.bases.photo_depth import android, apple
-from spackle.bases.photo_depth.coded import BrokenDepth, CodedDepth
-from spackle.bases.photo_depth.heif import find_in_heif
-from spackle.bases.photo_depth.turn import BY_ORIENTATION, UPRIGHT, Turn
+from spackle.bases.depth_map import ASPECT_TOLERANCE, DepthMap, StrPath
+from spackle.bases.photo_depth.coded import BY_ORIENTATION, UPRIGHT, BrokenDepth, CodedDepth, Turn
+from spackle.bases.photo_depth.layouts import find_android, find_apple, find_in_heif
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels, focal_from_exif, read_image
@@ -49,7 +47,7 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
 def _find(path: StrPath) -> CodedDepth | None:
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if data[:3] == b"\xff\xd8\xff":
-            return apple.find_in_jpeg(data) or android.find_in_jpeg(data)
+            return find_apple(data) or find_android(data)
         return find_in_heif(data, path) if data[4:8] == b"ftyp" else None
 
 

@@ -10,19 +10,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.device import enough_memory, memory_is_short, own_arithmetic, pick_device
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.compiled import Forward, compile_forward
-from spackle.bases.sharp.network import SharpNetwork, SharpOutput
-from spackle.bases.sharp.pyramid import WINDOWS
-from spackle.bases.sharp.start import compose
+from spackle.bases.sharp.encoder import WINDOWS
+from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
+from spackle.device import Precision, enough_memory, memory_is_short, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, reason_in_a_line
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
-from spackle.precision import Precision, pick_dtype
 
 LOG = logging.getLogger("spackle")
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak

@@ -1,21 +1,39 @@
-"""SHARP's network from its checkpoint: strict about names, shapes and numbers."""
+"""SHARP's network from its checkpoint: strict about names, shapes and numbers.
+
+A Gaussian decoder by itself: 31 MB that stand for a whole checkpoint, because they say which one the rest is in.
+
+Named tensors from a file that a stranger wrote: its kind told by its content, and nothing in it run.
+
+What SHARP's checkpoint holds and inference never reads: it is checked by name and shape, then dropped.
+
+Weights that anyone can make, so that the whole path runs without Apple's checkpoint.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import hashlib
+import json
 import os
+import pickle
+import warnings
+import zipfile
+import zlib
 from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
 import torch
-from torch import Tensor
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
 
-from spackle.bases.device import enough_memory
-from spackle.bases.sharp.config import CONFIGS, SharpConfig
-from spackle.bases.sharp.decoder_file import owner_of, with_owner
+from spackle.bases.sharp.layers import CONFIGS, SharpConfig, set_precision
 from spackle.bases.sharp.network import SharpNetwork
-from spackle.bases.sharp.precision import set_precision
-from spackle.bases.sharp.tensor_file import plain_text, read_tensors
-from spackle.bases.sharp.unused import Shapes, unused_shapes
+from spackle.device import enough_memory
 from spackle.errors import InputError, reason_in_a_line
+from spackle.image import check_file
 
 NAMED = 3  # how many of the names that differ are spelled out
 
@@ -34,7 +52,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     Raises:
         InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
-    tensors = read_tensors(path)
+    tensors = read_checkpoint_tensors(path)
     if (owner := owner_of(path)) is not None:
         tensors = with_owner(tensors, path, owner)
     network = _empty_network(_config_of(tensors))
@@ -112,3 +130,296 @@ def _config_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
 def _some(names: list[str]) -> str:
     more = len(names) - NAMED
     return ", ".join(map(plain_text, names[:NAMED])) + (f", and {more} more" if more > 0 else "")
+
+
+NOTE = "spackle.gaussian_decoder"  # in the file's metadata: JSON, for safetensors shuffles several notes
+PARTS = ("feature_model.", "prediction_head.")  # how its tensors' names begin
+BLOCK = 1 << 20  # bytes of a file read at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Owner:
+    """The checkpoint that a decoder was trained on, and needs for all that was not trained."""
+
+    path: Path  # where it lies; of one that a decoder's file names, the name alone
+    sha256: str
+
+    @property
+    def places(self) -> tuple[str, str]:
+        """What it, or a link to it, is called beside a decoder: the link of `link_owner`, and its own name."""
+        return f"trained-on-{plain_text(Path(self.sha256).name, 12)}.link", self.path.name
+
+
+def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
+    """A safetensors file in float32: weights that have not changed come back bit for bit.
+
+    Args:
+        decoder: a `GaussianDecoder`.
+        owner: its checkpoint.
+    """
+    tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
+    return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
+
+
+def link_owner(owner: Owner, folder: Path) -> None:
+    """Let decoders in a folder find their checkpoint; the link's name is one that nothing is ever written to."""
+    link = folder / owner.places[0]
+    with contextlib.suppress(OSError):  # this place has no links: then a person puts the checkpoint there
+        if link.is_symlink() and not link.exists():  # to where it lay once
+            link.unlink()
+        if not link.exists():
+            link.symlink_to(owner.path.absolute())
+
+
+def owner_of(path: str | os.PathLike[str]) -> Owner | None:
+    """The checkpoint that a decoder's file names; None where a file holds something else.
+
+    Args:
+        path: a file that `read_checkpoint_tensors` has read.
+
+    Raises:
+        InputError: it says that it is a decoder, and not whose.
+    """
+    note = read_notes(path).get(NOTE)
+    if note is None:
+        return None
+    try:
+        facts = json.loads(note)
+        return Owner(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{path}: does not say which checkpoint it was trained on: train it again") from error
+
+
+def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
+    """A whole checkpoint: the owner's tensors, with the decoder's in place of those of the same names.
+
+    The owner is looked for beside the decoder.
+
+    Args:
+        decoder: the tensors of the decoder's file.
+        path: that file, for messages.
+        owner: what it names.
+
+    Raises:
+        InputError: the owner is not there, cannot be read or has changed, or the decoder is another network's.
+    """
+    beside = Path(path).absolute().parent
+    home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
+    name = plain_text(owner.path.name)
+    if home is None:
+        raise InputError(
+            f"{path}: a decoder trained on {name}, which is not beside it: put that checkpoint, or a link to it, there"
+        )
+    if _sha256(home) != owner.sha256:
+        raise InputError(
+            f"{path}: trained on a checkpoint with the SHA-256 {plain_text(owner.sha256)}, which {home} has not: "
+            f"put that {name} beside it"
+        )
+    whole = read_checkpoint_tensors(home)
+    replaced = {name for name in whole if name.startswith(PARTS)}
+    if wrong := sorted(replaced ^ decoder.keys()):
+        raise InputError(
+            f"{path}: not the decoder of {home}: {len(wrong)} names differ, e.g. {plain_text(wrong[0])}: "
+            "give what `spackle train --method direct-ft` wrote"
+        )
+    return {**whole, **decoder}
+
+
+def _sha256(path: Path) -> str:
+    """Of a whole file; InputError where it cannot be read."""
+    found = hashlib.sha256()
+    try:
+        with open(path, "rb") as file:
+            while block := file.read(BLOCK):
+                found.update(block)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason_in_a_line(error)}") from error
+    return found.hexdigest()
+
+
+MAX_HEADER = 100_000_000  # bytes of a safetensors header; the format allows no more
+ENCRYPTED = 1  # a zip member's flag
+
+
+def read_checkpoint_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """The tensors of a checkpoint, their numbers read from the disk only when they are used.
+
+    Args:
+        path: what torch.save wrote, or a safetensors file, whatever its name.
+
+    Raises:
+        InputError: a missing or broken file, or one that holds anything but named tensors.
+    """
+    check_file(path, "checkpoint")
+    try:
+        with enough_memory():
+            loaded = _read(path)
+    except InputError:
+        raise
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"{path}: holds more than tensors, or is damaged; nothing in it was run: "
+            "give Apple's checkpoint as it was downloaded, or a .safetensors file"
+        ) from error
+    except Exception as error:  # a stranger's bytes can raise anything
+        reason = plain_text(reason_in_a_line(error), 200)
+        raise InputError(f"{path}: not a checkpoint, or cut off ({reason}): download it again") from error
+    if not isinstance(loaded, Mapping) or not loaded:
+        raise InputError(f"{path}: holds no named tensors: give SHARP's checkpoint")
+    for name, value in loaded.items():
+        if not isinstance(name, str):
+            raise InputError(f"{path}: a {type(name).__name__} stands for a name: give SHARP's weights alone")
+        if not _is_plain(value):
+            raise InputError(f"{path}: {plain_text(name)} is no plain tensor of floats: give SHARP's weights alone")
+    return dict(loaded)
+
+
+def read_notes(path: str | os.PathLike[str]) -> dict[str, str]:
+    """What a safetensors file says about itself; nothing where it says nothing, or is another kind of file.
+
+    Args:
+        path: a file that `read_checkpoint_tensors` has read.
+    """
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if not _is_safetensors(head):
+        return {}
+    with safe_open(path, framework="pt") as opened:
+        return dict(opened.metadata() or {})
+
+
+def plain_text(text: str, longest: int = 120) -> str:
+    """A stranger's text for a message: as it is where it is plain, else quoted and escaped."""
+    text = text[:longest]
+    return text if text.isascii() and text.isprintable() else ascii(text)[:longest]
+
+
+def _read(path: str | os.PathLike[str]) -> object:
+    """Whatever is in a file, by its first bytes: people rename files."""
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if head.startswith(b"PK\x03\x04"):
+        _check_archive(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about kinds of tensors that are refused
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    if _is_safetensors(head):
+        with safe_open(path, framework="pt") as opened:
+            return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
+    if head.startswith(b"\x80"):
+        raise InputError(
+            f"{path}: a bare pickle, as PyTorch wrote before 1.6; nothing in it was run: "
+            "save it again with a current torch.save, or give Apple's checkpoint as it was downloaded"
+        )
+    raise InputError(f"{path}: neither a PyTorch checkpoint nor a safetensors file: give SHARP's checkpoint")
+
+
+def _is_safetensors(head: bytes) -> bool:
+    """By the first nine bytes of a file."""
+    return head[8:] == b"{" and int.from_bytes(head[:8], "little") <= MAX_HEADER
+
+
+def _check_archive(path: str | os.PathLike[str]) -> None:
+    """InputError unless a zip's members lie in it plainly and undamaged: torch maps them, and looks at nothing."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & ENCRYPTED for member in members):
+            raise InputError(
+                f"{path}: zipped again by another program: give Apple's checkpoint as it was downloaded, "
+                "or what torch.save writes"
+            )
+        # The record says little or big, and torch refuses whatever else it says.
+        if any(member.filename.endswith("/byteorder") and member.file_size == len("big") for member in members):
+            raise InputError(f"{path}: its numbers are big-endian: save it again on a little-endian machine")
+        summed = any(member.CRC for member in members)  # torch.save can be told to leave the sums out
+        if summed and (damaged := archive.testzip()) is not None:
+            raise InputError(f"{path}: damaged at {plain_text(damaged)}: download it again")
+
+
+def _is_plain(value: object) -> bool:
+    """A dense tensor of floats with nothing attached: a file can give a tensor attributes that hide its methods."""
+    if type(value) not in (Tensor, torch.nn.Parameter) or vars(value):
+        return False
+    assert isinstance(value, Tensor)
+    dense = not value.is_nested and value.layout == torch.strided and value.device.type == "cpu"
+    return dense and value.is_floating_point()
+
+
+Shapes = dict[str, tuple[int, ...]]
+
+_STEPS = 4  # halvings of the U-Net
+_WIDTH = 16  # its channels at full size
+
+
+def unused_shapes(config: SharpConfig) -> Shapes:
+    """Names and shapes of the transformers' classifiers and of the branch that aligns depth in training."""
+    shapes: Shapes = {}
+    for encoder in ("patch_encoder", "image_encoder"):
+        name = f"monodepth_model.monodepth_predictor.encoder.{encoder}.head"
+        shapes |= {f"{name}.weight": (config.classes, config.embed), f"{name}.bias": (config.classes,)}
+    return shapes | {f"depth_alignment.scale_map_estimator.{name}": shape for name, shape in _unet().items()}
+
+
+def _unet() -> Shapes:
+    """A U-Net that maps two depths to a scale: a level is two residual blocks."""
+    widths = [_WIDTH << level for level in range(_STEPS + 1)]
+    shapes = _conv("encoder.conv_in.0", 2, _WIDTH, 3) | _norm("encoder.conv_in.1", _WIDTH)
+    for level in range(_STEPS):
+        shapes |= _level(f"encoder.convs_down.{level}", widths[level], widths[level + 1])
+    for level in range(_STEPS):
+        wide, narrow = widths[_STEPS - level], widths[_STEPS - level - 1]
+        shapes |= _level(f"decoder.convs_up.{level}", 2 * wide if level else wide, narrow)
+    shapes |= _norm("decoder.conv_out.0", 2 * _WIDTH) | _conv("decoder.conv_out.2", 2 * _WIDTH, _WIDTH, 1)
+    return shapes | _norm("decoder.conv_out.3", _WIDTH) | _conv("conv_out", _WIDTH, 1, 1)
+
+
+def _level(name: str, dim_in: int, dim_out: int) -> Shapes:
+    """Two residual blocks behind a change of size, which has no parameters."""
+    return (
+        _block(f"{name}.1", dim_in, dim_out)
+        | _conv(f"{name}.1.shortcut", dim_in, dim_out, 1)
+        | _block(f"{name}.2", dim_out, dim_out)
+    )
+
+
+def _block(name: str, dim_in: int, dim_out: int) -> Shapes:
+    hidden = dim_out // 2
+    return (
+        _norm(f"{name}.residual.0", dim_in)
+        | _conv(f"{name}.residual.2", dim_in, hidden, 3)
+        | _norm(f"{name}.residual.3", hidden)
+        | _conv(f"{name}.residual.5", hidden, dim_out, 3)
+    )
+
+
+def _conv(name: str, dim_in: int, dim_out: int, size: int) -> Shapes:
+    return {f"{name}.weight": (dim_out, dim_in, size, size), f"{name}.bias": (dim_out,)}
+
+
+def _norm(name: str, dim: int) -> Shapes:
+    return {f"{name}.weight": (dim,), f"{name}.bias": (dim,)}
+
+
+def deterministic_weights(shapes: Shapes) -> dict[str, Tensor]:
+    """A state dict [name → float32 tensor] that depends on names and shapes alone.
+
+    The numbers are random, the scale of each kind is such that signals neither die nor explode, and
+    the Gaussians that come out fill the picture. They show no scene.
+    """
+    return {name: torch.from_numpy(_tensor(name, shape)) for name, shape in shapes.items()}
+
+
+def _tensor(name: str, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    generator = np.random.Generator(np.random.Philox(zlib.crc32(name.encode())))
+    x = generator.standard_normal(shape, dtype=np.float32)
+    if name.endswith(("pos_embed", "cls_token")):
+        return np.float32(0.02) * x
+    if name.endswith(".gamma"):
+        return np.float32(0.1) * (1 + np.float32(0.1) * x)
+    if name.endswith("monodepth_predictor.head.4.bias"):
+        return 1 + np.float32(0.1) * x  # disparities around one
+    if len(shape) > 1:
+        return x / np.float32(np.sqrt(np.prod(shape[1:])))
+    if name.endswith("weight"):
+        return 1 + np.float32(0.1) * x
+    return np.float32(0.02) * x

@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from spackle.bases.protocol import Progress
-from spackle.bases.sharp.network import DepthNetwork, SharpNetwork, SharpOutput
-from spackle.bases.sharp.pyramid import WINDOWS
-from spackle.bases.sharp.start import Start
-from spackle.bases.sharp.vit import Block
+from spackle.bases.sharp.encoder import WINDOWS, Block
+from spackle.bases.sharp.network import DepthNetwork, SharpNetwork, SharpOutput, Start
 
 WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels and take their workspaces
 

@@ -8,13 +8,12 @@ import os
 import torch
 from torch import Tensor, nn
 
-from spackle.bases.device import own_arithmetic
 from spackle.bases.sharp.base import to_square, usual_windows
 from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.network import Seen, SharpNetwork
-from spackle.bases.sharp.precision import set_precision
-from spackle.bases.sharp.start import compose
+from spackle.bases.sharp.layers import set_precision
+from spackle.bases.sharp.network import Seen, SharpNetwork, compose
 from spackle.camera import Camera
+from spackle.device import own_arithmetic
 from spackle.gaussians import Gaussians
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.bases.depth_maps import DepthMap, load_depth
+from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import Precision, pick_dtype
 from spackle.evaluation.suite.clock import CPU, TOTAL, Task, measure
 from spackle.evaluation.suite.counts import FLOAT, GAUSSIAN, PIXEL, drawing_needs
 from spackle.evaluation.suite.fill import (
@@ -28,7 +29,6 @@ from spackle.evaluation.suite.flops import network_need
 from spackle.evaluation.suite.renderer import redraw_need
 from spackle.evaluation.suite.values import Found, Need, Row, Target
 from spackle.gaussians import Gaussians
-from spackle.precision import Precision, pick_dtype
 from spackle.render import Renderer
 from spackle.render.project import View
 from spackle.residual import CELL, ResidualNet, hole_area_ratio

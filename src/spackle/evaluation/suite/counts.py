@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spackle._numba import kernel
+from spackle.device import run_chunks
 from spackle.evaluation.suite.arithmetic import operations_of
 from spackle.evaluation.suite.values import Need
 from spackle.gaussians import Gaussians
@@ -21,7 +22,6 @@ from spackle.render.patch import LANES, PLANE, STATE, blend_patch, blend_splat, 
 from spackle.render.pipeline import BLEND_GRAIN, Drawing, draw, wanted_tiles
 from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, View, X, Y
 from spackle.render.protocol import TILE
-from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.evaluation.suite.clock import Lap
 from spackle.gaussians import Gaussians
-from spackle.precision import Precision
 from spackle.render import Renderer, touched_tiles
 from spackle.rendering import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.evaluation.suite.clock import Lap
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import View
 from spackle.render.project_forward import covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
-from spackle.threads import run_chunks
 
 Array = npt.NDArray[Any]
 

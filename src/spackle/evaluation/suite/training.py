@@ -11,11 +11,11 @@ import torch
 from torch.nn.functional import interpolate
 from torch.nn.utils import clip_grad_norm_
 
+from spackle.device import pick_dtype
 from spackle.evaluation.suite.clock import CPU, MS, TOTAL, Lap, measure
 from spackle.evaluation.suite.flops import counted
 from spackle.evaluation.suite.values import Found, Need, Row
 from spackle.formats import save_png
-from spackle.precision import pick_dtype
 from spackle.render import Renderer
 from spackle.residual import ResidualNet
 from spackle.training.cache import Cache, load_sample

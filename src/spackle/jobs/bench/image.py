@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 
+from spackle.bases.lift import RgbdBase
 from spackle.bases.protocol import Base
-from spackle.bases.rgbd import RgbdBase
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.efficiency import Clock, ViewBench, time_base

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from spackle.bases.rgbd import lift
+from spackle.bases.lift import lift
 from spackle.bases.sharp import SharpBase
 from spackle.digest import weights_digest
 from spackle.errors import InputError

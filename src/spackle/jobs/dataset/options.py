@@ -14,7 +14,7 @@ from spackle.errors import InputError
 from spackle.image import MAX_SIDE
 from spackle.jobs.bases import public_name
 from spackle.jobs.options import PredictOptions, check_has_depth, check_options
-from spackle.precision import Precision
+from spackle.device import Precision
 from spackle.pseudo.build import ViewChoices
 from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile

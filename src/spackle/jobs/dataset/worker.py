@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from spackle.bases.device import MemoryShort
+from spackle.device import MemoryShort
 from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
 from spackle.errors import InputError

@@ -6,8 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import ClassVar
 
-from spackle.bases.sharp.decoder_file import Owner, owner_of
-from spackle.bases.sharp.tensor_file import read_tensors
+from spackle.bases.sharp.checkpoint import Owner, owner_of, read_checkpoint_tensors
 from spackle.bases.sharp.tuning import TunableSharp
 from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
@@ -85,7 +84,7 @@ def _owner(checkpoint: Path | None) -> Owner:
             "--method direct-ft: no weights of SHARP on this machine: `spackle weights get sharp` downloads them "
             "(2.8 GB, for research only), -c FILE takes a local copy"
         )
-    read_tensors(path)  # refuses what is none, and reads no numbers yet
+    read_checkpoint_tensors(path)  # refuses what is none, and reads no numbers yet
     if owner_of(path) is not None:
         raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
     record = check_recorded(path)

@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from torch import nn
 
-from spackle.precision import pick_dtype
+from spackle.device import pick_dtype
 from spackle.progress import Reporter
 from spackle.training.learner import even
 from spackle.training.method import Method, MethodName

@@ -9,8 +9,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from spackle.bases.lite.network import LiteNet
-from spackle.bases.lite.weights import SCALE
+from spackle.bases.lite.network import SCALE, LiteNet
 from spackle.formats import atomic_path
 
 FEW = 32  # weights for an output: so few, those of depthwise convolutions, take little room in sixteen bits
@@ -18,7 +17,7 @@ STEPS = 127  # of eight bits, to either side of zero
 
 
 def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
-    """Write networks into one file, which `spackle.bases.lite.weights.load_networks` reads.
+    """Write networks into one file, which `spackle.bases.lite.network.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
     precision. `Look.network` counts them in this order.

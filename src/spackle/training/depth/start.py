@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from spackle.bases.lite.network import Block, LiteNet, Size
-from spackle.bases.lite.weights import load_networks
+from spackle.bases.lite.network import Block, LiteNet, Size, load_networks
 from spackle.errors import InputError
 from spackle.training.depth.encoder import load_encoder
 from spackle.training.depth.recipe import RANDOM, LiteRecipe

@@ -1,0 +1,164 @@
+"""A photo and its depth map, lifted: one surface-aligned Gaussian for each pixel, and a coarse backing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from spackle.bases.cleanup import (
+    attach_flying_pixels,
+    attach_mixed_pixels,
+    fill_missing,
+    smooth_noise,
+    undo_quantisation,
+)
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.edges import find_edges, sample, settle
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sky import push_sky
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, resize_photo
+from spackle.surface import surface_gaussians, surface_slope
+
+# Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
+# behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
+OPACITY = 0.99
+# Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
+# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels, closes it from behind:
+# 2 dB sharper at the photo's camera than one layer of wider blobs.
+FRONT_SPREAD_PX = 0.5
+BACKING_SPREAD_PX = 1.1
+BACKING_GAP = 0.005  # the backing's distance behind the front, relative
+BACKING_SLOPE_GAP = 4.0  # and this many pixels further along a slanted surface, so that none pokes through
+MAX_BACKING_GAP = 0.2
+
+
+class RgbdBase:
+    """Lifts a photo by a depth map that came with it."""
+
+    name = "rgbd"
+
+    def __init__(self, depth: DepthMap) -> None:
+        self.depth = depth
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Gaussians of the pixels of the photo at its working size; missing depth is filled and its share reported.
+
+        Raises:
+            InputError: where photo and depth map differ in aspect ratio.
+        """
+        self.depth.check_shape(photo.height, photo.width, photo.path)
+        photo = resize_photo(photo)
+        prediction = lift(photo.rgb, self.depth, self._camera(photo))
+        return dataclasses.replace(prediction, lens_source="" if self.depth.K is None else "calibration")
+
+    def _camera(self, photo: Photo) -> Camera:
+        """The calibration's lens where there is one, on the photo's pixels; else the photo's."""
+        if self.depth.K is None:
+            return photo.camera
+        height, width = self.depth.depth.shape
+        return Camera(self.depth.K, torch.eye(4), width, height).resized(photo.width, photo.height)
+
+
+def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
+    """A photo and its depth to Gaussians, first one for each pixel in row-major order, then the backing.
+
+    Args:
+        rgb: [H, W, 3] sRGB in 0..1.
+        depth: any size of the same aspect ratio.
+        camera: the photo's camera, at the world's origin.
+
+    Raises:
+        InputError: not one pixel has a depth.
+    """
+    rgb = rgb.detach().float()
+    inverse_depth, known = _inverse_depth(_sound(depth), rgb, camera)
+    sky = push_sky(inverse_depth, rgb, known)
+    missing = 1.0 - float(sky.known.float().mean())
+    if not sky.known.any():
+        raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
+    inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
+    inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
+    slope = surface_slope(inverse_depth)
+    colors = srgb_to_linear(rgb)
+    gaussians = Gaussians.cat(
+        [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
+    )
+    notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
+    if sky.share:
+        notes["sky"] = round(sky.share, 4)
+    if depth.depth.shape != inverse_depth.shape:
+        notes["depth_resampled_from"] = f"{depth.depth.shape[1]}×{depth.depth.shape[0]}"
+    return BasePrediction(gaussians, camera, notes)
+
+
+def _sound(depth: DepthMap) -> DepthMap:
+    """The same map; what is no depth is not valid, whatever the map says."""
+    values = depth.depth.detach().float()
+    valid = depth.valid & torch.isfinite(values) & (values > 0)
+    return dataclasses.replace(depth, depth=values.where(valid, 0.0), valid=valid)
+
+
+def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Inverse depth on the photo's grid and where it is known, [H, W] each.
+
+    Noise is evened out in the map as it came; then every smeared or resampled edge is moved to where
+    the photo has it. A clean map of the photo's size stays as it is.
+    """
+    inverse = torch.where(depth.valid, 1.0 / depth.depth, torch.zeros_like(depth.depth))
+    if depth.quantity == "disparity" and depth.quantum is not None:
+        inverse = undo_quantisation(inverse, depth.valid, depth.quantum)
+    known = depth.valid.contiguous().numpy()
+    smooth = smooth_noise(inverse.contiguous().numpy(), known)
+    rows, columns = known.shape
+    fx, fy = camera.focal
+    edges = find_edges(smooth, known, (fx * columns / camera.width, fy * rows / camera.height))
+    sampled = sample(smooth, known, edges, camera.height, camera.width)
+    settled, found = settle(sampled, rgb.contiguous().numpy())
+    return torch.from_numpy(settled), torch.from_numpy(found)
+
+
+def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
+    """One small Gaussian for each pixel."""
+    uv = camera.pixel_centers().reshape(-1, 2)
+    opacities = torch.full((len(uv),), OPACITY)
+    flat = inverse_depth.reshape(-1)
+    return surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
+
+
+def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
+    """One wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface."""
+    cells = _cells(inverse_depth)
+    if not cells.numel():  # one pixel high or wide
+        return Gaussians.empty()
+    far, pick = cells.min(dim=-1)
+    slope = _cells(slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
+    # The cell's centre lies half a pixel from the farthest pixel's.
+    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
+    at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
+    gap = BACKING_GAP + BACKING_SLOPE_GAP * slope.abs().sum(-1) / at_center
+    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
+    # Its colour is the mean of the pixels on that surface.
+    same = (cells - far[..., None] < 0.02 * far[..., None]).to(colors)
+    mean = (_cells(colors) * same[..., None]).sum(2) / same.sum(2)[..., None]
+    return surface_gaussians(
+        camera,
+        camera.pixel_centers(stride=2).reshape(-1, 2),
+        (at_center * recede).reshape(-1),
+        (slope * recede[..., None]).reshape(-1, 2),
+        BACKING_SPREAD_PX,
+        mean.reshape(-1, 3),
+        torch.full((far.numel(),), OPACITY),
+    )
+
+
+def _cells(image: Tensor) -> Tensor:
+    """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order."""
+    height, width = (n // 2 for n in image.shape[:2])
+    grid = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *image.shape[2:])
+    return grid.transpose(1, 2).flatten(2, 3)

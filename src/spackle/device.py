@@ -1,0 +1,191 @@
+"""Where a network runs: on which device, with how much memory, untouched by settings that a caller has for others.
+
+What networks compute in: float32, or bfloat16 where the hardware multiplies it natively.
+
+Neither type repeats bit for bit with another number of threads: sums run in another order. With the same
+number they do.
+
+Loops shared between threads, each step a kernel that runs without the GIL.
+
+Numba's own parallel loops depend on a threading layer that is either unsafe to enter from two Python
+threads or unsafe after a fork; a plain thread pool is neither, and its kernels compile faster.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Literal
+
+import torch
+
+from spackle.errors import InputError
+
+# How torch says that memory is short, beside the exceptions that it has for it.
+_SHORTAGES = (
+    "DefaultCPUAllocator",
+    "not enough memory",
+    "allocate memory",  # the system, when a file is to be mapped; and torch
+    "out of memory",  # CUDA outside torch's allocator
+    "_ALLOC_FAILED",  # cuBLAS and cuDNN
+)
+
+
+class MemoryShort(InputError):
+    """There was too little memory; the next time there may be enough."""
+
+
+def pick_device(device: torch.device | str | None) -> torch.device:
+    """The device that a caller means: for None a CUDA device where there is one, else the processor.
+
+    Raises:
+        InputError: a device that is not there, or one of a kind that networks do not run on here.
+    """
+    present = torch.cuda.is_available()
+    if device is None:
+        return torch.device("cuda" if present else "cpu")
+    shown = f"device {str(device)[:40]!a}"
+    try:
+        target = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise InputError(f"{shown}: there is no such device: give cpu or cuda") from error
+    if target.type not in ("cpu", "cuda"):
+        raise InputError(f"{shown}: networks do not run there: give cpu or cuda")
+    if target.type == "cuda" and not present:
+        raise InputError(f"{shown}: torch finds no CUDA device: give cpu, or install a torch and a driver for CUDA")
+    if target.type == "cuda" and (target.index or 0) >= torch.cuda.device_count():
+        raise InputError(f"{shown}: the last CUDA device is cuda:{torch.cuda.device_count() - 1}: give that or another")
+    return target
+
+
+def memory_is_short(error: BaseException) -> bool:
+    """Whether that is what an exception says, in one of torch's many ways."""
+    named = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+    return named or any(words in str(error) for words in _SHORTAGES)
+
+
+@contextmanager
+def enough_memory(*advice: str) -> Iterator[None]:
+    """Turn a shortage of memory, which torch reports in many ways, into one line.
+
+    Args:
+        advice: what to do about it; closing other programs is always named.
+
+    Raises:
+        MemoryShort: memory was short.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not memory_is_short(error):
+            raise
+        remedies = ", or ".join([*advice, "close other programs"])
+        raise MemoryShort(f"not enough memory for the network: {remedies}") from error
+
+
+@contextmanager
+def own_arithmetic(device: torch.device) -> Iterator[None]:
+    """Compute in the types that the tensors have, whatever the caller has set for networks of their own.
+
+    Autocast would round to sixteen bits what is to stay exact. TF32, which torch uses for a GPU's convolutions
+    unless told otherwise, drops thirteen bits of each float32. Its switches hold for the whole process, so
+    other threads see them too until they are set back.
+    """
+    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        if device.type != "cuda":
+            yield
+            return
+        # The older allow_tf32 cannot be read where the caller has used these newer switches.
+        switches = torch.backends.cuda.matmul, torch.backends.cudnn.conv  # type: ignore[attr-defined]  # its stubs
+        before = [switch.fp32_precision for switch in switches]
+        try:
+            for switch in switches:
+                switch.fp32_precision = "ieee"
+            yield
+        finally:
+            for switch, value in zip(switches, before, strict=True):
+                switch.fp32_precision = value
+
+
+Precision = Literal["auto", "fp32", "bf16"]
+PRECISIONS = ("auto", "fp32", "bf16")
+
+
+def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
+    """The type that --precision means on a device: `auto` is bfloat16 where the hardware multiplies it natively.
+
+    Raises:
+        ValueError: an unknown precision.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+    if precision == "auto":
+        return torch.bfloat16 if multiplies_bf16(device) else torch.float32
+    return torch.float32 if precision == "fp32" else torch.bfloat16
+
+
+def multiplies_bf16(device: torch.device) -> bool:
+    """Whether products of bfloat16 are native: AMX or AVX512-BF16 on a processor, Ampere or later on a GPU."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
+    if device.type != "cpu":
+        return False
+    has: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # older torch cannot tell
+    return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
+
+
+_pool: ThreadPoolExecutor | None = None
+_pool_lock = threading.Lock()
+
+
+def thread_count() -> int:
+    """As many threads as torch itself uses, so that one setting rules both."""
+    return torch.get_num_threads()
+
+
+def run_chunks(function: Callable[[int, int], object], total: int, grain: int) -> None:
+    """Call `function(start, stop)` for consecutive chunks of at most `grain` of 0..total.
+
+    A thread takes the next chunk when it is done with its last, so uneven chunks balance. The order of
+    the calls is free: what they write must not overlap.
+    """
+    chunks = -(-total // grain)
+    helpers = min(thread_count(), chunks) - 1
+    starts = iter(range(0, total, grain))
+    lock = threading.Lock()
+
+    def work() -> None:
+        while True:
+            with lock:
+                start = next(starts, None)
+            if start is None:
+                return
+            function(start, min(start + grain, total))
+
+    futures = [_executor().submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        for future in futures:
+            future.result()
+
+
+def _executor() -> ThreadPoolExecutor:
+    global _pool
+    with _pool_lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="spackle")
+        return _pool
+
+
+def _forget_pool() -> None:
+    """A forked child has none of its parent's threads, and starts its own."""
+    global _pool, _pool_lock
+    _pool, _pool_lock = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)

@@ -1,0 +1,439 @@
+"""The clean-up of depth maps: resampled, sharpened along the photo, and smoothed where noisy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plain_cleanup import plain_edges, plain_planes, plain_sample, plain_settle
+from scenes import Scene, box_before_wall, box_mask, motorcycle, motorcycle_base, slanted_plane, texture, wall
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
+
+from spackle.bases.cleanup import (
+    LEAST_NOISE,
+    OUTLIERS,
+    attach_flying_pixels,
+    attach_mixed_pixels,
+    fill_missing,
+    noise_level,
+    smooth_noise,
+)
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.edges import HOLE, OPEN, SETTLED, Sampled, find_edges, sample, settle
+from spackle.bases.lift import lift
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.render import CpuRenderer
+from spackle.residual import hole_mask
+from spackle.trajectory import DepthRange, extremes
+
+FOCAL = (100.0, 110.0)
+FACTORS = [(1.0, 1.0), (1.25, 1.25), (2.0, 2.0), (3.3, 2.9), (4.0, 4.0), (12.0, 12.0), (0.5, 0.5), (0.7, 0.7)]
+
+
+def blurred(image: Tensor, sigma: float) -> Tensor:
+    """A gaussian blur; borders repeat."""
+    radius = math.ceil(4 * sigma)
+    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
+    kernel = (kernel / kernel.sum()).reshape(1, 1, 1, -1)
+    wide = pad(image[None, None], [radius] * 4, mode="replicate")
+    return torch.conv2d(torch.conv2d(wide, kernel), kernel.transpose(2, 3))[0, 0]
+
+
+def map_of(inverse: Tensor, known: Tensor | None = None) -> DepthMap:
+    known = inverse > 0 if known is None else known
+    return DepthMap(torch.where(known, 1 / inverse, 0.0), known, None, None, "depth", Path("network"))
+
+
+def as_networks_do(scene: Scene, sigma: float = 3.0, factor: int = 4) -> DepthMap:
+    """A scene's depth as a network predicts it: small, and smeared at the outlines."""
+    return map_of(avg_pool2d(blurred(1 / scene.depth, sigma)[None, None], factor)[0, 0])
+
+
+def front(scene: Scene, depth: DepthMap) -> Tensor:
+    """[H, W] the inverse depths that a scene's photo is lifted with."""
+    means = lift(scene.rgb, depth, scene.camera).gaussians.means
+    return 1 / means[: scene.camera.height * scene.camera.width, 2].reshape(scene.camera.height, scene.camera.width)
+
+
+def random_map(seed: int, height: int = 13, width: int = 17) -> tuple[np.ndarray, np.ndarray]:
+    """Planes and steps, smeared here and there, with holes: inverse depth and what is known."""
+    generator = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
+    inverse = 0.3 + 0.2 * torch.rand(1, generator=generator) * x
+    for _ in range(3):
+        a, b, c, rise = (2 * torch.rand(4, generator=generator) - 1).tolist()
+        inverse = inverse + torch.where(a * (x - 0.5) + b * (y - 0.5) > 0.2 * c, abs(rise), 0.0)
+    inverse = blurred(inverse, 0.4 + 0.5 * float(torch.rand(1, generator=generator)))
+    inverse = inverse + 0.003 * torch.rand(height, width, generator=generator)
+    known = torch.rand(height, width, generator=generator) > 0.06
+    return torch.where(known, inverse, 0.0).numpy(), known.numpy()
+
+
+def random_photo(seed: int, height: int, width: int) -> np.ndarray:
+    generator = torch.Generator().manual_seed(seed + 1000)
+    coarse = torch.rand(1, 3, 4, 5, generator=generator)
+    smooth = interpolate(coarse, size=(height, width), mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+    return (smooth + 0.05 * torch.rand(height, width, 3, generator=generator)).contiguous().numpy()
+
+
+# Edges.
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_edges_match_the_plain_twin(seed: int) -> None:
+    inverse, known = random_map(seed, 17, 41)
+    found, plain = find_edges(inverse, known, FOCAL), plain_edges(inverse, known, FOCAL)
+    assert (found.step > 0).any()
+    np.testing.assert_allclose(found.step, plain.step, rtol=1e-4, atol=1e-6)
+    assert np.array_equal(found.across, plain.across)
+    assert np.array_equal(found.down, plain.down)
+
+
+def sphere(radius_px: float, behind: float, size: int = 120) -> Tensor:
+    """Exact inverse depth of a ball at 3 m, that many radii before a wall, seen at a focal length of 200."""
+    ray = Camera.from_focal(200, size, size).pixel_centers().sub(size / 2).div(200)
+    radius = 3 * radius_px / 200
+    a, c = ray.square().sum(-1) + 1, 9 - radius**2
+    within = 9 - a * c
+    return torch.where(within > 0, a / (3 - within.clamp_min(0).sqrt()), 1 / (3 + behind * radius))
+
+
+def horizon(size: int = 120) -> Tensor:
+    """Ground that runs up to a far wall: steep, with a crease at its end."""
+    return (0.004 * (torch.arange(size) - size / 3)).clamp_min(0.002)[:, None].expand(size, size).contiguous()
+
+
+def bump(size: int = 120) -> Tensor:
+    """A smooth hill, as steep as 45° somewhere."""
+    x = (torch.arange(size) - size / 2) / 30
+    return 0.3 + 0.02 * torch.exp(-(x**2 + x[:, None] ** 2))
+
+
+@pytest.mark.parametrize(
+    "inverse",
+    [
+        *(1 / slanted_plane(1.5, far, axis).depth for far in (6, 1000) for axis in (0, 1)),
+        *(sphere(radius, 4.0) for radius in (5, 10, 30, 50)),
+        horizon(),
+        horizon().T.contiguous(),
+        bump(),
+        1 / box_before_wall().depth,
+    ],
+)
+def test_planes_creases_and_round_things_are_not_smeared(inverse: Tensor) -> None:
+    found = find_edges(inverse.numpy(), np.ones(inverse.shape, bool), (200.0, 200.0))
+    assert not found.step.any()
+
+
+@pytest.mark.parametrize("radius", [5, 10, 30, 50])
+@pytest.mark.parametrize("behind", [0.0, 0.2, 1.0])
+def test_a_ball_keeps_its_roundness_even_where_it_touches_the_wall(radius: float, behind: float) -> None:
+    """Where the rim falls off to the wall like an edge a pixel or two wide, it ends a little more bluntly."""
+    inverse = sphere(radius, behind)
+    known = np.ones(inverse.shape, bool)
+    edges = find_edges(inverse.numpy(), known, (200.0, 200.0))
+    rgb = torch.where((inverse == inverse.min())[..., None], 0.2, texture(*inverse.shape)).numpy()
+    found, _ = settle(sample(inverse.numpy(), known, edges, *inverse.shape), rgb)
+    error = np.abs(found / inverse.numpy() - 1)
+    assert error.max() < 0.04
+    assert (error > 0).sum() < 3 * 2 * math.pi * radius
+
+
+def test_planes_and_creases_have_no_edge_and_a_box_has_its_outline() -> None:
+    for inverse in (horizon(), 1 / slanted_plane(1.5, 1000, 0).depth, bump()):
+        found = find_edges(inverse.numpy(), np.ones(inverse.shape, bool), (200.0, 200.0))
+        assert not found.across.any()
+        assert not found.down.any()
+    found = find_edges((1 / box_before_wall().depth).numpy(), np.ones((72, 96), bool), (80.0, 80.0))
+    mask = box_mask(96, 72)
+    assert np.array_equal(found.across[:, :-1], (mask[:, 1:] ^ mask[:, :-1]).numpy())
+    assert np.array_equal(found.down[:-1], (mask[1:] ^ mask[:-1]).numpy())
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("sigma", [0.7, 1.5, 3.0])
+@pytest.mark.parametrize("slope", [0.0, 0.002])
+def test_a_smeared_edge_is_found_from_foot_to_foot(sigma: float, slope: float, turned: bool) -> None:
+    exact = (torch.where(torch.arange(60) < 30, 1.0, 0.4) + slope * torch.arange(60)).expand(9, 60)
+    image = blurred(exact, sigma)
+    inverse = (image.T if turned else image).contiguous().numpy()
+    step = torch.from_numpy(find_edges(inverse, np.ones(inverse.shape, bool), FOCAL).step)
+    hangs = (step.T if turned else step) > 0
+    assert bool(hangs[(image - exact).abs() > 0.1 * 0.6].all())
+    assert bool((hangs[4] == hangs).all())
+    assert int(hangs[4].sum()) <= 6 * sigma + 2
+    assert float(step.max()) == pytest.approx(0.6, rel=0.15)
+
+
+# Upsampling.
+
+
+@pytest.mark.parametrize("size", [(13, 17), (30, 35), (40, 55), (9, 12), (100, 7), (1, 1)])
+@pytest.mark.parametrize("seed", range(3))
+def test_resampling_matches_the_plain_twin(seed: int, size: tuple[int, int]) -> None:
+    inverse, known = random_map(seed, 14, 18)
+    edges = find_edges(inverse, known, FOCAL)
+    found, plain = sample(inverse, known, edges, *size), plain_sample(inverse, known, edges, *size)
+    assert np.array_equal(found.state, plain.state)
+    for one, other in zip(
+        (found.inverse_depth, found.step, *found.slope), (plain.inverse_depth, plain.step, *plain.slope), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (6, 1), (2, 2)])
+def test_tiny_maps_are_resampled(shape: tuple[int, int]) -> None:
+    inverse = np.linspace(0.2, 0.3, shape[0] * shape[1], dtype=np.float32).reshape(shape)
+    known = np.ones(shape, bool)
+    found = sample(inverse, known, find_edges(inverse, known, FOCAL), 8, 9)
+    assert (found.state != HOLE).all()
+    assert found.inverse_depth.min() > 0.1
+    assert found.inverse_depth.max() < 0.4
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+@pytest.mark.parametrize("slope", [(0.0, 1.0), (1.0, 0.0), (-0.4, 0.7)])
+def test_a_plane_stays_that_plane_at_any_size(factor: tuple[float, float], slope: tuple[float, float]) -> None:
+    """No stairs, up to the border; the photo is noise, so nothing of it may show."""
+    height, width = 96, 120
+    rows, columns = round(height / factor[0]), round(width / factor[1])
+    x, y = (torch.arange(columns) + 0.5) / columns, (torch.arange(rows) + 0.5) / rows
+    at_map = 0.5 + 0.4 * (slope[0] * x + slope[1] * y[:, None])
+    x, y = (torch.arange(width) + 0.5) / width, (torch.arange(height) + 0.5) / height
+    exact = 0.5 + 0.4 * (slope[0] * x + slope[1] * y[:, None])
+    scene = Scene(
+        torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0)),
+        1 / exact,
+        Camera.from_focal(100, width, height),
+    )
+    torch.testing.assert_close(front(scene, map_of(at_map)), exact, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("nonsense", [0.0, 1e-9, 1e9])
+def test_what_is_unknown_never_leaks(nonsense: float) -> None:
+    """A strip without depth beside the box: what stands in it means nothing, and the photo's pixels in it are holes."""
+    scene = box_before_wall(width=192, height=144, focal=200)
+    known = torch.ones(36, 48, dtype=torch.bool)
+    known[12:24, 13:16] = False
+    depth = torch.where(known, scene.depth[1::4, 1::4], nonsense)
+    edges = find_edges((1 / depth).nan_to_num().numpy(), known.numpy(), FOCAL)
+    found = sample((1 / depth).nan_to_num(0).numpy(), known.numpy(), edges, 144, 192)
+    settled, seen = settle(found, scene.rgb.numpy())
+    hole = interpolate((~known).float()[None, None], size=(144, 192), mode="nearest-exact")[0, 0] > 0
+    assert int((seen ^ ~hole.numpy()).sum()) <= 4  # its corners
+    values = torch.from_numpy(settled[seen])
+    torch.testing.assert_close(
+        torch.minimum((values - 0.5).abs(), (values - 1 / 6).abs()), torch.zeros_like(values), rtol=0, atol=1e-6
+    )
+    z = 1 / front(scene, DepthMap(depth, known, None, None, "depth", Path("sensor")))
+    assert bool(((z - 2).abs() < 1e-4).logical_or((z - 6).abs() < 1e-4).all())
+
+
+def test_a_larger_map_is_reduced_without_mixing() -> None:
+    scene = box_before_wall(width=193, height=145)  # edges between the photo's pixels
+    small = dataclasses.replace(box_before_wall(width=77, height=58), depth=scene.depth)
+    z = 1 / front(small, map_of(1 / scene.depth))
+    assert bool(((z - 2).abs() < 1e-4).logical_or((z - 6).abs() < 1e-4).all())
+    assert int(((z < 3) ^ box_mask(77, 58)).sum()) <= 20
+
+
+# Sharpening.
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4, 5, 6, 7, 8])
+def test_settling_matches_the_plain_twin(seed: int) -> None:
+    inverse, known = random_map(seed)
+    edges = find_edges(inverse, known, FOCAL)
+    height, width = ((13, 17), (21, 30))[seed % 2]
+    sampled, rgb = sample(inverse, known, edges, height, width), random_photo(seed, height, width)
+    assert (sampled.state == OPEN).any()
+    found, seen = settle(sampled, rgb)
+    plain, plain_seen, tied = plain_settle(sampled, rgb)
+    assert not tied.any()
+    assert np.array_equal(seen, plain_seen)
+    same = np.isclose(found, plain, rtol=1e-4, atol=1e-6)
+    assert same[seen].all()
+    assert np.array_equal(found[sampled.state == SETTLED], sampled.inverse_depth[sampled.state == SETTLED])
+
+
+def test_pixels_that_nothing_settled_can_reach_are_unknown() -> None:
+    state = np.full((3, 5), HOLE, np.uint8)
+    state[1, 1:3] = OPEN
+    nothing = np.zeros((3, 5), np.float32)
+    _, seen = settle(Sampled(nothing + 0.5, state, nothing + 0.1, (nothing, nothing)), np.zeros((3, 5, 3), np.float32))
+    assert not seen.any()
+
+
+def soft(scene: Scene, sigma: float, factor: int) -> DepthMap:
+    return as_networks_do(scene, sigma, factor) if factor > 1 else map_of(blurred(1 / scene.depth, sigma))
+
+
+def between(inverse: Tensor) -> Tensor:
+    """Which pixels of `box_before_wall` hang between its box and its wall, 5 % of the way or more from both."""
+    way = (inverse - 1 / 6) / (1 / 2 - 1 / 6)
+    return (way > 0.05) & (way < 0.95)
+
+
+@pytest.mark.parametrize(("sigma", "factor"), [(1.0, 1), (2.0, 1), (3.0, 1), (1.0, 4), (3.0, 4), (6.0, 4)])
+def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> None:
+    """Maps of the photo's size, as phones store them, and small ones, as networks give them."""
+    scene = box_before_wall(width=192, height=144, focal=200)
+    depth = soft(scene, sigma, factor)
+    inverse = torch.where(depth.valid, 1 / depth.depth, 0.0)[None, None]
+    before = interpolate(inverse, size=(144, 192), mode="bilinear")[0, 0]
+    found = front(scene, depth)
+    assert int(between(before).sum()) > 400
+    assert int(between(found).sum()) <= 8  # about the corners
+    assert int(((found > 1 / 3) ^ box_mask(192, 144)).sum()) <= 24
+    assert float((found * scene.depth - 1).abs().median()) < 1e-3
+
+
+def test_where_the_photo_shows_no_edge_it_is_in_the_middle_of_what_was_smeared() -> None:
+    scene = dataclasses.replace(box_before_wall(width=192, height=144, focal=200), rgb=texture(144, 192))
+    found = front(scene, as_networks_do(scene))
+    assert int(between(found).sum()) <= 60
+    outline = max_pool2d(box_mask(192, 144).float()[None, None], 9, 1, 4)[0, 0] > 0
+    outline &= max_pool2d((~box_mask(192, 144)).float()[None, None], 9, 1, 4)[0, 0] > 0
+    assert not bool(((found > 1 / 3) ^ box_mask(192, 144))[~outline].any())
+
+
+def test_a_slanted_side_goes_on_as_a_plane_up_to_the_outline() -> None:
+    """A box before ground that recedes, smeared: the ground behind it has neither a lip nor a step."""
+    ground = 1 / slanted_plane(1.5, 6, 0, width=192, height=144, focal=160).depth
+    mask = box_mask(192, 144)
+    scene = box_before_wall(width=192, height=144, focal=200)
+    scene = dataclasses.replace(scene, depth=1 / torch.where(mask, 0.9, ground))
+    error = (front(scene, as_networks_do(scene)) * scene.depth - 1).abs()
+    near = max_pool2d(mask.float()[None, None], 17, 1, 8)[0, 0] > 0
+    assert float(error[near & ~mask].quantile(0.9)) < 0.06
+    assert float(error[~near].max()) < 0.02
+
+
+def test_a_sharp_map_of_the_photos_size_is_lifted_as_it_is() -> None:
+    """Bit for bit what it was before there was any sharpening; the real one apart from a few pixels in between."""
+    for scene in (box_before_wall(), slanted_plane(1.5, 1000, 0), wall()):
+        clean = attach_mixed_pixels(attach_flying_pixels(1 / scene.depth), scene.rgb)
+        torch.testing.assert_close(front(scene, scene.depth_map), clean, rtol=1e-6, atol=0)
+        edges = find_edges((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), scene.camera.focal)
+        sampled = sample((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), edges, *scene.depth.shape)
+        assert np.array_equal(settle(sampled, scene.rgb.numpy())[0], (1 / scene.depth).numpy())
+    scene = motorcycle().left
+    known = scene.depth > 0
+    inverse = torch.where(known, 1 / scene.depth, 0.0)
+    clean = attach_mixed_pixels(attach_flying_pixels(fill_missing(inverse, scene.rgb, known)), scene.rgb)
+    z = motorcycle_base().gaussians.means[: clean.numel(), 2].reshape(clean.shape)
+    changed = (1 / (z * clean) - 1).abs() > 1e-4
+    assert 0 < float(changed.float().mean()) < 0.02
+
+
+@pytest.mark.parametrize("sigma", [0.5, 3.0])
+def test_a_network_like_motorcycle_is_nearer_to_the_truth_than_nearest_or_bilinear(sigma: float) -> None:
+    scene = motorcycle().left
+    rgb, depth = scene.rgb[:500, :740].contiguous(), scene.depth[:500, :740]
+    known = depth > 0
+    inverse = fill_missing(torch.where(known, 1 / depth, 0.0), rgb, known)
+    small = avg_pool2d(blurred(inverse, sigma)[None, None], 4)
+    camera = dataclasses.replace(scene.camera, width=740, height=500)
+    found = front(Scene(rgb, depth, camera), map_of(small[0, 0]))
+    edges = find_edges(inverse.numpy(), np.ones((500, 740), bool), scene.camera.focal)
+    edge = torch.from_numpy(edges.across | edges.down).float()
+    near = (max_pool2d(edge[None, None], 17, 1, 8)[0, 0] > 0) & known
+
+    def error(of: Tensor) -> float:
+        return float((1 / (of * depth) - 1).abs()[near].mean())
+
+    others = [interpolate(small, size=(500, 740), mode=mode)[0, 0] for mode in ("nearest-exact", "bilinear")]
+    assert error(found) < 0.75 * min(error(other) for other in others)
+
+
+# Noise.
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_planes_match_least_squares(seed: int) -> None:
+    inverse, known = random_map(seed)
+    generator = np.random.default_rng(seed)
+    inverse = (inverse * (1 + 0.005 * generator.standard_normal(inverse.shape))).astype(np.float32)
+    level = noise_level(inverse, known)
+    assert level > LEAST_NOISE
+    found = smooth_noise(inverse, known)
+    assert (found != inverse).mean() > 0.3
+    np.testing.assert_allclose(found, plain_planes(inverse, known, OUTLIERS * level), rtol=2e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.003, 0.01])
+def test_the_noise_of_a_slanted_plane_is_measured(noise: float) -> None:
+    scene = slanted_plane(1.5, 6, 1)
+    generator = np.random.default_rng(0)
+    inverse = (1 / scene.depth).numpy() * (1 + noise * generator.standard_normal(scene.depth.shape))
+    assert noise_level(inverse.astype(np.float32), np.ones(inverse.shape, bool)) == pytest.approx(noise, rel=0.05)
+    assert noise_level(np.ones((2, 9), np.float32), np.ones((2, 9), bool)) == 0
+    assert noise_level(np.ones((9, 9), np.float32), np.zeros((9, 9), bool)) == 0
+
+
+@pytest.mark.parametrize("inverse", [1 / box_before_wall().depth, sphere(30, 1.0), 1 / slanted_plane(1.5, 6, 0).depth])
+def test_a_clean_map_is_not_smoothed(inverse: Tensor) -> None:
+    clean = inverse.numpy()
+    assert smooth_noise(clean, np.ones(clean.shape, bool)) is clean
+
+
+def test_noise_leaves_edges_alone() -> None:
+    scene = box_before_wall(width=192, height=144, focal=200)
+    inverse = (1 / scene.depth).numpy() * (1 + 0.003 * np.random.default_rng(0).standard_normal((144, 192)))
+    found = smooth_noise(inverse.astype(np.float32), np.ones((144, 192), bool))
+    error = np.abs(found * scene.depth.numpy() - 1)
+    assert error.max() < 0.015  # five times the noise: single pixels far off stay where they are
+    assert error.std() < 0.001
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_noisy_slanted_plane_is_not_perforated(axis: int) -> None:
+    """0.3 % of noise makes thousands of specks at disparity 0.5 where it is left in."""
+    scene = slanted_plane(1.5, 6, axis, width=160, height=120, focal=150)
+    noise = 1 + 0.003 * torch.randn(scene.depth.shape, generator=torch.Generator().manual_seed(0))
+    base = lift(scene.rgb, map_of(noise / scene.depth), scene.camera).gaussians
+    for camera in extremes(scene.camera, 0.5, DepthRange.of(base)):
+        alpha = CpuRenderer().render(base, camera).alpha
+        inside = max_pool2d((alpha < 0.5).float()[None, None], 17, 1, 8)[0, 0] == 0  # nothing but surface all around
+        assert int(inside.sum()) > 3000
+        assert int(hole_mask(alpha)[inside].sum()) <= 4
+
+
+def test_fine_clean_structure_is_no_noise() -> None:
+    """A mesh before a wall: its second differences are large everywhere, but nothing of it is to move."""
+    inverse = torch.full((60, 80), 0.2)
+    inverse[::5] = inverse[1::5] = 1.0
+    inverse[:, ::5] = inverse[:, 1::5] = 1.0
+    known = np.ones(inverse.shape, bool)
+    assert np.array_equal(smooth_noise(inverse.numpy(), known), inverse.numpy())
+
+
+def test_what_a_map_calls_valid_but_is_no_depth_is_filled_and_never_lifted() -> None:
+    scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
+    depth = scene.depth.clone()
+    for place, value in enumerate((math.nan, math.inf, 0.0, -1.0)):
+        depth[10, 10 + 4 * place] = value
+    every = torch.ones(36, 48, dtype=torch.bool)
+    found = lift(scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera)
+    assert bool(torch.isfinite(found.gaussians.means).all())
+    assert found.notes["depth_filled"] == round(4 / (36 * 48), 4)
+
+
+def test_a_map_without_any_depth_is_refused() -> None:
+    scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
+    with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):
+        lift(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)
+
+
+def test_a_sparse_map_keeps_what_a_smaller_photo_covers() -> None:
+    known = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) < 0.05
+    found = find_edges(np.ones((48, 64), np.float32), known.numpy(), FOCAL)
+    sampled = sample(np.ones((48, 64), np.float32), known.numpy(), found, 24, 32)
+    kept = int((sampled.state != HOLE).sum())
+    assert kept > 0.9 * int((max_pool2d(known[None, None].float(), 2) > 0).sum())

@@ -1,0 +1,279 @@
+"""Depth maps: every format read back, every decision between depth and disparity, every bad file."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.errors import InputError
+
+CALIB = """cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]
+cam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]
+ doffs= 10.0
+baseline=200.0
+width=8
+height=6
+isint=0
+"""
+
+
+def ramp(height: int = 6, width: int = 8) -> NDArray[np.float32]:
+    return np.linspace(1, 5, height * width, dtype=np.float32).reshape(height, width)
+
+
+def pfm(values: NDArray[np.float32], endian: str = "<") -> bytes:
+    height, width = values.shape
+    header = f"Pf\n{width} {height}\n{'-' if endian == '<' else ''}0.0039\n".encode()
+    return header + values[::-1].astype(f"{endian}f4").tobytes()
+
+
+def same(found: DepthMap, expected: NDArray[Any], tolerance: float = 0.0) -> None:
+    assert found.depth.dtype == torch.float32
+    assert found.valid.dtype == torch.bool
+    assert found.depth.shape == expected.shape
+    np.testing.assert_allclose(found.depth.numpy(), expected, rtol=tolerance)
+    assert torch.equal(found.valid, found.depth > 0)
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_npy(tmp_path: Path, dtype: str, order: Any) -> None:
+    depth = ramp()
+    depth[0, :3] = [np.nan, np.inf, 0]
+    np.save(tmp_path / "d.npy", np.asarray(depth.astype(dtype), order=order))
+    found = load_depth(tmp_path / "d.npy")
+    assert (~found.valid).sum() == 3
+    same(found, np.where(np.isfinite(depth), depth, 0), 1e-3 if dtype == "<f2" else 0)
+    assert (found.K, found.quantum, found.quantity) == (None, None, "depth")
+
+
+def test_npz(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "one.npz", ramp())
+    np.savez(tmp_path / "named.npz", depth=ramp(), other=np.zeros(3))
+    np.savez(tmp_path / "none.npz", a=ramp(), b=ramp())
+    same(load_depth(tmp_path / "one.npz"), ramp())
+    same(load_depth(tmp_path / "named.npz"), ramp())
+    with pytest.raises(InputError, match="none is called depth"):
+        load_depth(tmp_path / "none.npz")
+
+
+def test_millimetre_png(tmp_path: Path) -> None:
+    stored = np.arange(48, dtype=np.uint16).reshape(6, 8) * 25 + 1000
+    stored[0, 0], stored[5, 7] = 0, 65535
+    Image.fromarray(stored).save(tmp_path / "d.png")
+    found = load_depth(tmp_path / "d.png")
+    same(found, np.where(stored == 65535, 0, stored) / 1000, 1e-6)
+    assert found.quantum == pytest.approx(0.025)
+    Image.fromarray(np.full((6, 8), 1234, np.uint16)).save(tmp_path / "flat.png")
+    assert load_depth(tmp_path / "flat.png").quantum == pytest.approx(0.001)
+
+
+@pytest.mark.parametrize("endian", ["<", ">"])
+def test_pfm(tmp_path: Path, endian: str) -> None:
+    depth = ramp()
+    (tmp_path / "d.pfm").write_bytes(pfm(depth, endian))
+    same(load_depth(tmp_path / "d.pfm"), depth)
+
+
+@pytest.mark.parametrize("suffix", ["pfm", "npz", "npy", "png"])
+@pytest.mark.parametrize("beside", [True, False])
+def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
+    stored = np.arange(48, dtype=np.float32).reshape(6, 8) + 40
+    name = tmp_path / (f"disp0GT.{suffix}" if beside else f"x.{suffix}")
+    if suffix == "png":
+        stored[0, 0] = 0
+        Image.fromarray(stored.astype(np.uint8)).save(name)
+    else:
+        stored[0, 0] = np.inf
+        name.write_bytes(pfm(stored)) if suffix == "pfm" else None
+        np.save(name, stored) if suffix == "npy" else None
+        np.savez(name, arr_0=stored) if suffix == "npz" else None
+    calib = tmp_path / "calib.txt"
+    calib.write_text(CALIB)
+    found = load_depth(name) if beside else load_depth(name, calib=calib)
+    expected = 0.2 * 1000.5 / (stored + 10)
+    expected[0, 0] = 0
+    same(found, expected, 1e-6)
+    assert found.quantity == "disparity"
+    assert found.quantum == pytest.approx(1 / (0.2 * 1000.5))
+    assert found.K is not None
+    assert found.K.tolist() == [[1000.5, 0, 30.25], [0, 1000.5, 20.5], [0, 0, 1]]
+    longer = load_depth(name, calib=calib, focal_px=2001)
+    assert longer.K is not None
+    assert longer.K[0, 0] == 2001
+    same(longer, 2 * expected, 1e-6)
+
+
+def test_depth_beside_a_calibration_stays_depth(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text(CALIB)
+    np.save(tmp_path / "depth.npy", ramp())
+    assert load_depth(tmp_path / "depth.npy").quantity == "depth"
+
+
+def test_scene_json(tmp_path: Path) -> None:
+    stored = np.tile(np.arange(0, 192, 24, dtype=np.uint8), (6, 1))
+    stored[3] = np.arange(101, 109)
+    Image.fromarray(stored).save(tmp_path / "disparity.png")
+    scene = {"disparity": "disparity.png", "disparity_scale": 0.25, "invalid": 0, "focal_px": 900.0, "cx": 4, "cy": 3}
+    scene |= {"doffs_px": 5.0, "baseline_m": 0.1}
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    found = load_depth(tmp_path / "disparity.png")
+    same(found, np.where(stored > 0, 90.0 / (stored * 0.25 + 5), 0), 1e-6)
+    assert found.quantum == pytest.approx(0.25 / 90)
+    np.save(tmp_path / "depth.npy", ramp())
+    assert load_depth(tmp_path / "depth.npy").quantity == "depth"
+    assert load_depth(tmp_path / "depth.npy", calib=tmp_path / "scene.json").quantity == "disparity"
+    for bad in ({"focal_px": "wide"}, {"focal_px": 0}, {"baseline_m": None}, {"cx": float("nan")}):
+        (tmp_path / "scene.json").write_text(json.dumps(scene | bad))
+        with pytest.raises(InputError, match=r"scene\.json"):
+            load_depth(tmp_path / "disparity.png")
+    for text in ("{", "[]", "[" * 10_000):
+        (tmp_path / "scene.json").write_text(text)
+        with pytest.raises(InputError, match=r"scene\.json"):
+            load_depth(tmp_path / "disparity.png")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "hello", CALIB.replace("1000.5", "0"), CALIB.replace("cam0", "cam9"), CALIB.replace("200.0", "-1"),
+     CALIB.replace("10.0", "ten"), CALIB.replace("width=8", "width=80"), "x" * 100_000],
+)  # fmt: skip
+def test_bad_calibrations(tmp_path: Path, text: str) -> None:
+    (tmp_path / "d.pfm").write_bytes(pfm(ramp()))
+    (tmp_path / "calib.txt").write_text(text)
+    with pytest.raises(InputError, match="calib") as caught:
+        load_depth(tmp_path / "d.pfm", calib=tmp_path / "calib.txt")
+    assert "\n" not in str(caught.value)
+
+
+def npy_claiming(shape: str, descr: str = "<f4") -> bytes:
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + b"\0" * 64
+
+
+def as_bytes(array: NDArray[Any], **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def zipped(content: bytes) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("arr_0.npy", content)
+    return buffer.getvalue()
+
+
+def png(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(array).save(buffer, "png")
+    return buffer.getvalue()
+
+
+NOISE = np.random.default_rng(0).integers(1, 60_000, (64, 64)).astype(np.uint16)
+BAD = {
+    "empty": (b"", "empty"),
+    "text": (b"hello there, I am text", "not a depth map"),
+    "jpeg": (b"\xff\xd8\xff\xe0" + b"\0" * 100, "not a depth map"),
+    "cut npy": (as_bytes(ramp())[:-5], "cut off"),
+    "cut header": (as_bytes(ramp())[:30], "damaged|cut off"),
+    "huge npy": (npy_claiming("(1000000, 1000000)"), "too large"),
+    "big npy": (npy_claiming("(9000, 9000)"), "cut off"),
+    "negative shape": (npy_claiming("(-4, 4)"), "empty|damaged"),
+    "three axes": (as_bytes(np.ones((2, 3, 3), np.float32)), "shape"),
+    "one axis": (as_bytes(np.ones(9, np.float32)), "shape"),
+    "scalar": (as_bytes(np.float32(3)), "shape"),
+    "zero size": (as_bytes(np.ones((0, 5), np.float32)), "empty"),
+    "objects": (as_bytes(np.array([[None, 1]], dtype=object), allow_pickle=True), "object"),
+    "complex": (as_bytes(np.ones((2, 2), complex)), "complex"),
+    "bools": (as_bytes(np.ones((2, 2), bool)), "bool"),
+    "all NaN": (as_bytes(np.full((4, 4), np.nan)), "all-invalid"),
+    "all zero": (as_bytes(np.zeros((4, 4))), "all-invalid"),
+    "too far for float32": (as_bytes(np.full((4, 4), 1e300)), "all-invalid"),
+    "negative": (as_bytes(np.array([[1.0, -2.0], [-0.5, np.nan]])), "2 of 4 values are negative"),
+    "millimetres": (as_bytes(NOISE), "divide by 1000"),
+    "cut npz": (zipped(as_bytes(NOISE))[:200], "damaged"),
+    "bomb": (zipped(npy_claiming("(100000, 100000)")), "too large"),
+    "npz of text": (zipped(b"hello"), "damaged"),
+    "cut pfm": (pfm(ramp())[:-1], "cut off"),
+    "pfm header": (b"Pf\n8", "damaged"),
+    "pfm words": (b"Pf\na b\n-1\n" + b"\0" * 64, "damaged"),
+    "huge pfm": (b"Pf\n1000000 1000000\n-1\n" + b"\0" * 64, "too large"),
+    "negative pfm": (b"Pf\n-3 3\n-1\n" + b"\0" * 64, "empty"),
+    "colour pfm": (b"PF\n2 2\n-1\n" + b"\0" * 48, "three channels"),
+    "cut png": (png(NOISE)[:2000], "damaged"),
+    "8 bits": (png(np.full((4, 4), 9, np.uint8)), "8-bit"),
+    "colour png": (png(np.zeros((4, 4, 3), np.uint8)), "mode RGB"),
+    "black png": (png(np.zeros((4, 4), np.uint16)), "all-invalid"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_maps(tmp_path: Path, kind: str) -> None:
+    content, says = BAD[kind]
+    path = tmp_path / "map.dat"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=says) as caught:
+        load_depth(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.sampled_from(["cut npy", "cut npz", "cut pfm", "cut png"]), st.data())
+def test_random_damage_is_an_input_error_or_a_map(tmp_path_factory: Any, kind: str, data: st.DataObject) -> None:
+    whole = {"cut npy": as_bytes(ramp()), "cut npz": zipped(as_bytes(ramp())), "cut pfm": pfm(ramp())}
+    content = bytearray(whole.get(kind) or png(NOISE[:8, :8]))
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "damaged.dat"
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    with contextlib.suppress(InputError):
+        assert load_depth(path).valid.any()
+
+
+def test_paths_and_names(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such depth map"):
+        load_depth(tmp_path / "none.npy")
+    with pytest.raises(InputError, match="not a plain file"):
+        load_depth(tmp_path)
+    np.save(tmp_path / "motorcycle_disp.npy", ramp())
+    with pytest.raises(InputError, match="--calib"):
+        load_depth(tmp_path / "motorcycle_disp.npy")
+    with pytest.raises(InputError, match="no such calibration"):
+        load_depth(tmp_path / "motorcycle_disp.npy", calib=tmp_path / "none.txt")
+    np.save(tmp_path / "depth.npy", ramp())
+    for focal in (0.0, -3.0, float("nan")):
+        with pytest.raises(InputError, match="--focal-px"):
+            load_depth(tmp_path / "depth.npy", focal_px=focal)
+
+
+def test_shape_against_the_photo(tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", np.ones((480, 640), np.float32))
+    found = load_depth(tmp_path / "d.npy")
+    found.check_shape(480, 640, "a.jpg")
+    found.check_shape(960, 1280, "a.jpg")
+    found.check_shape(959, 1281, "a.jpg")
+    for height, width in [(640, 480), (480, 660), (100, 100)]:
+        with pytest.raises(InputError, match=r"is 640×480 but photo a\.jpg is"):
+            found.check_shape(height, width, "a.jpg")
+
+
+def test_a_depth_too_small_to_invert_is_unknown(tmp_path: Path) -> None:
+    depth = np.full((4, 5), 2.0, np.float32)
+    depth[1] = 1e-41
+    np.save(tmp_path / "a.npy", depth)
+    assert load_depth(tmp_path / "a.npy").valid.sum() == 15

@@ -1,0 +1,184 @@
+"""The lite base with the weights that ship: what it says of a real photo, and what it makes of others."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch.nn.functional import interpolate
+
+import spackle
+from spackle.bases.lite.base import FARTHEST, LOOKS, NEAREST_M, SHIPPED, LiteBase, merged, network_size
+from spackle.bases.lite.network import SCALE, STRIDE, LiteNet, Size, load_networks
+from spackle.errors import InputError
+from spackle.image import Photo
+from spackle.training.depth.export import save_networks
+from spackle.training.depth.score import score_depth, vertical_ramp
+
+BOTH_WAYS = [look for look in LOOKS if look.mirrored]
+
+
+@functools.cache
+def shipped() -> LiteBase:
+    return LiteBase.load(device="cpu")
+
+
+def some_network(size: Size, seed: int) -> LiteNet:
+    torch.manual_seed(seed)
+    return LiteNet(size).eval().requires_grad_(False)
+
+
+def photo_of(rgb: torch.Tensor) -> Photo:
+    return Photo(rgb, 1.1 * rgb.shape[1], "default 30 mm", Path("photo.png"))
+
+
+@functools.cache
+def motorcycle() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The left photo at half size [H, W, 3], and its disparity over the focal length and baseline, with validity."""
+    data = pytest.importorskip("skimage.data")
+    left, _, disparity = data.stereo_motorcycle()
+    rgb = torch.from_numpy(left[::2, ::2].copy()).float() / 255
+    known = torch.from_numpy(disparity[::2, ::2].copy())
+    valid = torch.isfinite(known)
+    return rgb, 1 / (known.where(valid, 1.0) + 31.086), valid  # depth but for its unit; the pair's doffs
+
+
+def test_a_real_photo_comes_out_nearer_to_its_measured_depth_than_by_a_guess_without_looking() -> None:
+    rgb, depth, valid = motorcycle()
+    seen = shipped().inverse_depth(rgb)
+    seen = interpolate(seen[None, None], size=depth.shape, mode="bilinear", align_corners=False)[0, 0]
+    found = score_depth(seen, depth, valid)
+    for guess in (vertical_ramp(*depth.shape), torch.ones_like(depth)):
+        assert found.abs_rel < 0.9 * score_depth(guess, depth, valid).abs_rel
+    assert found.delta > 0.8
+
+
+def test_a_mirrored_photo_has_nearly_the_mirrored_depth_and_quite_where_all_sizes_are_seen_both_ways() -> None:
+    rgb, *_ = motorcycle()
+    seen, mirrored = (shipped().inverse_depth(picture).log() for picture in (rgb, rgb.flip(1)))
+    assert float((mirrored - seen.flip(1)).abs().mean()) < 0.02
+    seen, mirrored = (shipped().looks(picture, BOTH_WAYS).mean(0) for picture in (rgb, rgb.flip(1)))
+    torch.testing.assert_close(mirrored, seen.flip(1), rtol=1e-3, atol=1e-4)
+
+
+def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:
+    rgb = motorcycle()[0][:96, :128]
+    one, other = (shipped().predict(photo_of(rgb)) for _ in range(2))
+    for a, b in zip(one.gaussians.tensors, other.gaussians.tensors, strict=True):
+        assert torch.equal(a, b)
+    view = spackle.get_renderer("cpu").render(one.gaussians, one.camera)
+    assert float((view.rgb - rgb).abs().mean()) < 0.05
+    assert float(view.alpha.min()) > 0.95
+
+
+def test_depth_lies_in_the_range_that_the_report_names() -> None:
+    prediction = shipped().predict(photo_of(motorcycle()[0][:128, :160]))
+    z = prediction.gaussians.means[:, 2]
+    assert prediction.notes["depth_scale"] == f"relative, the nearest at {NEAREST_M:g} m"
+    assert NEAREST_M * 0.9 < float(z.min()) < NEAREST_M * 1.5
+    assert float(z.max()) < NEAREST_M * FARTHEST * 10  # what is taken for sky stands behind all else
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (1536, 864), (40, 3000), (17, 17), (1, 1)])
+def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(height: int, width: int) -> None:
+    for pixels in {look.pixels for look in LOOKS}:
+        tall, wide = network_size(height, width, pixels)
+        assert tall % STRIDE == 0
+        assert wide % STRIDE == 0
+        if 0.5 < height / width < 2:
+            assert 0.65 * pixels < tall * wide < 1.4 * pixels
+            assert abs(tall - (pixels * height / width) ** 0.5) <= STRIDE / 2
+            assert abs(wide - (pixels * width / height) ** 0.5) <= STRIDE / 2
+            assert 0.75 < (tall / wide) / (height / width) < 1.33
+    small = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+    if height * width < 200_000:
+        assert bool(torch.isfinite(shipped().inverse_depth(small)).all())
+
+
+def test_the_weights_are_small_and_of_the_network_that_reads_them() -> None:
+    assert SHIPPED.stat().st_size <= 12_000_000
+    networks = load_networks(SHIPPED)
+    assert [network.encoder.size for network in networks] == ["lite0", "lite2"]
+    assert sum(weight.numel() for network in networks for weight in network.parameters()) < SHIPPED.stat().st_size
+
+
+def test_stored_weights_are_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
+    """Steps of 1/127 of an output's largest weight: half of that is the most that one can be off."""
+    networks = [some_network("lite2", 1), some_network("lite0", 2)]
+    save_networks(networks, tmp_path / "two.safetensors")
+    read = load_networks(tmp_path / "two.safetensors")
+    assert [network.encoder.size for network in read] == ["lite2", "lite0"]
+    for one, other in zip(networks, read, strict=True):
+        for weight, stored in zip(one.parameters(), other.parameters(), strict=True):
+            largest = weight.abs().flatten(1).amax(1) if weight.dim() > 1 else weight.abs()
+            off = (weight - stored).abs().flatten(1).amax(1) if weight.dim() > 1 else (weight - stored).abs()
+            assert bool((off <= largest / 254 * 1.001 + 1e-7).all())
+    assert (tmp_path / "two.safetensors").stat().st_size < 1.1 * sum(
+        w.numel() for n in networks for w in n.parameters()
+    )
+    save_networks(read, tmp_path / "again.safetensors")
+    for one, other in zip(read, load_networks(tmp_path / "again.safetensors"), strict=True):
+        torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=1e-6, atol=1e-9)
+
+
+def test_each_look_is_by_its_own_network_and_one_network_alone_does_without_the_others() -> None:
+    networks, rgb = [some_network("lite0", 1), some_network("lite0", 2)], motorcycle()[0][:96, :128]
+    seen = LiteBase(networks, torch.device("cpu")).looks(rgb, LOOKS)
+    alone = [LiteBase([network], torch.device("cpu")) for network in networks]
+    for look, said in zip(LOOKS, seen, strict=True):
+        own = alone[look.network].looks(rgb, [dataclasses.replace(look, network=0), LOOKS[-1]])[0]
+        assert torch.equal(said, own)
+    first = [number for number, look in enumerate(LOOKS) if look.network == 0]
+    expected = merged(seen[first], [LOOKS[number].tilt for number in first]).exp()
+    torch.testing.assert_close(alone[0].inverse_depth(rgb), expected)
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (80, 48)])
+def test_a_look_without_a_say_in_the_tilt_adds_its_outlines_alone(shape: tuple[int, int]) -> None:
+    height, width = shape
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    post = torch.zeros(shape)
+    post[:, width // 2 - 1 : width // 2 + 1] = 0.5
+    level, steep = torch.zeros(shape), 3 * y + x
+    torch.testing.assert_close(merged(torch.stack([level, steep]), [True, True]), steep / 2, rtol=0, atol=1e-5)
+    inner = (slice(height // 5, -height // 5), slice(width // 5, -width // 5))  # bicubic flattens the ends
+    assert float(merged(torch.stack([level, steep]), [True, False])[inner].abs().max()) < 0.15
+    seen = merged(torch.stack([level, steep + post]), [True, False])[inner]
+    assert 0.15 < float((seen.amax(1) - seen.median(1).values).min()) < 0.35
+
+
+@pytest.mark.parametrize(
+    "harm", ["a tensor is missing", "a scale is missing", "a scale is of another length", "the last bias is a number"]
+)
+def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, harm: str) -> None:
+    save_networks([LiteNet()], tmp_path / "one.safetensors")
+    tensors = load_file(tmp_path / "one.safetensors")
+    name = "0.context.weight" + ("" if "tensor" in harm else SCALE)
+    if "bias" in harm:
+        tensors["0.encoder.stages.6.0.project.bias"] = torch.tensor(1.0)
+    elif "length" in harm:
+        tensors[name] = tensors[name][1:]
+    else:
+        del tensors[name]
+    save_file(tensors, tmp_path / "harmed.safetensors")
+    with pytest.raises(
+        InputError, match=r"harmed.safetensors are of another network: (1 tensors differ, e.g. context|encoder\.stages)"
+    ):
+        LiteBase.load(tmp_path / "harmed.safetensors")
+
+
+def test_weights_of_another_network_are_refused_in_a_line(tmp_path: Path) -> None:
+    from spackle.residual.network import SHIPPED as RESIDUAL
+
+    with pytest.raises(InputError, match=r"lite weights .* are of another network"):
+        LiteBase.load(RESIDUAL)
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(b"\x00" * 100)
+    with pytest.raises(InputError, match="not readable as safetensors"):
+        LiteBase.load(broken)
+    with pytest.raises(InputError, match="not found"):
+        LiteBase.load(tmp_path / "none.safetensors")

@@ -1,0 +1,665 @@
+"""The depth map inside a photo: every layout read back, upright, in metres; every bad file refused."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pillow_heif
+import portraits
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from photos import picture, write_photo
+from portraits import Range, apple_xmp, codes, depth_information, png, upright
+
+import spackle.bases.photo_depth.coded as coded
+from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.lift import RgbdBase
+from spackle.bases.photo_depth import load_photo_depth
+from spackle.errors import InputError
+from spackle.image import film_to_pixels, load_photo
+
+ORIENTATIONS = range(1, 9)
+LENS = (70.0, 0.0, 0.0, 0.0, 50.0, 0.0, 20.0, 30.0, 1.0)  # of the whole photo, column by column
+MODEL = {
+    "ImagingModel:FocalLengthX": 70.0,
+    "ImagingModel:FocalLengthY": 50.0,
+    "ImagingModel:PrincipalPointX": 20.0,
+    "ImagingModel:PrincipalPointY": 30.0,
+    "ImagingModel:ImageWidth": 64,
+    "ImagingModel:ImageHeight": 48,
+}
+
+
+def found(tmp_path: Path, data: bytes) -> DepthMap:
+    depth = load_photo_depth(portraits.write(tmp_path / "portrait.xyz", data))
+    assert depth is not None
+    return depth
+
+
+def disparity(values: NDArray[Any], first: float = 0.5, last: float = 3.0, full: int = 255) -> NDArray[np.float64]:
+    """Depth of codes that run evenly from one disparity to another."""
+    return 1 / (first + (last - first) * values.astype(np.float64) / full)
+
+
+def same(depth: DepthMap, expected: NDArray[Any]) -> None:
+    assert depth.depth.dtype == torch.float32
+    assert depth.valid.dtype == torch.bool
+    assert bool(depth.valid.all())
+    np.testing.assert_allclose(depth.depth.numpy(), expected, rtol=1e-6)
+
+
+def refused(tmp_path: Path, data: bytes, why: str) -> None:
+    path = portraits.write(tmp_path / "bad.jpg", data)
+    with pytest.raises(InputError, match=why) as caught:
+        load_photo_depth(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    assert "--depth FILE, or use --base lite" in message
+
+
+# What each layout means.
+
+
+def test_heic_with_apples_words(tmp_path: Path) -> None:
+    data = portraits.heic(codes(), apple_xmp(ends=(0.5, 3.0), matrix=LENS))
+    others = pillow_heif.open_heif(io.BytesIO(data)).info["depth_images"]
+    np.testing.assert_array_equal(np.asarray(others[0]), codes())  # libheif sees the same map
+    depth = found(tmp_path, data)
+    same(depth, disparity(codes()))
+    assert (depth.quantity, depth.note) == ("disparity", "portrait depth of the photo (Apple disparity, relative)")
+    assert depth.quantum == pytest.approx(2.5 / 255)
+    assert depth.K is not None
+    assert depth.K.tolist() == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
+    assert depth.path == tmp_path / "portrait.xyz"
+
+
+def test_heic_with_apples_depth_in_metres(tmp_path: Path) -> None:
+    depth = found(tmp_path, portraits.heic(codes(), apple_xmp("fdep", (0.5, 8.0), "absolute")))
+    same(depth, 0.5 + 7.5 * codes().astype(np.float64) / 255)
+    assert (depth.quantity, depth.K) == ("depth", None)
+    assert depth.note == "portrait depth of the photo (Apple depth, absolute)"
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "expected"),
+    [
+        (0, {"z_near": 0.5, "z_far": 8.0}, disparity(codes(), 1 / 8, 2)),
+        (1, {"d_min": 0.25, "d_max": 3.0}, disparity(codes(), 0.25, 3)),
+        (2, {"z_near": 0.5, "z_far": 8.0}, 0.5 + 7.5 * codes().astype(np.float64) / 255),
+        (None, {}, disparity(codes(), 0.1, 1)),
+    ],
+)
+@pytest.mark.parametrize("name", [b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"])
+def test_heic_with_hevcs_words(
+    tmp_path: Path, kind: int | None, values: dict[str, float], expected: NDArray[np.float64], name: bytes
+) -> None:
+    information = b"" if kind is None else depth_information(kind, **values)
+    depth = found(tmp_path, portraits.heic(codes(), information=information, kind=name))
+    same(depth, expected)
+    assert depth.quantity == ("depth" if kind == 2 else "disparity")
+    assert ("assumed" in depth.note) == (kind is None)
+    apple = portraits.heic(codes(), apple_xmp(), information=depth_information(2, z_near=1, z_far=2))
+    same(found(tmp_path, apple), disparity(codes()))  # Apple's words beat them
+
+
+def test_heic_with_steps_of_uneven_size_is_refused(tmp_path: Path) -> None:
+    uneven = depth_information(3, d_min=0.25, d_max=3.0)
+    refused(tmp_path, portraits.heic(codes(), information=uneven), "uneven size")
+    same(found(tmp_path, portraits.heic(codes(), apple_xmp(), information=uneven)), disparity(codes()))
+    refused(tmp_path, portraits.heic(codes(), information=depth_information(0, z_near=3, z_far=2)), "near 3 and far 2")
+
+
+def test_heic_with_ten_bits(tmp_path: Path) -> None:
+    fine = (codes().astype(np.uint16) * 4 + np.arange(32, dtype=np.uint16) % 4) << 6
+    depth = found(tmp_path, portraits.heic(fine, information=depth_information(1, d_min=0.5, d_max=3.0)))
+    same(depth, disparity(fine >> 6, full=1023))
+    assert depth.quantum == pytest.approx(2.5 / 1023)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_jpeg_with_apples_further_pictures(tmp_path: Path, order: str) -> None:
+    data = portraits.apple_jpeg(codes(), apple_xmp(matrix=LENS), order=order)
+    depth = found(tmp_path, data)
+    same(depth, disparity(portraits.decoded(portraits.jpeg(codes()))))  # not the gain map or the matte before it
+    assert depth.K is not None
+    assert depth.K.tolist() == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
+    assert depth.note == "portrait depth of the photo (Apple disparity, relative)"
+
+
+def test_apples_type_counts_where_the_format_is_not_given(tmp_path: Path) -> None:
+    for kind, expected in (("depth", "depth"), ("disparity", "disparity")):
+        said = f"<apdi:AuxiliaryImageType>{kind}</apdi:AuxiliaryImageType>"
+        packet = apple_xmp(None, accuracy="great", more=said)
+        depth = found(tmp_path, portraits.apple_jpeg(codes(), packet))
+        assert depth.quantity == expected
+        assert depth.note == f"portrait depth of the photo (Apple {kind}, of unknown accuracy)"
+    matte = "<apdi:AuxiliaryImageSubType>portraiteffectsmatte</apdi:AuxiliaryImageSubType>"
+    matte = portraits.apple_jpeg(codes(), apple_xmp(None, more=said + matte))
+    assert load_photo_depth(portraits.write(tmp_path / "matte.jpg", matte)) is None
+
+
+ANDROID: dict[str, Callable[..., bytes]] = {
+    "GDepth, extended": portraits.gdepth_jpeg,
+    "GDepth, one packet": lambda image, said=None, **kw: portraits.gdepth_jpeg(image, said, part=None, **kw),
+    "Dynamic Depth": portraits.dynamic_jpeg,
+    "Dynamic Depth, extended": lambda image, said=None, **kw: portraits.dynamic_jpeg(image, said, extended=True, **kw),
+}
+
+
+@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+def test_android(tmp_path: Path, make: Callable[..., bytes]) -> None:
+    share = codes().astype(np.float64) / 255
+    inverse, linear = 1 / (2 + share * (1 / 8 - 2)), 0.5 + share * 7.5
+    for unit in ("m", "Meters"):
+        depth = found(tmp_path, make(png(codes()), Range(unit=unit)))
+        same(depth, inverse)
+        assert (depth.quantity, depth.K) == ("disparity", None)
+        assert depth.quantum == pytest.approx((2 - 1 / 8) / 255)
+        assert depth.note.endswith(f"Depth, in {unit.lower()})")
+    depth = found(tmp_path, make(png(codes()), Range(style="RangeLinear")))
+    same(depth, linear)
+    assert depth.quantity == "depth"
+    assert depth.quantum == pytest.approx(7.5 / 255)
+    same(found(tmp_path, make(png(codes()), Range(500, 8000, unit="mm"))), inverse)
+    same(found(tmp_path, make(png(codes()), Range(2, 0.125, unit="Diopters"))), 1 / (1 / (0.5 + share * 7.5)))
+    same(found(tmp_path, make(png(codes()), Range(2, 0.125, "RangeLinear", unit="Diopters"))), inverse)
+    fine = codes().astype(np.uint16) * 257 - np.uint16(3) * (codes() == 200)
+    depth = found(tmp_path, make(png(fine)))
+    same(depth, 1 / (2 + fine / 65535 * (1 / 8 - 2)))
+    assert depth.quantum == pytest.approx((2 - 1 / 8) / 65535)
+    lossy = portraits.jpeg(codes())
+    same(found(tmp_path, make(lossy)), 1 / (2 + portraits.decoded(lossy) / 255 * (1 / 8 - 2)))
+    colored = np.repeat(codes()[..., None], 3, axis=-1)
+    same(found(tmp_path, make(png(colored))), inverse)
+
+
+@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+def test_a_map_without_a_unit_keeps_a_plausible_scale_and_gets_one_otherwise(
+    tmp_path: Path, make: Callable[..., bytes]
+) -> None:
+    share = codes().astype(np.float64) / 255
+    for unit in (None, "None", "parsec"):
+        depth = found(tmp_path, make(png(codes()), Range(0.5, 8, unit=unit)))
+        same(depth, 1 / (2 + share * (1 / 8 - 2)))
+        assert depth.note.endswith("Depth, unit unknown)")
+    for said in (Range(50, 800, unit=None), Range(0.005, 0.08, unit="Diopters")):  # the latter is a Pixel's habit
+        depth = found(tmp_path, make(png(codes()), said))
+        shape = 1 / (2 + share * (1 / 8 - 2))
+        factor = 3 / float(torch.from_numpy(shape).median())
+        same(depth, shape * factor)
+        assert depth.quantum == pytest.approx((2 - 1 / 8) / 255 / factor)
+        assert depth.note.endswith("Depth, unit unknown, scaled to a median of 3 m)")
+    linear = found(tmp_path, make(png(codes()), Range(50, 800, "RangeLinear", unit=None)))
+    assert linear.quantum == pytest.approx(float(linear.depth.max() - linear.depth.min()) / 255, rel=1e-5)
+    same(found(tmp_path, make(png(codes()), Range(50, 800))), 100 / (2 + share * (1 / 8 - 2)))
+
+
+@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+def test_distances_along_the_ray_become_depth(tmp_path: Path, make: Callable[..., bytes]) -> None:
+    along = found(tmp_path, make(png(codes()), Range(measure="OpticRay")))
+    plain = found(tmp_path, make(png(codes())))
+    focal = film_to_pixels(30, 64, 48) / 2
+    y, x = np.mgrid[:24, :32] + 0.5
+    length = np.sqrt(1 + ((x - 16) / focal) ** 2 + ((y - 12) / focal) ** 2)
+    same(along, plain.depth.numpy() / length)
+    assert along.quantum is None
+
+
+def test_distances_along_the_ray_by_the_maps_own_lens(tmp_path: Path) -> None:
+    along = found(tmp_path, portraits.dynamic_jpeg(png(codes()), Range(measure="OpticRay"), model=MODEL, orientation=6))
+    plain = found(tmp_path, portraits.dynamic_jpeg(png(codes()), orientation=6))
+    y, x = np.mgrid[:24, :32] + 0.5
+    length = np.sqrt(1 + ((x - 10) / 35) ** 2 + ((y - 15) / 25) ** 2)
+    same(along, plain.depth.numpy() / np.rot90(length, -1))
+
+
+def test_dynamic_depths_lens(tmp_path: Path) -> None:
+    shares = MODEL | {"ImagingModel:PrincipalPointX": 20 / 64, "ImagingModel:PrincipalPointY": 30 / 48}
+    for model in (MODEL, shares):
+        K = found(tmp_path, portraits.dynamic_jpeg(png(codes()), model=model)).K
+        assert K is not None
+        np.testing.assert_allclose(K, [[35, 0, 10], [0, 25, 15], [0, 0, 1]], rtol=1e-6)
+    without = {name: value for name, value in MODEL.items() if "Point" not in name}
+    K = found(tmp_path, portraits.dynamic_jpeg(png(codes()), model=without)).K
+    assert K is not None
+    np.testing.assert_allclose(K, [[35, 0, 16], [0, 25, 12], [0, 0, 1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("change", [("FocalLengthX", 0.1), ("FocalLengthY", "nan"), ("ImageWidth", 0)])
+@pytest.mark.parametrize("more", [("ImageHeight", 64), ("PrincipalPointX", -1), ("ImageHeight", "tall")])
+def test_a_lens_that_cannot_be_the_maps_is_left_to_the_photo(tmp_path: Path, change: Any, more: Any) -> None:
+    for name, value in (change, more):
+        model = MODEL | {f"ImagingModel:{name}": value}
+        assert found(tmp_path, portraits.dynamic_jpeg(png(codes()), model=model)).K is None
+    for matrix, size in ((LENS[:8], (64, 48)), (LENS, (48, 64)), (LENS, ("x", 48)), (("a", *LENS[1:]), (64, 48))):
+        data = portraits.apple_jpeg(codes(), apple_xmp(matrix=matrix, size=size))  # type: ignore[arg-type]
+        assert found(tmp_path, data).K is None
+
+
+def test_dynamic_depth_finds_its_item_however_the_lengths_are_meant(tmp_path: Path) -> None:
+    expected = found(tmp_path, portraits.dynamic_jpeg(png(codes()))).depth
+    for data in (
+        portraits.dynamic_jpeg(png(codes()), padding=37),
+        portraits.dynamic_jpeg(png(codes()), padding=37, extended=True, trailer=b"camera's own bytes"),
+        portraits.dynamic_jpeg(png(codes()), length=0),  # to the end of the file
+        portraits.dynamic_jpeg(png(codes()), padding=37).replace(b'Item:Padding="37"', b'Item:Padding="0" '),
+        portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99).replace(b'Item:Padding="0"', b'Item:Padding="9"'),
+        portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99, primary=5000),
+    ):
+        assert torch.equal(found(tmp_path, data).depth, expected)
+
+
+def test_of_several_dynamic_depth_maps_the_first_that_is_depth_counts(tmp_path: Path) -> None:
+    data = portraits.dynamic_jpeg(png(codes()))
+    begin = data.index(b"<Camera:DepthMap")
+    other = data[begin : data.index(b"/>", begin) + 2].replace(b'"Depth"', b'"Segmentation"')
+    assert b"Segmentation" in other
+    packet = data[data.index(b"<?xpacket") : data.index(b'<?xpacket end="w"?>') + 19]
+    longer = packet.replace(b"<Camera:DepthMap", other.replace(b"depthmap", b"segments") + b"<Camera:DepthMap")
+    data = data.replace(portraits.xmp_segment(packet), portraits.xmp_segment(longer))
+    assert torch.equal(found(tmp_path, data).depth, found(tmp_path, portraits.dynamic_jpeg(png(codes()))).depth)
+
+
+def test_disparity_beyond_the_horizon_is_far_not_unknown(tmp_path: Path) -> None:
+    depth = found(tmp_path, portraits.heic(codes(), apple_xmp(ends=(-0.1, 2.45))))
+    assert bool(depth.valid.all())
+    assert float(depth.depth.max()) == pytest.approx(1 / (2.55 / 255 / 2))
+    assert depth.depth[0, 0] == depth.depth.max()
+    assert float(depth.depth.min()) == pytest.approx(1 / 2.45)
+
+
+def test_depth_that_is_not_above_zero_is_unknown(tmp_path: Path) -> None:
+    depth = found(tmp_path, portraits.gdepth_jpeg(png(codes()), Range(0, 8, "RangeLinear")))
+    assert torch.equal(depth.valid, torch.from_numpy(codes() > 0))
+    assert torch.equal(depth.valid, depth.depth > 0)
+
+
+def test_the_step_is_that_of_the_values_in_use(tmp_path: Path) -> None:
+    coarse = codes() // 4 * 4
+    for data in (portraits.heic(coarse, apple_xmp()), portraits.gdepth_jpeg(png(coarse), Range(1 / 3, 2))):
+        assert found(tmp_path, data).quantum == pytest.approx(4 * 2.5 / 255)
+
+
+# Upright, as the photo is.
+
+
+MAKERS: dict[str, Callable[[NDArray[np.uint8], int], bytes]] = {
+    "HEIC": lambda map_, orientation: portraits.heic(map_, apple_xmp(matrix=LENS), orientation),
+    "HEIC, map with its own turn": lambda map_, orientation: portraits.heic(
+        map_, apple_xmp(matrix=LENS), orientation, own_turn=True
+    ),
+    "Apple JPEG": lambda map_, orientation: portraits.apple_jpeg(map_, apple_xmp(matrix=LENS), orientation),
+    "GDepth": lambda map_, orientation: portraits.gdepth_jpeg(png(map_), orientation=orientation),
+    "Dynamic Depth": lambda map_, orientation: portraits.dynamic_jpeg(png(map_), orientation=orientation, model=MODEL),
+}
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+def test_the_map_is_upright_as_the_photo_is(
+    tmp_path: Path, make: Callable[[NDArray[np.uint8], int], bytes], orientation: int
+) -> None:
+    path = portraits.write(tmp_path / "portrait.xyz", make(codes(), orientation))
+    photo, depth = load_photo(path), load_photo_depth(path)
+    np.testing.assert_allclose(photo.rgb.numpy() * 255, upright(picture(), orientation), atol=60)
+    assert depth is not None
+    as_stored = load_photo_depth(portraits.write(path, make(codes(), 1)))
+    assert as_stored is not None
+    np.testing.assert_array_equal(depth.depth.numpy(), upright(as_stored.depth.numpy(), orientation))
+    depth.check_shape(photo.height, photo.width, path)
+    if "GDepth" in depth.note:
+        assert depth.K is None
+    else:
+        _check_lens(depth, orientation)
+
+
+def _check_lens(depth: DepthMap, orientation: int) -> None:
+    """Each pixel looks along the ray that it had before it was turned, its axes turned alike."""
+    y, x = np.mgrid[:24, :32].astype(np.float32)
+    before = [upright(ray, orientation) for ray in ((x + 0.5 - 10) / 35, (y + 0.5 - 15) / 25)]
+    columns, rows = upright(x, orientation), upright(y, orientation)
+    v, u = np.mgrid[: depth.depth.shape[0], : depth.depth.shape[1]] + 0.5
+    assert depth.K is not None
+    K = depth.K.numpy()
+    for axis, ray in ((1, (u - K[0, 2]) / K[0, 0]), (0, (v - K[1, 2]) / K[1, 1])):
+        along = np.diff(columns, axis=axis).mean(), np.diff(rows, axis=axis).mean()  # one is ±1, the other 0
+        np.testing.assert_allclose(ray, along[0] * before[0] + along[1] * before[1], atol=1e-5)
+
+
+# The same scene as from a map beside the photo.
+
+
+def test_depth_in_a_heic_lifts_as_the_same_depth_beside_it(tmp_path: Path) -> None:
+    path = portraits.write(tmp_path / "portrait.heic", portraits.heic(codes(), apple_xmp("hdep", (0.5, 8.0)), 6))
+    inside, photo = load_photo_depth(path), load_photo(path)
+    assert inside is not None
+    metres = np.rot90(0.5 + 7.5 * codes().astype(np.float64) / 255, -1)
+    np.save(tmp_path / "depth.npy", metres.astype(np.float32))
+    one, other = (RgbdBase(depth).predict(photo) for depth in (inside, load_depth(tmp_path / "depth.npy")))
+    for a, b in zip(one.gaussians.tensors, other.gaussians.tensors, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert one.notes == other.notes
+
+
+def test_disparity_in_a_photo_lifts_as_the_same_disparity_beside_it(tmp_path: Path) -> None:
+    path = portraits.write(tmp_path / "portrait.heic", portraits.heic(codes(), apple_xmp(matrix=LENS)))
+    inside, photo = load_photo_depth(path), load_photo(path)
+    assert inside is not None
+    np.save(tmp_path / "disparity.npy", codes())
+    step = 2.5 / 255
+    scene = {"disparity": "disparity.npy", "focal_px": 35.0, "cx": 10.0, "cy": 15.0, "doffs_px": 0.5 / step}
+    (tmp_path / "scene.json").write_text(json.dumps(scene | {"baseline_m": 1 / step / 35}))
+    beside = load_depth(tmp_path / "disparity.npy")
+    assert inside.K is not None
+    assert beside.K is not None
+    assert beside.quantum == pytest.approx(inside.quantum)
+    beside.K[1, 1] = 25.0  # a calibrated pair has one focal length
+    one, other = (RgbdBase(depth).predict(photo) for depth in (inside, beside))
+    for a, b in zip(one.gaussians.tensors, other.gaussians.tensors, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+# Photos without depth.
+
+
+def test_photos_without_depth(tmp_path: Path) -> None:
+    other = portraits.jpeg(codes())
+    movie = portraits.xmp_segment(portraits.xmp(' GCamera:MotionPhoto="1">', 'xmlns:GCamera="http://ns.google.com/"'))
+    gain_map = b"urn:com:apple:photo:2020:aux:hdrgainmap"
+    gone = portraits.gdepth_jpeg(png(codes()))  # an editor has dropped the extended XMP
+    head = gone.index(b"http://ns.adobe.com/xmp/extension/") - 4
+    tail = gone.rindex(b"http://ns.adobe.com/xmp/extension/") - 4
+    tail += 2 + struct.unpack(">H", gone[tail + 2 : tail + 4])[0]
+    files = {
+        "plain.jpg": portraits.jpeg(picture()),
+        "several.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, other),
+        "beyond.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, shift=1 << 30),
+        "misplaced.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, shift=1),
+        "motion.jpg": portraits.with_segments(portraits.jpeg(picture()), movie) + b"\0\0\0\x18ftypmp42" + bytes(99),
+        "gone.jpg": gone[:head] + gone[tail:],
+        "plain.heic": portraits.heic(None),
+        "gain.heic": portraits.heic(codes(), kind=gain_map),
+        "gain.xmp.heic": portraits.heic(codes(), apple_xmp(), kind=gain_map),
+        "short.jpg": b"\xff\xd8\xff",
+        "start.jpg": b"\xff\xd8\xff\xe1\xff\xff" + bytes(20),
+        "start.heic": b"\0\0\0\x18ftypheic" + bytes(20),
+        "other.txt": b"neither a photo nor anything else",
+    }
+    for name, data in files.items():
+        assert load_photo_depth(portraits.write(tmp_path / name, data)) is None, name
+    for name in ("photo.png", "photo.webp", "photo.tif"):
+        assert load_photo_depth(write_photo(tmp_path / name)) is None, name
+
+
+def test_a_further_picture_that_is_no_depth_map_is_passed_over_however_odd_its_xmp(tmp_path: Path) -> None:
+    odd = portraits.with_segments(portraits.jpeg(codes()), portraits.xmp_segment(b"<<<not XML"))
+    photo = portraits.multi_picture(
+        portraits.with_segments(portraits.jpeg(picture()), portraits.xmp_segment(b"<<")), odd
+    )
+    assert load_photo_depth(portraits.write(tmp_path / "odd.jpg", photo)) is None
+
+
+def test_missing_and_empty_files(tmp_path: Path) -> None:
+    for name in ("nowhere.jpg", "empty.jpg"):
+        (tmp_path / "empty.jpg").write_bytes(b"")
+        with pytest.raises(InputError, match=name):
+            load_photo_depth(tmp_path / name)
+
+
+def test_a_depth_map_of_another_picture_in_the_file_is_not_the_photos(tmp_path: Path) -> None:
+    data, link = portraits.heic(codes(), apple_xmp()), b"auxl" + struct.pack(">HHH", 2, 1, 1)
+    assert data.count(link) == 1
+    other = data.replace(link, link[:-1] + b"\3")
+    assert load_photo_depth(portraits.write(tmp_path / "other.heic", other)) is None
+
+
+# Depth maps that are broken.
+
+
+@pytest.mark.parametrize("flat", [0, 7, 255])
+def test_a_map_with_one_value_is_refused(tmp_path: Path, flat: int) -> None:
+    image = np.full((24, 32), flat, np.uint8)
+    for data in (
+        portraits.heic(image, apple_xmp()),
+        portraits.apple_jpeg(image),
+        portraits.gdepth_jpeg(png(image)),
+        portraits.dynamic_jpeg(png(image)),
+    ):
+        refused(tmp_path, data, "the same value everywhere")
+
+
+def test_another_crop_is_refused(tmp_path: Path) -> None:
+    square = codes(32, 32)
+    for data in (
+        portraits.heic(square, apple_xmp()),
+        portraits.apple_jpeg(square),
+        portraits.gdepth_jpeg(png(square)),
+        portraits.dynamic_jpeg(png(square)),
+    ):
+        refused(tmp_path, data, "has 32×32 pixels but the photo 64×48, another crop")
+    refused(tmp_path, portraits.gdepth_jpeg(png(codes(24, 32))), "has 24×32 pixels")
+    found(tmp_path, portraits.gdepth_jpeg(png(codes(133, 100))))  # within 1 %
+
+
+@pytest.mark.parametrize(
+    ("ends", "why"),
+    [
+        (("nan", 3), "'nan' for FloatMinValue, which is no number"),
+        ((0.5, "inf"), "'inf' for FloatMaxValue"),
+        ((0.5, "three"), "'three' for FloatMaxValue"),
+        ((2, 2), "announces a disparity from 2 to 2"),
+        ((-2, -1), "announces a disparity from -2 to -1"),
+        ((-1e308, 1.1e308), "no pixel with a depth|makes no sense"),
+        ((1e-320, 1e-310), "no pixel with a depth"),
+    ],
+)
+def test_apples_ranges_that_mean_nothing(tmp_path: Path, ends: tuple[object, object], why: str) -> None:
+    refused(tmp_path, portraits.heic(codes(), apple_xmp(ends=ends)), why)
+    refused(tmp_path, portraits.apple_jpeg(codes(), apple_xmp(ends=ends)), why)
+
+
+def test_apples_range_that_is_missing(tmp_path: Path) -> None:
+    packet = apple_xmp().replace(b"apdi:FloatMaxValue", b"apdi:FloatMiddle")
+    refused(tmp_path, portraits.apple_jpeg(codes(), packet), "does not say its range")
+    assert "assumed" in found(tmp_path, portraits.heic(codes(), packet)).note
+    empty = apple_xmp().replace(b"<apdi:IntMaxValue>255<", b"<apdi:IntMaxValue>-1<")
+    refused(tmp_path, portraits.apple_jpeg(codes(), empty), "a number of its range makes no sense")
+
+
+@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (Range(8, 0.5), "near 8 and far 0.5"),
+        (Range(3, 3), "near 3 and far 3"),
+        (Range(0, 3), "near 0 and far 3"),
+        (Range(-1, 3), "near -1 and far 3"),
+        (Range("nan", 3), "'nan' for Near"),
+        (Range(1, "inf"), "'inf' for Far"),
+        (Range(1, ""), "'' for Far"),
+        (Range(5e-324, 3), "makes no sense"),
+        (Range(1e-323, 3, unit="mm"), "near 0 and far"),
+        (Range(1e300, 1e305), "no pixel with a depth"),
+        (Range(1e-41, 1e-40, "RangeLinear"), "no pixel with a depth"),
+        (Range(style="RangeSquared"), "the format 'rangesquared'"),
+    ],
+)
+def test_androids_ranges_that_mean_nothing(tmp_path: Path, make: Callable[..., bytes], said: Range, why: str) -> None:
+    refused(tmp_path, make(png(codes()), said), why)
+
+
+@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+def test_androids_range_that_is_missing(tmp_path: Path, make: Callable[..., bytes]) -> None:
+    data = make(png(codes()), Range(near=0.123))
+    for missing in (b":Near", b":Format"):
+        refused(tmp_path, data.replace(missing, missing[:2] + b"x" * (len(missing) - 2)), "missing|the format ''")
+
+
+def test_maps_that_cannot_be_decoded(tmp_path: Path) -> None:
+    image = png(codes())
+    broken = image[:60] + bytes(30) + image[90:]
+    for data in (portraits.gdepth_jpeg(broken), portraits.dynamic_jpeg(broken)):
+        refused(tmp_path, data, "cannot be decoded")
+    refused(tmp_path, portraits.gdepth_jpeg(b"GIF89a" + image), "cannot be decoded")
+    refused(tmp_path, portraits.apple_jpeg(codes())[:-20], "is cut off: the file ends before it does")
+    heic = portraits.heic(codes(), apple_xmp())
+    at = heic.rindex(b"mdat")
+    refused(tmp_path, heic[: at + 40], "cannot be decoded|cannot be read")
+    half = portraits.heic(codes())
+    refused(tmp_path, half[:-30], "cannot be decoded")
+
+
+def test_base64_that_is_none(tmp_path: Path) -> None:
+    for text in ("****", "AAAAA", "é" * 8):
+        refused(tmp_path, portraits.gdepth_jpeg(b"", text=text), "not readable as base64")
+    refused(tmp_path, portraits.gdepth_jpeg(b"", text=""), "cannot be decoded")
+    whole = base64.b64encode(png(codes())).decode().rstrip("=")
+    wrapped = "\n ".join(whole[at : at + 76] for at in range(0, len(whole), 76))
+    expected = found(tmp_path, portraits.gdepth_jpeg(png(codes()))).depth
+    assert torch.equal(found(tmp_path, portraits.gdepth_jpeg(b"", text=wrapped, part=None)).depth, expected)
+
+
+def test_extended_xmp_with_missing_mixed_and_foreign_parts(tmp_path: Path) -> None:
+    data = portraits.gdepth_jpeg(png(codes()), part=100)
+    expected = found(tmp_path, data).depth
+    starts = [i - 4 for i in range(len(data)) if data.startswith(b"http://ns.adobe.com/xmp/extension/", i)]
+    assert len(starts) > 4
+    ends = [start + 2 + struct.unpack(">H", data[start + 2 : start + 4])[0] for start in starts]
+    parts = [data[a:b] for a, b in zip(starts, ends, strict=True)]
+    head, tail = data[: starts[0]], data[ends[-1] :]
+    assert torch.equal(found(tmp_path, head + b"".join(reversed(parts)) + tail).depth, expected)
+    foreign = parts[0].replace(parts[0][39:71], b"0" * 32)
+    assert torch.equal(found(tmp_path, head + foreign + b"".join(parts) + tail).depth, expected)
+    for kept in (parts[1:], parts[:-1], parts[:2] + parts[3:], [*parts, parts[1]]):
+        refused(tmp_path, head + b"".join(kept) + tail, "extended XMP is missing")
+    longer = [part[:71] + struct.pack(">I", 1 << 31) + part[75:] for part in parts]
+    refused(tmp_path, head + b"".join(longer) + tail, "extended XMP is missing")
+
+
+def test_dynamic_depth_items_that_are_not_there(tmp_path: Path) -> None:
+    data = portraits.dynamic_jpeg(png(codes()))
+    refused(tmp_path, data[:-20], "is cut off, or not where")
+    refused(tmp_path, portraits.dynamic_jpeg(png(codes()), length=10**30), "is cut off, or not where")
+    refused(tmp_path, portraits.dynamic_jpeg(png(codes()), length=-5), "negative length")
+    elsewhere = data.replace(b'DepthURI="android/depthmap"', b'DepthURI="android/deepmap1"')
+    refused(tmp_path, elsewhere, "missing from the photo's directory")
+    refused(tmp_path, data.replace(b'Item:Length="0"', b'Item:Length="x"'), "'x' for Length")
+
+
+@pytest.mark.parametrize(
+    ("hostile", "why"),
+    [
+        (b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "document type"),
+        (b'<!DOCTYPE a SYSTEM "file:///etc/hostname"><a/>', "document type"),
+        ('<?xml version="1.0" encoding="utf-16"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'.encode("utf-16"), "XMP"),
+        (b"<a>" * 100 + b"</a>" * 100, "too large or too deep"),
+        (b"<a>" + b"<b/>" * 30_000 + b"</a>", "too large or too deep"),
+        (b"<a><b></a>", "cannot be read"),
+        (b'<?xml version="1.0" encoding="klingon"?><a/>', "cannot be read"),
+        (b"<a>\xff</a>", "cannot be read"),
+        (b"", "cannot be read"),
+    ],
+)
+def test_hostile_xmp(tmp_path: Path, hostile: bytes, why: str) -> None:
+    """Wherever it stands; a namespace in a comment makes it look like depth."""
+    extended, parts = portraits.extended_segments(
+        hostile + b"<!-- http://ns.google.com/photos/1.0/depthmap/ -->", 60_000
+    )
+    named = portraits.xmp(f' xmpNote:HasExtendedXMP="{extended}">', portraits.GDEPTH)
+    photo = portraits.jpeg(picture())
+    refused(tmp_path, portraits.with_segments(photo, portraits.xmp_segment(named), *parts), why)
+    if len(hostile) < 60_000:
+        main = hostile + b"<!-- http://ns.google.com/photos/1.0/depthmap/ -->"
+        refused(tmp_path, portraits.with_segments(photo, portraits.xmp_segment(main)), why)
+        packet = hostile + b"<!-- http://ns.apple.com/pixeldatainfo/1.0/ -->"
+        refused(tmp_path, portraits.apple_jpeg(codes(), packet), why)
+        refused(tmp_path, portraits.heic(codes(), packet), why)
+
+
+def test_huge_announced_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = png(codes())
+    huge = bytearray(image)
+    huge[16:24] = struct.pack(">II", 40_000, 30_000)
+    huge[29:33] = struct.pack(">I", zlib.crc32(huge[12:29]))
+    for data in (portraits.gdepth_jpeg(bytes(huge)), portraits.dynamic_jpeg(bytes(huge))):
+        refused(tmp_path, data, "cannot be decoded|40000×30000")
+    monkeypatch.setattr(coded, "MAX_PIXELS", 700)
+    for data in (
+        portraits.gdepth_jpeg(image),
+        portraits.dynamic_jpeg(image),
+        portraits.apple_jpeg(codes()),
+        portraits.heic(codes()),
+    ):
+        refused(tmp_path, data, "is 32×24, and at most 100 megapixels are read")
+
+
+def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
+    start = time.perf_counter()
+    fill = b"\xff\xd8\xff" + b"\xff" * 3_000_000
+    tiny = b"\xff\xd8" + b"\xff\xe5\x00\x02" * 700_000
+    scans = portraits.dynamic_jpeg(png(codes()))
+    scans = scans.replace(b"\xff\xd9", b"\xff\xda\x00\x02" * 500_000)
+    places = portraits.full(b"iloc", 0, b"\0\0\xff\xff" + b"\0\x09\0\0\xff\xff" * 60_000)  # numbers of no length
+    parts = portraits.boxes(portraits.heic(codes(), apple_xmp()))
+    empty = b"".join(portraits.box(kind, body + (places if kind == b"meta" else b"")) for kind, body in parts)
+    for data in (fill, tiny, scans, empty):
+        path = portraits.write(tmp_path / "slow.jpg", data)
+        try:
+            load_photo_depth(path)
+        except InputError:
+            continue
+    assert time.perf_counter() - start < 5
+
+
+# Bytes of chance.
+
+WHOLE = {
+    "HEIC": portraits.heic(codes(), apple_xmp(matrix=LENS), 6, information=depth_information(1, d_min=0.5, d_max=3.0)),
+    "Apple JPEG": portraits.apple_jpeg(codes(), apple_xmp(matrix=LENS), 6),
+    "GDepth": portraits.gdepth_jpeg(png(codes()), orientation=6),
+    "Dynamic Depth": portraits.dynamic_jpeg(png(codes()), orientation=6, model=MODEL, extended=True),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@settings(max_examples=120)
+@given(data=st.data())
+def test_damaged_files_are_read_or_refused(
+    name: str, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    damaged = bytearray(WHOLE[name])
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(damaged) - 1))
+        kind = data.draw(st.sampled_from(("flip", "set", "cut", "drop", "double")))
+        if kind == "flip":
+            damaged[at] ^= 1 << data.draw(st.integers(0, 7))
+        elif kind == "set":
+            damaged[at] = data.draw(st.sampled_from((0, 1, 0x7F, 0x80, 0xFF)))
+        elif kind == "cut":
+            del damaged[max(at, 1) :]
+        else:
+            piece = damaged[at : at + data.draw(st.integers(1, 64))]
+            damaged[at : at + len(piece)] = b"" if kind == "drop" else piece * 2
+        damaged = damaged or bytearray(b"\0")
+    path = portraits.write(tmp_path_factory.getbasetemp() / "damaged.xyz", bytes(damaged))
+    try:
+        depth = load_photo_depth(path)
+    except InputError:
+        return
+    if depth is not None:
+        assert bool(depth.valid.any())
+        assert bool(torch.isfinite(depth.depth).all())
+        assert torch.equal(depth.depth > 0, depth.valid)

@@ -1,0 +1,342 @@
+"""The rgbd base: sharp and closed from the photo's eye, and no rubber sheet from the side."""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import (
+    Scene,
+    away,
+    box_before_wall,
+    box_mask,
+    cast,
+    motorcycle,
+    motorcycle_base,
+    psnr,
+    same_bits,
+    slanted_plane,
+    texture,
+    wall,
+)
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from spackle.bases.cleanup import COLOR_COST, MEDIAN, NEAR_COST, fill_missing
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import RgbdBase, lift
+from spackle.camera import Camera
+from spackle.color import srgb_to_linear
+from spackle.errors import InputError
+from spackle.fill import far_fill
+from spackle.image import Photo
+from spackle.render import CpuRenderer
+from spackle.residual import hole_area_ratio, hole_mask
+from spackle.trajectory import DepthRange, extremes, trajectory
+
+CPU = CpuRenderer()
+
+
+def photo_of(scene: Scene) -> Photo:
+    return Photo(scene.rgb, scene.camera.focal[0], "--focal-px", Path("photo.png"))
+
+
+def eroded(mask: Tensor, pixels: int) -> Tensor:
+    """A mask without its outermost pixels; the image's border counts as outside."""
+    outside = torch.nn.functional.pad((~mask).float()[None, None], [pixels] * 4, value=1.0)
+    return max_pool2d(outside, 2 * pixels + 1, stride=1)[0, 0] == 0
+
+
+def in_frame(camera: Camera, points: Tensor, margin: float = 0.0) -> Tensor:
+    """Which world points a camera has in its frame, a margin in pixels inside its border."""
+    uv, z = camera.project(points)
+    size = torch.tensor([camera.width, camera.height]).to(uv)
+    return ((uv > margin) & (uv < size - margin)).all(-1) & (z > 0)
+
+
+def on_plane(scene: Scene, camera: Camera) -> Tensor:
+    """[H, W, 3] where a view's pixels meet the plane of `slanted_plane`; behind the eye where they do not."""
+    inverse = 1 / scene.depth.double()
+    slope = torch.stack([inverse[0, -1] - inverse[0, 0], inverse[-1, 0] - inverse[0, 0]])
+    slope = slope / torch.tensor([scene.camera.width - 1, scene.camera.height - 1])
+    focal, middle = scene.camera.focal[0], scene.camera.K[:2, 2].double()
+    at_middle = inverse[0, 0] + slope @ (middle - 0.5)
+    normal = torch.cat([focal * slope, at_middle[None]])  # normal · point = 1, as 1/z is linear in the pixel
+    centers = camera.pixel_centers().double()
+    eye = camera.position.double()
+    ray = camera.unproject(centers, torch.ones(centers.shape[:-1], dtype=torch.float64)) - eye
+    return eye + ray * ((1 - normal @ eye) / (ray @ normal))[..., None]
+
+
+def test_one_gaussian_for_each_pixel_in_order_then_one_for_each_cell() -> None:
+    scene = box_before_wall()
+    base = scene.base()
+    height, width = scene.depth.shape
+    assert len(base) == height * width + height * width // 4
+    front = base.select(slice(0, height * width))
+    uv, z = scene.camera.project(front.means)
+    torch.testing.assert_close(uv, scene.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
+    torch.testing.assert_close(z, scene.depth.reshape(-1))
+    assert torch.equal(front.colors, srgb_to_linear(scene.rgb).reshape(-1, 3))
+
+
+def test_the_backing_stands_behind_each_of_its_pixels_and_has_the_farthest_ones_colour() -> None:
+    scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
+    height, width = scene.depth.shape
+    backing = scene.base().select(slice(height * width, None))
+    uv, z = scene.camera.project(backing.means)
+    torch.testing.assert_close(uv, scene.camera.pixel_centers(stride=2).reshape(-1, 2), rtol=0, atol=1e-3)
+    farthest = max_pool2d(scene.depth[None, None], 2)[0, 0].reshape(-1)
+    assert bool((z > farthest).all())
+    assert float((z / farthest).max()) < 1.01
+    bluish = backing.colors[:, 2] > backing.colors[:, 0]
+    assert torch.equal(bluish, farthest == 6.0)
+
+
+@pytest.mark.parametrize("scene", [wall(), box_before_wall(), slanted_plane(1.5, 6, 0), slanted_plane(1.5, 6, 1)])
+def test_from_the_photos_eye_the_photo_is_whole_and_its_depth_right(scene: Scene) -> None:
+    view = CPU.render(scene.base(), scene.camera)
+    assert hole_area_ratio(view.alpha) == 0
+    assert psnr(view.rgb, scene.rgb) > 28
+    error = (view.depth / scene.depth - 1).abs()
+    assert float(error.median()) < 0.01
+
+
+@pytest.mark.parametrize("size", [(63, 47), (5, 3), (3, 2), (2, 2)])
+def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
+    scene = wall(4.0, *size)
+    base = scene.base()
+    assert len(base) == size[0] * size[1] + (size[0] // 2) * (size[1] // 2)
+    view = CPU.render(base, scene.camera)
+    assert hole_area_ratio(view.alpha) == 0
+    torch.testing.assert_close(view.depth, scene.depth, rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("size", [(64, 1), (1, 64), (1, 1)])
+def test_a_photo_one_pixel_high_or_wide_is_lifted(size: tuple[int, int]) -> None:
+    scene = wall(4.0, *size)
+    base = scene.base()
+    assert len(base) == size[0] * size[1]
+    assert hole_area_ratio(CPU.render(base, scene.camera).alpha) == 0
+
+
+def test_every_number_of_a_base_is_in_range() -> None:
+    for base in (box_before_wall().base(), slanted_plane(1.5, 1000, 0).base(), motorcycle_base().gaussians):
+        assert all(bool(t.isfinite().all()) for t in base.tensors)
+        assert float(base.means[:, 2].min()) > 0
+        assert float(base.scales.min()) > 0
+        assert 0 < float(base.opacities.min()) <= float(base.opacities.max()) < 1
+        assert float(base.colors.min()) >= 0
+        assert float(base.colors.max()) <= 1
+
+
+def test_the_same_photo_gives_the_same_bits() -> None:
+    scene = box_before_wall()
+    assert same_bits(scene.base(), scene.base())
+
+
+def test_missing_depth_is_filled_from_behind_and_reported() -> None:
+    """A strip without depth beside a box, as a stereo camera leaves it."""
+    scene = box_before_wall()
+    strip = torch.zeros_like(scene.depth, dtype=torch.bool)
+    strip[24:48, 28:32] = True  # the wall's last columns before the box
+    found = dataclasses.replace(scene, depth=torch.where(strip, 0.0, scene.depth)).lift()
+    assert found.notes["depth_filled"] == pytest.approx(24 * 4 / (72 * 96), abs=1e-4)
+    z = found.gaussians.means[: 72 * 96, 2].reshape(72, 96)
+    elsewhere = eroded(~strip, 1)  # the pixels beside it may count as mixed ones
+    assert torch.equal(z[elsewhere], scene.base().means[: 72 * 96, 2].reshape(72, 96)[elsewhere])
+    assert float(z[strip].min()) > 5.99  # the wall's depth is 6, the box's 2
+    assert wall().lift().notes["depth_filled"] == 0
+
+
+def plain_missing(inverse: Tensor, rgb: Tensor, valid: Tensor) -> Tensor:
+    """`fill_missing` by Dijkstra's algorithm, one pixel at a time; NaN where two paths are as good as equal."""
+    (height, width), (far, _) = inverse.shape, far_fill(inverse, inverse[None], valid)
+    cost, origin, queue = {}, {}, []
+    for y, x in valid.nonzero().tolist():
+        cost[y, x], origin[y, x] = 0.0, (y, x)
+        heapq.heappush(queue, (0.0, (y, x)))
+    tied = set()
+    while queue:
+        total, (y, x) = heapq.heappop(queue)
+        if total > cost[y, x]:
+            continue
+        for v, u in ((y + dy, x + dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx):
+            if not (0 <= v < height and 0 <= u < width) or valid[v, u]:
+                continue
+            step = math.hypot(v - y, u - x) + COLOR_COST * float((rgb[v, u] - rgb[y, x]).abs().sum())
+            if valid[y, x]:
+                step += NEAR_COST * max(0.0, 1 - float(far[v, u] / inverse[y, x]))
+            new, old = total + step, cost.get((v, u), math.inf)
+            if abs(new - old) < 1e-3 and inverse[origin[v, u]] != inverse[origin[y, x]]:
+                tied.add((v, u))
+            if new < old:
+                cost[v, u], origin[v, u] = new, origin[y, x]
+                heapq.heappush(queue, (new, (v, u)))
+    assert not tied
+    spread = torch.tensor([[float(inverse[origin[y, x]]) for x in range(width)] for y in range(height)])
+    windows = torch.nn.functional.pad(spread[None, None], [MEDIAN // 2] * 4, mode="replicate").unfold(2, MEDIAN, 1)
+    median = windows.unfold(3, MEDIAN, 1)[0, 0].flatten(2).median(dim=-1).values
+    return torch.where(valid, inverse, median)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_filling_of_missing_depth_matches_dijkstra(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    inverse = 0.1 + torch.rand(9 + seed, 11, generator=generator)
+    rgb = 0.3 * torch.rand(9 + seed, 11, 3, generator=generator)
+    valid = torch.rand(9 + seed, 11, generator=generator) < 0.25
+    found = fill_missing(torch.where(valid, inverse, 0.0), rgb, valid)
+    torch.testing.assert_close(found, plain_missing(inverse, rgb, valid))
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "what"),
+    [
+        (slice(24, 48), slice(28, 32), "wall"),
+        (slice(28, 34), slice(36, 60), "box"),
+        (slice(24, 48), slice(28, 37), "both"),
+    ],
+)
+def test_missing_depth_stops_at_the_outline_that_the_colours_draw(rows: slice, columns: slice, what: str) -> None:
+    """A gap beside, within or astride a silhouette of little depth: each side keeps its own."""
+    scene = box_before_wall(near=5.0, far=6.0)
+    gap = torch.zeros_like(scene.depth, dtype=torch.bool)
+    gap[rows, columns] = True
+    z = dataclasses.replace(scene, depth=torch.where(gap, 0.0, scene.depth)).base().means[: 72 * 96, 2]
+    wrong = (z.reshape(72, 96) - scene.depth).abs() > 0.01
+    assert int(wrong.sum()) <= 8, what  # the corners of the outline, which the median rounds
+
+
+def test_a_depth_map_may_be_smaller_than_the_photo() -> None:
+    scene = box_before_wall()
+    small = dataclasses.replace(scene.depth_map, depth=scene.depth[::2, ::2], valid=scene.depth[::2, ::2] > 0)
+    z = lift(scene.rgb, small, scene.camera).gaussians.means[: 72 * 96, 2].reshape(72, 96)
+    torch.testing.assert_close(z, scene.depth)  # the box starts at even pixels, and edges stay edges
+
+
+def test_a_depth_map_of_another_shape_is_refused() -> None:
+    with pytest.raises(InputError, match="synthetic"):
+        RgbdBase(wall(width=64, height=64).depth_map).predict(photo_of(wall()))
+
+
+def test_the_lens_is_the_calibrations_where_there_is_one_and_else_the_photos() -> None:
+    scene = wall()
+    photo = photo_of(scene)
+    assert torch.equal(RgbdBase(scene.depth_map).predict(photo).camera.K, photo.camera.K)
+    K = torch.tensor([[70.0, 0.0, 15.0], [0.0, 70.0, 12.5], [0.0, 0.0, 1.0]])
+    half = DepthMap(scene.depth[::2, ::2], scene.depth[::2, ::2] > 0, K, None, "disparity", Path("disp.pfm"))
+    found = RgbdBase(half).predict(photo)
+    assert found.camera.K.tolist() == [[140, 0, 30], [0, 140, 25], [0, 0, 1]]
+    assert (found.camera.width, found.camera.height) == (64, 48)
+    uv, _ = found.camera.project(found.gaussians.means[: 64 * 48])
+    torch.testing.assert_close(uv, found.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
+
+
+def test_no_rubber_sheet_hangs_between_a_box_and_its_wall() -> None:
+    z = box_before_wall(near=2.0, far=6.0).base().means[:, 2]
+    assert bool(((z < 2.0 * 1.01) | (z > 6.0 * 0.999)).all())
+    assert float(z.min()) >= 2.0 * 0.999
+    assert float(z.max()) < 6.0 * 1.01
+
+
+@pytest.mark.parametrize("disparity", [0.1, 0.2, 0.5])
+@pytest.mark.parametrize("side", [0, 1])
+def test_what_a_box_uncovers_is_a_hole_and_what_was_seen_is_none(disparity: float, side: int) -> None:
+    near, far = 2.0, 6.0
+    scene = box_before_wall(near, far)
+    base = scene.base()
+    camera = extremes(scene.camera, disparity, DepthRange.of(base))[side]
+    box = box_mask(96, 72)
+
+    def looked_up(points: Tensor) -> Tensor:
+        uv, _ = scene.camera.project(points)
+        x, y = uv.long().unbind(-1)
+        return in_frame(scene.camera, points) & box[y.clamp(0, 71), x.clamp(0, 95)]
+
+    at_box, at_wall = cast(camera, near), cast(camera, far)
+    hits_box = looked_up(at_box)
+    uncovered = ~hits_box & looked_up(at_wall)
+    seen = hits_box | (in_frame(scene.camera, at_wall) & ~looked_up(at_wall))
+    alpha = CPU.render(base, camera).alpha
+    assert int(eroded(uncovered, 1).sum()) > 20
+    assert float(alpha[eroded(uncovered, 1)].max()) < 0.5
+    assert bool(hole_mask(alpha)[uncovered].float().mean() > 0.95)
+    assert not hole_mask(alpha)[eroded(seen, 2)].any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("kind", ["swipe", "shake"])
+def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
+    """A floor (axis 0) and a side wall (axis 1) that run from 1.5 m to 6 m, at disparity 0.5."""
+    scene = slanted_plane(1.5, 6, axis)
+    base = scene.base()
+    for camera in trajectory(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
+        interior = in_frame(scene.camera, on_plane(scene, camera), margin=8) & (on_plane(scene, camera)[..., 2] > 0)
+        view = CPU.render(base, camera)
+        assert int(interior.sum()) > 1000
+        assert int(hole_mask(view.alpha)[interior].sum()) == 0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_ground_up_to_the_horizon_is_all_but_closed(axis: int) -> None:
+    """Its last rows, each much farther than the one before, may open; a sideways move opens little of them."""
+    scene = slanted_plane(1.5, 1000, axis)
+    base = scene.base()
+    for camera in extremes(scene.camera, 0.5, DepthRange.of(base)):
+        interior = in_frame(scene.camera, on_plane(scene, camera), margin=8) & (on_plane(scene, camera)[..., 2] > 0)
+        assert float(hole_mask(CPU.render(base, camera).alpha)[interior].float().mean()) < 0.02
+
+
+def test_rounded_disparities_leave_no_stairs() -> None:
+    """Whole disparities cut a slanted wall into slices; undone, it stays closed from the side."""
+    scene = slanted_plane(2, 4, 1)
+    quantum = 0.005
+    stored = (1 / scene.depth / quantum).round() * quantum
+    depth = DepthMap(1 / stored, stored > 0, None, quantum, "disparity", Path("disp.png"))
+    base = lift(scene.rgb, depth, scene.camera).gaussians
+    z = base.means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
+    error, before = (1 / z - 1 / scene.depth).square().mean(), (stored - 1 / scene.depth).square().mean()
+    assert float(error) < 0.25 * float(before)
+    for camera in extremes(scene.camera, 0.3, DepthRange.of(base)):
+        interior = in_frame(scene.camera, on_plane(scene, camera), margin=8)
+        assert float(hole_mask(CPU.render(base, camera).alpha)[interior].float().mean()) < 0.002
+
+
+def test_a_ghost_outline_is_not_left_on_the_wall() -> None:
+    """The wall's first pixels beside the box have the box's colour, as a lens blurs it: they go with the box."""
+    scene = box_before_wall()
+    grown = max_pool2d(box_mask(96, 72).float()[None, None], 3, stride=1, padding=1)[0, 0] > 0
+    front = texture(72, 96, (0.8, 0.3, 0.2))
+    base = dataclasses.replace(scene, rgb=torch.where(grown[..., None], front, scene.rgb)).base()
+    reddish = base.colors[:, 0] > base.colors[:, 2]
+    corners = 4
+    assert int((reddish & (base.means[:, 2] > 4)).sum()) <= 2 * corners
+
+
+def test_motorcycle_is_reproduced_by_its_base() -> None:
+    scene, found = motorcycle().left, motorcycle_base()
+    view = CPU.render(found.gaussians, found.camera)
+    assert found.notes["depth_filled"] == pytest.approx(0.0735, abs=1e-3)
+    assert hole_area_ratio(view.alpha) < 1e-4
+    assert psnr(view.rgb, scene.rgb) > 30.5
+    known = scene.depth > 0
+    error = (view.depth / scene.depth - 1).abs()[known]
+    assert float(error.median()) < 0.01
+
+
+def test_motorcycle_leaves_its_occlusions_open_to_the_right_camera() -> None:
+    pair = motorcycle()
+    view = CPU.render(motorcycle_base().gaussians, pair.right)
+    hole = hole_mask(view.alpha)
+    assert 0.08 < float(hole.float().mean()) < 0.15
+    assert psnr(view.rgb[~hole], pair.right_rgb[~hole]) > 26
+
+
+def test_with_the_back_to_the_photo_nothing_is_seen() -> None:
+    scene = wall()
+    assert float(CPU.render(scene.base(), away(scene.camera)).alpha.max()) == 0

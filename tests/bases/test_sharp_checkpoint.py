@@ -1,0 +1,322 @@
+"""SHARP's checkpoint as a stranger's file: strict about what it holds, and nothing in it is run."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from sharp_weights import tiny_weights, write_tiny
+from torch import Tensor
+
+import spackle
+from spackle.bases.sharp import SharpBase, checkpoint
+from spackle.bases.sharp.checkpoint import load_network
+from spackle.bases.sharp.layers import TINY, SharpConfig
+from spackle.bases.sharp.network import SharpNetwork
+
+FP32 = torch.float32
+
+
+class Bomb:
+    """Unpickling this makes a folder."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture(scope="module")
+def weights() -> dict[str, Tensor]:
+    return tiny_weights()
+
+
+def refused(path: Path) -> str:
+    """The one line that a checkpoint is refused with."""
+    with pytest.raises(spackle.InputError) as caught:
+        load_network(path, FP32)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert str(path) in line
+    assert len(line) < 1000
+    return line
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_both_kinds_of_file_give_the_same_network(
+    tmp_path: Path, weights: dict[str, Tensor], suffix: str, dtype: torch.dtype
+) -> None:
+    path = write_tiny(tmp_path / f"weights{suffix}")
+    network = load_network(path, dtype)
+    path.unlink()  # what was read from it stays
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(tensor.float(), weights[name].to(tensor.dtype).float()), name
+        assert not tensor.requires_grad
+    assert not network.training
+    assert not any("depth_alignment" in name or ".head.weight" in name for name in network.state_dict())
+
+
+def test_in_bf16_the_heavy_parts_are_halved_and_the_sensitive_ones_are_not(tmp_path: Path) -> None:
+    tensors = load_network(write_tiny(tmp_path / "w.pt"), torch.bfloat16).state_dict()
+    exact = {name for name, tensor in tensors.items() if tensor.dtype == FP32}
+    for part in ("patch_embed.proj", "norm1", "gamma", "pos_embed", "head.4", "prediction_head", "image_encoder.conv"):
+        assert any(part in name for name in exact), part
+    for part in ("attn.qkv", "mlp.fc1", "upsample0", "resnet1", "texture_head"):
+        assert not any(part in name for name in exact), part
+
+
+def test_half_precision_checkpoints_are_read_too(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    save_file({name: tensor.half() for name, tensor in weights.items()}, tmp_path / "w.safetensors")
+    network = load_network(tmp_path / "w.safetensors", FP32)
+    assert all(tensor.dtype == FP32 for tensor in network.state_dict().values())
+
+
+def test_a_pickle_with_code_is_refused_and_not_run(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    mark = tmp_path / "ran"
+    torch.save({**weights, "more": Bomb(mark)}, tmp_path / "zip.pt")
+    torch.save({**weights, "more": Bomb(mark)}, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    (tmp_path / "plain.pt").write_bytes(pickle.dumps(Bomb(mark)))
+    torch.save(Bomb(mark), tmp_path / "alone.pt")
+    for name in ("zip.pt", "old.pt", "plain.pt", "alone.pt"):
+        assert "nothing in it was run" in refused(tmp_path / name)
+    assert not mark.exists()
+
+
+def test_a_whole_module_instead_of_its_tensors_is_refused(tmp_path: Path) -> None:
+    torch.save(torch.nn.Linear(2, 2), tmp_path / "module.pt")
+    assert "nothing in it was run" in refused(tmp_path / "module.pt")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_a_cut_file_is_refused(tmp_path: Path, suffix: str, share: float) -> None:
+    path = write_tiny(tmp_path / f"weights{suffix}")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    refused(path)
+
+
+def test_a_zip_whose_tensor_is_cut_is_refused(tmp_path: Path) -> None:
+    """A whole archive whose entries are shorter than the tensors need."""
+    source = write_tiny(tmp_path / "whole.pt")
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(tmp_path / "cut.pt", "w") as new:
+        for entry in old.infolist():
+            data = old.read(entry)
+            new.writestr(entry.filename, data[: len(data) // 2] if "/data/" in entry.filename else data)
+    refused(tmp_path / "cut.pt")
+
+
+def repacked(source: Path, target: Path, method: int = zipfile.ZIP_STORED, byteorder: bytes = b"little") -> Path:
+    """What a checkpoint becomes when another program packs it."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", method) as new:
+        for entry in old.infolist():
+            new.writestr(entry.filename, byteorder if entry.filename.endswith("/byteorder") else old.read(entry))
+    return target
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_zip_that_was_compressed_is_refused(tmp_path: Path, method: int) -> None:
+    path = write_tiny(tmp_path / "w.pt")
+    assert "zipped again by another program" in refused(repacked(path, tmp_path / "packed.pt", method))
+
+
+def test_a_zip_that_was_packed_again_without_compression_is_read(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    network = load_network(repacked(write_tiny(tmp_path / "w.pt"), tmp_path / "packed.pt"), FP32)
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
+
+
+@pytest.mark.parametrize(("order", "said"), [(b"big", "big-endian"), (b"", "endian"), (b"middle", "endian")])
+def test_numbers_in_another_byte_order_are_refused(tmp_path: Path, order: bytes, said: str) -> None:
+    path = repacked(write_tiny(tmp_path / "w.pt"), tmp_path / "turned.pt", byteorder=order)
+    assert said in refused(path)
+
+
+def test_a_zip_with_one_changed_byte_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    path = write_tiny(tmp_path / "w.pt")
+    content = bytearray(path.read_bytes())
+    number = content.index(weights["feature_model.fusion.out_conv.weight"].numpy().tobytes())
+    content[number + 40] ^= 1  # a last digit
+    path.write_bytes(content)
+    assert "damaged at " in refused(path)
+
+
+def test_a_zip_that_was_written_without_sums_is_read(tmp_path: Path) -> None:
+    torch.serialization.set_crc32_options(False)
+    try:
+        path = write_tiny(tmp_path / "w.pt")
+    finally:
+        torch.serialization.set_crc32_options(True)
+    load_network(path, FP32)
+
+
+def test_a_checkpoint_from_before_zips_is_refused_with_the_way_out(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    torch.save(weights, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    assert "save it again with a current torch.save" in refused(tmp_path / "old.pt")
+
+
+@pytest.mark.parametrize("name", ["w.SAFETENSORS", "w.pt", "w"])
+def test_a_files_kind_is_told_from_its_content(tmp_path: Path, name: str) -> None:
+    for suffix in (".pt", ".safetensors"):
+        write_tiny(tmp_path / f"w{suffix}").rename(tmp_path / name)
+        load_network(tmp_path / name, FP32)
+
+
+def files_of_other_kinds() -> dict[str, bytes]:
+    zipped = io.BytesIO()
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("hello.txt", "hello")
+    numbers = io.BytesIO()
+    torch.save([1, 2, 3], numbers)
+    nested = io.BytesIO()
+    torch.save({"state_dict": tiny_weights(), "epoch": 3}, nested)
+    numbered = io.BytesIO()
+    torch.save({0: torch.zeros(2)}, numbered)
+    return {
+        "empty.pt": b"",
+        "text.pt": b"<html>not found</html>",
+        "answer.json": b'{"data":{"error": "gone"}}',
+        "noise.pt": bytes(range(256)) * 40,
+        "zip.pt": zipped.getvalue(),
+        "list.pt": numbers.getvalue(),
+        "nested.pt": nested.getvalue(),
+        "numbered.pt": numbered.getvalue(),
+        "text.safetensors": b"not a header",
+        "huge.safetensors": (2**62).to_bytes(8, "little") + b"{}",
+    }
+
+
+@pytest.mark.parametrize("name", files_of_other_kinds())
+def test_files_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(files_of_other_kinds()[name])
+    line = refused(tmp_path / name)
+    known = name in ("empty.pt", "zip.pt", "list.pt", "nested.pt", "numbered.pt")
+    assert ("neither a PyTorch checkpoint nor a safetensors file" in line) is not known
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    assert "no such checkpoint" in refused(tmp_path / "none.pt")
+    assert "not a plain file" in refused(tmp_path)
+
+
+def test_another_networks_weights_are_refused_with_what_differs(tmp_path: Path) -> None:
+    save_file(torch.nn.Conv2d(3, 8, 3).state_dict(), tmp_path / "conv.safetensors")
+    line = refused(tmp_path / "conv.safetensors")
+    assert "of 1038 tensors 1038 missing" in line
+    assert "2 unknown (bias, weight)" in line
+
+
+def test_each_difference_is_listed(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    changed = dict(weights)
+    del changed["prediction_head.geometry_prediction_head.bias"]
+    changed["extra"] = torch.zeros(1)
+    changed["feature_model.fusion.out_conv.bias"] = torch.zeros(17)
+    save_file(changed, tmp_path / "w.safetensors")
+    line = refused(tmp_path / "w.safetensors")
+    assert "1 missing (prediction_head.geometry_prediction_head.bias)" in line
+    assert "1 unknown (extra)" in line
+    assert "1 of another shape (feature_model.fusion.out_conv.bias [17] instead of [16])" in line
+
+
+def test_what_inference_never_uses_is_checked_all_the_same(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    name = "depth_alignment.scale_map_estimator.conv_out.weight"
+    save_file({**weights, name: torch.zeros(2, 16, 1, 1)}, tmp_path / "w.safetensors")
+    assert name in refused(tmp_path / "w.safetensors")
+
+
+def odd_names() -> dict[str, object]:
+    nested: tuple[object, ...] = ()
+    for _ in range(200):
+        nested = (nested,)
+    return {
+        "escapes": "\x1b[31mred\x1b[0m\r\n\u202e",
+        "long": "\x07" * 100_000,
+        "nested": nested,
+        "number": 10**5000,
+        "pair": ("a\n", "b\x1b"),
+    }
+
+
+@pytest.mark.parametrize("value", [torch.zeros(1), torch.zeros(1, dtype=torch.int32)], ids=["float", "int"])
+@pytest.mark.parametrize("kind", odd_names())
+def test_odd_names_do_not_reach_the_terminal(
+    tmp_path: Path, weights: dict[str, Tensor], kind: str, value: Tensor
+) -> None:
+    torch.save({**weights, odd_names()[kind]: value}, tmp_path / "w.pt")
+    assert refused(tmp_path / "w.pt").isprintable()
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.complex64, torch.bool])
+def test_tensors_that_are_no_floats_are_refused(tmp_path: Path, weights: dict[str, Tensor], dtype: torch.dtype) -> None:
+    torch.save({**weights, "feature_model.fusion.out_conv.bias": torch.zeros(16, dtype=dtype)}, tmp_path / "w.pt")
+    assert "feature_model.fusion.out_conv.bias" in refused(tmp_path / "w.pt")
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    spoiled = weights["feature_model.fusion.out_conv.bias"].clone()
+    spoiled[3] = torch.nan
+    save_file({**weights, "feature_model.fusion.out_conv.bias": spoiled}, tmp_path / "w.safetensors")
+    assert "not finite" in refused(tmp_path / "w.safetensors")
+
+
+def test_large_numbers_whose_sum_overflows_are_finite_all_the_same(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+    name = "feature_model.fusion.out_conv.bias"
+    save_file({**weights, name: torch.full((16,), 3e38)}, tmp_path / "w.safetensors")
+    assert float(load_network(tmp_path / "w.safetensors", FP32).state_dict()[name].max()) == pytest.approx(3e38)
+
+
+def test_the_network_is_built_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, built = write_tiny(tmp_path / "w.pt"), []
+
+    def build(config: SharpConfig) -> SharpNetwork:
+        built.append(config)
+        return SharpNetwork(config)
+
+    monkeypatch.setattr(checkpoint, "SharpNetwork", build)
+    load_network(path, FP32)
+    assert built == [TINY]
+
+
+def test_a_base_says_which_weights_it_has(tmp_path: Path) -> None:
+    base = SharpBase.load(write_tiny(tmp_path / "mine.pt"), precision="fp32", device="cpu")
+    assert (base.name, base.weights, base.precision) == ("sharp", "mine.pt", "fp32")
+
+
+def odd_tensors() -> dict[str, Tensor]:
+    hiding = torch.zeros(16)
+    hiding.float = "x"  # type: ignore[method-assign,assignment]
+    return {
+        "meta": torch.zeros(16, device="meta"),
+        "sparse": torch.ones(16).to_sparse(),
+        "hiding": hiding,
+    }
+
+
+@pytest.mark.parametrize("kind", odd_tensors())
+def test_tensors_of_odd_kinds_are_refused(tmp_path: Path, weights: dict[str, Tensor], kind: str) -> None:
+    torch.save({**weights, "feature_model.fusion.out_conv.bias": odd_tensors()[kind]}, tmp_path / "w.pt")
+    assert "no plain tensor of floats" in refused(tmp_path / "w.pt")
+
+
+@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
+def test_a_file_that_changes_later_changes_nothing(tmp_path: Path, suffix: str) -> None:
+    path = write_tiny(tmp_path / f"weights{suffix}")
+    network = load_network(path, FP32)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    size = path.stat().st_size
+    with open(path, "r+b") as file:
+        file.write(b"\0" * size)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in network.state_dict().items())
+
+
+def test_an_unknown_precision_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="none of auto, fp32, bf16"):
+        SharpBase.load(write_tiny(tmp_path / "w.pt"), precision="fp8")  # type: ignore[arg-type]

@@ -1,0 +1,248 @@
+"""SHARP's options of speed: windows at once, torch.compile, one CUDA graph; and how often a GPU is waited for."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from sharp_weights import MICRO, micro_network, waves
+from torch import Tensor
+from torch._dynamo.utils import counters
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+import spackle
+from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.compiled import GraphedForward, compile_forward
+from spackle.bases.sharp.encoder import WINDOWS, Block
+from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose, make_start
+from spackle.image import Photo
+
+PHOTO = Photo(torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg"))
+
+
+def same(one: SharpOutput, other: SharpOutput) -> bool:
+    pairs = zip(vars(one.start).values(), vars(other.start).values(), strict=True)
+    return torch.equal(one.deltas, other.deltas) and all(torch.equal(a, b) for a, b in pairs)
+
+
+# --- windows at once
+
+
+@pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"low_memory": True}, WINDOWS)])
+def test_so_many_windows_go_at_once(options: dict[str, Any], calls: int) -> None:
+    seen: list[int] = []
+    SharpBase(micro_network(), **options).look(PHOTO, lambda done, total: seen.append(done))
+    assert len(seen) == calls
+    assert seen[-1] == WINDOWS
+
+
+@pytest.mark.parametrize("options", [{"windows": 0}, {"windows": 36}, {"windows": 5, "low_memory": True}])
+def test_windows_that_cannot_be_are_one_line_before_anything_is_read(tmp_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(spackle.InputError, match=r"^windows.*(between 1 and 35, got|leave one of the two out)"):
+        SharpBase.load(tmp_path / "none.pt", device="cpu", **options)
+
+
+# --- torch.compile
+
+
+def test_a_compiled_forward_shares_the_weights_of_a_network_that_stays_as_it_is() -> None:
+    network = micro_network()
+    twin = compile_forward(network, backend="eager")
+    assert isinstance(twin, SharpNetwork)
+    translated = [module for module in twin.modules() if module._compiled_call_impl is not None]
+    assert len(translated) == 2 * MICRO.depth + 3
+    assert all(module._compiled_call_impl is None for module in network.modules())
+    assert all(a is b for a, b in zip(twin.parameters(), network.parameters(), strict=True))
+    tokens = torch.randn(2, 65, MICRO.embed, generator=torch.Generator().manual_seed(0))
+    one, other = (next(m for m in n.modules() if isinstance(m, Block)) for n in (twin, network))
+    with torch.no_grad():
+        torch.testing.assert_close(one(tokens), other(tokens), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # PyTorch's own, of what it uses itself
+@pytest.mark.parametrize("backend", ["eager", "inductor"])
+def test_a_translated_forward_says_the_same(backend: str) -> None:
+    network = micro_network()
+    before = counters["stats"]["unique_graphs"]
+    with torch.no_grad():
+        found = compile_forward(network, backend)(waves(MICRO.side), 0.8, 5)
+        expected = network(waves(MICRO.side), 0.8, 5)
+    torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
+    assert counters["stats"]["unique_graphs"] - before <= 5  # the blocks, of five windows and of one; and three more
+
+
+def no_compiler(*arguments: object, **options: object) -> Any:
+    raise RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx: (None, 'g++')")
+
+
+def test_without_a_compiler_one_line_says_so_and_the_photo_is_done_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    plain, base = SharpBase(micro_network()), SharpBase(micro_network(), compiled=True)
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
+    with caplog.at_level(logging.WARNING, "spackle"):
+        found = [base.look(PHOTO), base.look(PHOTO)]
+    assert [record.getMessage() for record in caplog.records] == [
+        "SHARP runs without --compile: No working C++ compiler found in torch._inductor.config.cpp.cxx: (None, 'g++')"
+    ]
+    assert not base.compiled
+    assert "C++" in base.compile_problem
+    expected = plain.look(PHOTO)
+    assert all(same(output, expected) for output in found)
+
+
+def test_too_little_memory_is_no_missing_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    def short(*arguments: object) -> Any:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    base = SharpBase(micro_network(), compiled=True)
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: short)
+    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --low-memory"):
+        base.predict(PHOTO)
+    assert base.compiled
+
+
+# --- one CUDA graph, on a stand-in for CUDA
+
+
+class RecordingGraph(TorchDispatchMode):
+    """What a CUDA graph does: remembers operations and where their tensors lie, and repeats them. All else is gone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[Any, Any, Any, Any]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        self.calls.append((func, args, kwargs or {}, out))
+        return out
+
+    def replay(self) -> None:
+        for func, args, kwargs, out in self.calls:
+            again = func(*args, **kwargs)
+            for old, new in zip(tree_leaves(out), tree_leaves(again), strict=True):
+                if isinstance(old, Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+class NoStream:
+    def wait_stream(self, other: object) -> None: ...
+
+
+@pytest.fixture
+def _stand_in_for_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    replacements: dict[str, Callable[..., Any]] = {
+        "CUDAGraph": RecordingGraph,
+        "graph": lambda graph: graph,
+        "Stream": NoStream,
+        "current_stream": NoStream,
+        "stream": contextlib.nullcontext,
+        "device": contextlib.nullcontext,
+    }
+    for name, replacement in replacements.items():
+        monkeypatch.setattr(torch.cuda, name, replacement)
+
+
+@pytest.mark.usefixtures("_stand_in_for_cuda")
+def test_one_graph_says_of_every_photo_what_the_network_says() -> None:
+    network = micro_network()
+    calls: list[int] = []
+    network.register_forward_hook(lambda *_: calls.append(1))
+    graphed, seen = GraphedForward(network), []
+    pictures = [(waves(MICRO.side), 0.8), (waves(MICRO.side).flip(-1), 1.3)]
+    with torch.no_grad():
+        found = [graphed(*one, 35, lambda done, total: seen.append((done, total))) for one in pictures]
+        assert len(calls) == 3  # to warm up, and captured
+        assert seen == [(WINDOWS, WINDOWS)] * 2
+        assert all(same(output, network(*one, 35)) for output, one in zip(found, pictures, strict=True))
+    assert not same(*found)  # the first is not what the second has become
+
+
+# --- a GPU is waited for once
+
+
+class FarAway(TorchDispatchMode):
+    """Takes `meta` for a GPU: nobody can look into its tensors. Counts what leaves it, and what goes there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.up: list[tuple[int, ...]] = []
+        self.down: list[tuple[int, ...]] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if func is torch.ops.aten._to_copy.default and args[0].is_meta and kwargs.get("device") == torch.device("cpu"):
+            self.down.append(tuple(args[0].shape))
+            return torch.arange(args[0].numel()).to(args[0].dtype).view(args[0].shape)  # each to be found again
+        came = {t.device.type for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)}
+        out = func(*args, **kwargs)
+        if "cpu" in came and any(t.is_meta for t in tree_leaves(out) if isinstance(t, Tensor)):
+            self.up.append(tuple(args[0].shape))
+        return out
+
+
+class FromNumbers(TorchFunctionMode):
+    """Counts as going up what is made of Python's numbers there: PyTorch makes it on the processor first."""
+
+    def __init__(self, up: list[tuple[int, ...]]) -> None:
+        super().__init__()
+        self.up = up
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if func in (Tensor.new_tensor, torch.tensor, torch.as_tensor) and out.is_meta:
+            self.up.append(tuple(out.shape))
+        return out
+
+
+@pytest.fixture
+def far_away(monkeypatch: pytest.MonkeyPatch) -> Iterator[FarAway]:
+    # There is no autocast for `meta`, not even one to switch off.
+    monkeypatch.setattr(torch, "autocast", lambda *arguments, **options: contextlib.nullcontext())
+    with FarAway() as mode, FromNumbers(mode.up):
+        yield mode
+
+
+def test_between_photo_and_scene_a_gpu_is_waited_for_once(far_away: FarAway) -> None:
+    with torch.device("meta"):
+        network = SharpNetwork(MICRO).eval().requires_grad_(False)
+    gaussians = SharpBase(network).predict(PHOTO).gaussians
+    count = len(gaussians)
+    assert far_away.up == [(20, 30, 3)]  # the photo alone
+    assert far_away.down == [(14 * count,)]  # the scene alone, in one copy
+    assert all(t.is_contiguous() for t in gaussians.tensors)
+    assert torch.equal(torch.cat([t.flatten() for t in gaussians.tensors]), torch.arange(14 * count).float())
+
+
+@pytest.mark.parametrize(
+    "look", [float, bool, Tensor.item, lambda t: t[None].nonzero(), lambda t: t[None][t[None] > 0]]
+)
+def test_a_look_into_the_gpu_would_be_an_error(far_away: FarAway, look: Callable[[Tensor], object]) -> None:
+    with pytest.raises(RuntimeError):
+        look(torch.ones((), device="meta"))
+
+
+def test_small_tensors_that_go_up_would_be_seen(far_away: FarAway) -> None:
+    there = torch.ones(3, device="meta")
+    there.new_tensor([1.0, 2.0]), torch.tensor([1.0], device="meta"), torch.eye(3).to(there)
+    assert far_away.up == [(2,), (1,), (3, 3)]
+
+
+def test_the_unit_of_depth_stays_on_its_device_and_means_the_same() -> None:
+    depth = 2 + torch.rand(1, 2, 8, 8, generator=torch.Generator().manual_seed(1))
+    image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(2))
+    start = make_start(image, depth)
+    factor = 1.0 / (float(depth.min()) + 1e-6)
+    assert torch.equal(start.disparity_map, 1.0 / (depth * factor).clamp_max(100.0))
+    assert float(start.unscale) == 1.0 / factor
+    gaussians = compose(start, torch.zeros(14, 2, 4, 4))
+    assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(32, 4))

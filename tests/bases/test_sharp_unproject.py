@@ -1,0 +1,209 @@
+"""Gaussians stretched along the axes, against NumPy's float64 decompositions of their covariances."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from spackle.bases.sharp.unproject import BLOCK, GRAIN, plain_stretch, stretch_gaussians
+from spackle.gaussians import Gaussians
+
+PROPERTY = settings(deadline=None, max_examples=40)
+SEEDS = st.integers(0, 2**32 - 1)
+FACTORS = st.floats(0.2, 3)  # a photo 0.4 to 6 times as wide as its focal length
+STRETCHES = st.tuples(FACTORS, FACTORS, st.just(1.0))
+DECADES = st.sampled_from([(-2.0, -2.0), (-2.01, -1.99), (-3.0, -1.0), (-8.0, 3.0)])  # powers of ten of the scales
+PHOTO = (0.67, 0.5, 1.0)
+
+
+def random_set(count: int, seed: int = 0, decades: tuple[float, float] = (-3, -1)) -> Gaussians:
+    """Gaussians as the network leaves them: quaternions of any length, scales over some decades."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    low, high = decades
+    quats = torch.randn(count, 4, generator=generator) * 10 ** (4 * uniform(count, 1) - 2)
+    scales = 10 ** (low + (high - low) * uniform(count, 3))
+    return Gaussians(uniform(count, 3), quats, scales, uniform(count), uniform(count, 3))
+
+
+def single(quat: tuple[float, ...], scales: tuple[float, ...]) -> Gaussians:
+    rest = torch.ones(1, 3), torch.tensor([quat]), torch.tensor([scales])
+    return Gaussians(*rest, torch.ones(1), torch.ones(1, 3))
+
+
+def plain(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
+    """The batched path in the Gaussians' own dtype, without the means."""
+    quats, scales = plain_stretch(gaussians.quats, gaussians.scales, stretch)
+    return Gaussians(gaussians.means, quats, scales, gaussians.opacities, gaussians.colors)
+
+
+def factors(gaussians: Gaussians) -> Any:
+    """R S, [N, 3, 3] float64, written down again; a zero quaternion turns nothing."""
+    quats, scales = gaussians.quats.double().numpy(), gaussians.scales.double().numpy()
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    w, x, y, z = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1, 0, 0, 0]).T
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return np.array(rows).transpose(2, 0, 1) * scales[:, None]
+
+
+def check(before: Gaussians, after: Gaussians, stretch: tuple[float, float, float], tolerance: float = 1e-5) -> None:
+    """Everything that `stretch_gaussians` promises of quats and scales."""
+    matrix = np.array(stretch)[:, None] * factors(before)
+    wanted = matrix @ matrix.transpose(0, 2, 1)
+    square = factors(after)
+    error = np.linalg.norm(square @ square.transpose(0, 2, 1) - wanted, axis=(1, 2))
+    assert (error <= tolerance * np.linalg.norm(wanted, axis=(1, 2))).all()
+    # Scales too small for the covariance to tell are asked of the matrix that it is the square of. Near
+    # these limits NumPy's own digits are eight.
+    digits = max(tolerance, 1e-7)
+    sizes, roots = np.linalg.svd(matrix)[1], np.sqrt(np.abs(np.linalg.eigvalsh(wanted)[:, ::-1]))
+    for values, smallest in ((sizes, 1e-8), (roots, 1e-4)):
+        told = (values > smallest * values[:, :1]) & (values > 0)
+        np.testing.assert_allclose(after.scales.double().numpy()[told], values[told], rtol=digits)
+    # And however small they are, the volume depends on them.
+    volumes = before.scales.double().prod(1).numpy() * np.prod(stretch)
+    told = volumes > 0
+    np.testing.assert_allclose(after.scales.double().prod(1).numpy()[told], volumes[told], rtol=3 * digits)
+    assert bool((after.scales[:, :-1] >= after.scales[:, 1:]).all())
+    assert bool((after.scales >= 0).all())
+    assert bool((after.quats[:, 0] >= 0).all())
+    torch.testing.assert_close(after.quats.norm(dim=1), torch.ones(len(after)).to(after.quats), rtol=0, atol=1e-6)
+
+
+@PROPERTY
+@given(SEEDS, DECADES, STRETCHES)
+def test_the_kernel_and_the_plain_sweeps_keep_covariances(seed: int, decades: tuple, stretch: tuple) -> None:
+    before = random_set(50, seed, decades)
+    check(before, stretch_gaussians(before, stretch), stretch, 1e-6)
+    check(before, plain(before, stretch), stretch)
+    exact = before.to(dtype=torch.float64)
+    check(exact, plain(exact, stretch), stretch, 1e-12)
+
+
+@PROPERTY
+@given(SEEDS, DECADES, st.tuples(*[st.floats(1e-3, 1e3)] * 3))
+def test_even_a_thousandfold_stretch_is_exact_in_the_kernel(seed: int, decades: tuple, stretch: tuple) -> None:
+    before = random_set(50, seed, decades)
+    check(before, stretch_gaussians(before, stretch), stretch, 1e-6)
+
+
+@PROPERTY
+@given(SEEDS, DECADES, STRETCHES)
+def test_the_kernel_matches_its_plain_twin(seed: int, decades: tuple, stretch: tuple) -> None:
+    before = random_set(50, seed, decades)
+    fast, twin = stretch_gaussians(before, stretch), plain(before.to(dtype=torch.float64), stretch)
+    torch.testing.assert_close(fast.scales, twin.scales.float(), rtol=1e-6, atol=1e-12)
+    # Axes of all but equal scales may lie anywhere in their plane.
+    distinct = (twin.scales[:, :-1] > 1.001 * twin.scales[:, 1:]).all(1)
+    found, wanted = fast.quats[distinct], twin.quats[distinct].float()
+    same_side = torch.where((found * wanted).sum(1, keepdim=True) < 0, -1, 1)  # w may be 0 from either side
+    torch.testing.assert_close(found * same_side, wanted, rtol=0, atol=1e-5)
+
+
+HALF_TURN = (0.0, 1.0, 0.0, 0.0)
+ODD = (0.3, -1.2, 0.7, 2.0)
+DEGENERATE = {
+    "no Gaussian at all": (ODD, (0.0, 0.0, 0.0)),
+    "a line": (ODD, (0.0, 2.0, 0.0)),
+    "a disc": (ODD, (1.0, 0.0, 2.0)),
+    "a ball": (ODD, (0.5, 0.5, 0.5)),
+    "two equal": (ODD, (0.5, 0.1, 0.5)),
+    "a needle": (ODD, (1e-8, 1e3, 1e-8)),
+    "a long thread": (ODD, (1e-12, 1.0, 2e-12)),
+    "a plate": (ODD, (1e3, 1e-8, 1e3)),
+    "all sizes": (ODD, (1e-8, 1e3, 1.0)),
+    "no rotation given": ((0.0, 0.0, 0.0, 0.0), (0.1, 0.3, 0.2)),
+    "a short quaternion": ((3e-7, -1e-6, 2e-6, 1e-6), (0.1, 0.3, 0.2)),
+    "a long quaternion": ((3e7, -1e9, 2e8, 1e8), (0.1, 0.3, 0.2)),
+    "a half turn": (HALF_TURN, (0.1, 0.3, 0.2)),
+    "a quarter turn": ((1.0, 0.0, 0.0, -1.0), (0.3, 0.3, 0.2)),
+    "along the axes": ((1.0, 0.0, 0.0, 0.0), (0.1, 0.0, 0.2)),
+    "huge": (ODD, (1e37, 1e30, 2e37)),
+    "minute": (ODD, (1e-36, 1e-30, 1e-33)),
+}
+
+
+@pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), PHOTO, (0.5, 0.5, 1.0), (2.0, 3.0, 1.0)])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_gaussians_are_stretched_too(name: str, stretch: tuple[float, float, float]) -> None:
+    before = single(*DEGENERATE[name])
+    check(before, stretch_gaussians(before, stretch), stretch)
+    check(before, plain(before, stretch), stretch)
+
+
+@pytest.mark.parametrize("stretch", [(1.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)])
+def test_gaussians_pressed_flat_keep_their_outline(stretch: tuple[float, float, float]) -> None:
+    before = random_set(200)
+    check(before, stretch_gaussians(before, stretch), stretch)
+    check(before, plain(before, stretch), stretch)
+
+
+def test_no_finite_number_makes_a_nan() -> None:
+    numbers = torch.tensor([0.0, 1e-45, 1e-38, 1e-20, 1e-8, 1.0, 1e20, 3e38])
+    scales, quats = torch.cartesian_prod(*[numbers] * 3), torch.cartesian_prod(*[numbers] * 4)
+    quats = quats[torch.randperm(len(quats), generator=torch.Generator().manual_seed(0))][: len(scales)]
+    ones = torch.ones(len(scales), 3)
+    before = Gaussians(ones, quats, scales, ones[:, 0], ones)
+    for after in (stretch_gaussians(before, PHOTO), plain(before, PHOTO), plain(before.to(dtype=torch.float64), PHOTO)):
+        assert not any(bool(t.isnan().any()) for t in after.tensors)
+        assert bool((after.scales[:, :-1] >= after.scales[:, 1:]).all())
+
+
+def test_an_unturned_gaussian_is_stretched_by_hand() -> None:
+    for quat in ((2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)):
+        after = stretch_gaussians(single(quat, (4.0, 2.0, 0.5)), (0.5, 0.25, 1.0))
+        torch.testing.assert_close(after.means, torch.tensor([[0.5, 0.25, 1.0]]))
+        torch.testing.assert_close(after.scales, torch.tensor([[2.0, 0.5, 0.5]]))
+        torch.testing.assert_close(after.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+
+
+def test_means_are_multiplied_and_the_rest_is_passed_on() -> None:
+    before = random_set(7)
+    kept = [t.clone() for t in before.tensors]
+    after = stretch_gaussians(before, PHOTO)
+    assert torch.equal(after.means, before.means * torch.tensor(PHOTO))
+    assert after.opacities is before.opacities
+    assert after.colors is before.colors
+    assert all(t.dtype == torch.float32 for t in after.tensors)
+    assert all(torch.equal(one, other) for one, other in zip(before.tensors, kept, strict=True))
+    assert len(stretch_gaussians(Gaussians.empty(), PHOTO)) == len(plain(Gaussians.empty(), PHOTO)) == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_other_dtypes_take_the_plain_path(dtype: torch.dtype) -> None:
+    before = random_set(100).to(dtype=dtype)
+    after, wanted = stretch_gaussians(before, PHOTO), plain(before, PHOTO)
+    assert all(t.dtype == dtype for t in after.tensors)
+    assert torch.equal(after.quats, wanted.quats)
+    assert torch.equal(after.scales, wanted.scales)
+
+
+def test_results_repeat_bit_for_bit_whatever_the_threads_the_neighbours_and_the_layout() -> None:
+    before = random_set(2 * GRAIN + BLOCK + 5)
+    wide = torch.cat(before.tensors[1:3], dim=1).requires_grad_()
+    strided = Gaussians(before.means, wide[:, :4], wide[:, 4:], before.opacities, before.colors)
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            results.append(stretch_gaussians(strided if count == 5 else before, PHOTO))
+    finally:
+        torch.set_num_threads(threads)
+    parts = [before.select(slice(0, 3)), before.select(slice(3, GRAIN)), before.select(slice(GRAIN, None))]
+    results.append(Gaussians.cat(stretch_gaussians(part, PHOTO) for part in parts))
+    for result in results[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(results[0].tensors, result.tensors, strict=True))
