@@ -22,8 +22,8 @@ import skimage.data
 import torch
 from PIL import Image
 
-from spackle.machine import hardware
 from spackle.device import PRECISIONS, pick_dtype
+from spackle.machine import hardware
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
 from spackle.training.cache import Cache, load_sample

@@ -17,21 +17,19 @@ from pathlib import Path
 import torch
 
 from spackle.bases.depth_map import DepthMap, load_depth
-from spackle.device import MemoryShort
-from spackle.bases.hf import HfBase
-from spackle.bases.hf import SETTINGS, WEIGHTS
+from spackle.bases.hf import SETTINGS, WEIGHTS, HfBase
+from spackle.bases.lift import RgbdBase
 from spackle.bases.lite import base as lite
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.photo_depth import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
-from spackle.bases.lift import RgbdBase
 from spackle.bases.sharp.base import SharpBase, check_windows
+from spackle.device import PRECISIONS, MemoryShort, Precision
 from spackle.digest import fingerprint
 from spackle.downloads import check_recorded, installed, known_weights, read_record
 from spackle.errors import InputError, check_name
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.device import PRECISIONS, Precision
 
 AUTO = "auto"
 HF = "hf:"  # a folder, or owner/name of the hub, follows

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from spackle.bases.lift import RgbdBase
 from spackle.bases.open import BaseError
 from spackle.bases.protocol import Base, BasePrediction
-from spackle.bases.lift import RgbdBase
 from spackle.choose import Load
 from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError

@@ -18,6 +18,7 @@ import spackle
 from spackle.bases.open import NETWORKS, BaseError, kind_of
 from spackle.bases.sharp import SharpBase
 from spackle.choose import Load
+from spackle.device import PRECISIONS, pick_dtype
 from spackle.digest import digest_of, weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset
@@ -30,7 +31,6 @@ from spackle.jobs.bases import public_name, says_of, title_of
 from spackle.jobs.dataset.options import base_digest
 from spackle.jobs.options import PredictOptions, check_base_options
 from spackle.jobs.setup import set_up
-from spackle.device import PRECISIONS, pick_dtype
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.network import load_residual

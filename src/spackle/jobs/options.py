@@ -10,9 +10,9 @@ from typing import Literal
 
 from spackle.bases.open import AUTO, BaseSettings
 from spackle.camera import Camera
+from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions, check_video_options
-from spackle.device import Precision
 from spackle.residual.network import SHIPPED
 from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.network_file import read_network
 from spackle.device import Precision, pick_dtype
+from spackle.network_file import read_network
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.hole_features import Cues
 from spackle.residual.seeds import Rim, Seeds

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.rendering import Rendering
 from spackle.residual.hole_features import MASK_THRESHOLD
-from spackle.device import run_chunks
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre

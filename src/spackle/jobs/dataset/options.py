@@ -9,12 +9,12 @@ from typing import Any
 
 import spackle
 from spackle.bases.open import find_depth, kind_of
+from spackle.device import Precision
 from spackle.digest import digest_of, fingerprint, weights_digest
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE
 from spackle.jobs.bases import public_name
 from spackle.jobs.options import PredictOptions, check_has_depth, check_options
-from spackle.device import Precision
 from spackle.pseudo.build import ViewChoices
 from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile

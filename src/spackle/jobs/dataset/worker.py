@@ -18,9 +18,9 @@ from pathlib import Path
 
 import torch
 
-from spackle.device import MemoryShort
 from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
+from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import Photo
