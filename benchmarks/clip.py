@@ -29,7 +29,7 @@ from spackle.gaussians import Gaussians
 from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
 from spackle.opencv import OpenCV
 from spackle.render import get_renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer
 from spackle.residual.network import shipped_network
 from spackle.residual.temporal import flicker, pixel_grid, sample

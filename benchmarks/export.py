@@ -22,13 +22,13 @@ import numpy as np
 import torch
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, max_offset
 from spackle.formats import load_ply, load_ply_camera, save_ply
+from spackle.formats.scene_files import SceneFile
 from spackle.formats.spz import decode_spz
 from spackle.gaussians import Gaussians
 from spackle.jobs.export import WRITERS
-from spackle.jobs.scene_file import SceneFile
 from spackle.render import CpuRenderer
-from spackle.trajectory import DepthRange, max_offset
 
 
 def grid_scene(count: int) -> tuple[Gaussians, Camera]:

@@ -21,11 +21,11 @@ from torch.nn.functional import grid_sample
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange
 from spackle.pseudo.inpainters import get_inpainter
 from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views
 from spackle.render import get_renderer
 from spackle.residual import Completer
-from spackle.trajectory import TRAJECTORIES, DepthRange
 
 NEAR, FAR = 2.0, 5.0
 

@@ -20,7 +20,7 @@ from spackle import get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.lite.base import LiteBase
 from spackle.formats import save_png
 from spackle.image import load_photo, resize_photo
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.scene import complete, scene_path
 from spackle.training.depth.pictures import colored, ends, sheet
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spackle.gaussians import Gaussians
-from spackle.render.project import View
+from spackle.render.project import KernelCamera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE
 
 HUGE = 1e30
@@ -23,7 +23,7 @@ class Plain:
     box: tuple[int, int, int, int]
 
 
-def project_plainly(gaussians: Gaussians, view: View, wanted: np.ndarray) -> dict[int, Plain]:
+def project_plainly(gaussians: Gaussians, view: KernelCamera, wanted: np.ndarray) -> dict[int, Plain]:
     """The visible ones by their numbers."""
     found = {}
     with np.errstate(all="ignore"):
@@ -38,7 +38,7 @@ def project_plainly(gaussians: Gaussians, view: View, wanted: np.ndarray) -> dic
 
 
 def _project(
-    mean: np.ndarray, quat: np.ndarray, scale: np.ndarray, opacity: float, color: np.ndarray, view: View
+    mean: np.ndarray, quat: np.ndarray, scale: np.ndarray, opacity: float, color: np.ndarray, view: KernelCamera
 ) -> Plain | None:
     fx, fy, cx, cy, left, right, top, bottom = view.lens
     x, y, z = view.pose[:, :3] @ mean + view.pose[:, 3]

@@ -17,7 +17,7 @@ from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 
 
 @dataclasses.dataclass(frozen=True)

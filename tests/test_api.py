@@ -15,9 +15,9 @@ from scenes import psnr, same_bits
 
 import spackle
 from spackle.bases.lift import RgbdBase
+from spackle.camera_path import TrajectoryKind
 from spackle.formats import load_ply_camera
 from spackle.residual import ResidualNet
-from spackle.trajectory import TrajectoryKind
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, extremes, max_offset, trajectory
 from spackle.gaussians import Gaussians
-from spackle.trajectory import TRAJECTORIES, DepthRange, extremes, max_offset, trajectory
 
 PROPERTY = settings(deadline=None, max_examples=40)
 COORDINATES = st.tuples(*[st.floats(-5, 5)] * 3)

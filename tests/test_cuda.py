@@ -18,9 +18,8 @@ from torch import Tensor
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, get_renderer
-from spackle.render.cuda import GsplatRenderer, load_gsplat
-from spackle.render.cuda_sets import SetStore
-from spackle.rendering import Rendering
+from spackle.render.cuda import GsplatRenderer, SetStore, load_gsplat
+from spackle.render.protocol import Rendering
 
 CPU = CpuRenderer()
 SCENE = box_before_wall(width=45, height=35, focal=40)

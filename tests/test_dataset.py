@@ -32,6 +32,7 @@ from torch.utils.data import DataLoader
 
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.jobs.dataset import build as building
@@ -55,7 +56,6 @@ from spackle.residual import hole_mask
 from spackle.training.data import Supply
 from spackle.training.pseudo_source import PseudoViews
 from spackle.training.recipe import DataRecipe
-from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind
 
 VIEWS = 4
 SHORT = ["--base", "rgbd", "--views", VIEWS, "--shard-size", 2, "--threads", 1]

@@ -39,12 +39,12 @@ from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, save_ply
 from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
 from spackle.formats.gltf import encode_glb
+from spackle.formats.scene_files import SceneFile
 from spackle.formats.sog import codebook, encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LIMIT, decode_spz, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
 from spackle.jobs.export import WRITERS, export_scene
-from spackle.jobs.scene_file import SceneFile
 from spackle.progress import Reporter
 from spackle.render import CpuRenderer
 
@@ -479,7 +479,7 @@ def test_a_camera_elsewhere_is_no_comment(tmp_path: Path) -> None:
 
 def test_a_scene_is_read_once_for_all_formats(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
-    monkeypatch.setattr("spackle.jobs.scene_file.load_ply", lambda path: (read.append(path), load_ply(path))[1])
+    monkeypatch.setattr("spackle.formats.scene_files.load_ply", lambda path: (read.append(path), load_ply(path))[1])
     export_scene(scene, [tmp_path / "a.html", tmp_path / "a.ply", tmp_path / "a.glb"], told()[0])
     assert read == [scene]
 

@@ -16,13 +16,12 @@ from hypothesis import strategies as st
 from scenes import box_before_wall
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, Keyframe, KeyframePath, PathError, interpolate, max_offset, view_matrix
 from spackle.errors import InputError
 from spackle.formats import load_path
-from spackle.formats.keyframes import MAX_FILE_BYTES
+from spackle.formats.camera_files import MAX_PATH_BYTES
 from spackle.jobs.film import fly
 from spackle.jobs.video_options import VideoOptions
-from spackle.keyframes import Keyframe, KeyframePath, PathError, interpolate, view_matrix
-from spackle.trajectory import DepthRange, max_offset
 
 CAMERA = Camera.from_focal(60, 64, 48)
 DEPTHS = DepthRange(near=1.5, focus=4.0)
@@ -225,7 +224,7 @@ def test_a_file_that_is_far_too_long_is_not_read(tmp_path: Path) -> None:
     file = tmp_path / "long.json"
     with open(file, "wb") as sparse:
         sparse.truncate(1 << 30)
-    assert MAX_FILE_BYTES < 1 << 30
+    assert MAX_PATH_BYTES < 1 << 30
     with pytest.raises(InputError, match="too long for a path file"):
         load_path(file)
     for name in ("missing.json", "."):

@@ -12,10 +12,8 @@ from plain_project import project_plainly
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.render.approx import natural_log
 from spackle.render.pipeline import project, wanted_tiles
-from spackle.render.project import DEPTH, RECORD, Splats, View
-from spackle.render.project_forward import BLOCK
+from spackle.render.project import BLOCK, DEPTH, RECORD, KernelCamera, Splats, natural_log
 from spackle.render.protocol import ALPHA_MIN
 
 CAMERA = Camera.from_focal(90.0, 150, 110).looking(torch.tensor([0.5, -0.3, -0.8]), torch.tensor([0.2, 0.4, 5.0]))
@@ -49,7 +47,7 @@ def found_in(splats: Splats, spans: np.ndarray) -> np.ndarray:
 
 def check(gaussians: Gaussians, eps2d: float = 0.0, tiles: torch.Tensor | None = None) -> int:
     """Hold the kernel to its twin, and count the visible ones."""
-    view = View.of(CAMERA, eps2d)
+    view = KernelCamera.of(CAMERA, eps2d)
     wanted = wanted_tiles(view, tiles)
     splats, spans = project([gaussians], view, wanted)
     ids = found_in(splats, spans)
@@ -88,7 +86,7 @@ def test_no_number_of_one_gaussian_spoils_it_or_its_neighbours_unnoticed(value):
     scene = Gaussians(*(f.reshape(t.shape) for f, t in zip(fields, scene.tensors, strict=True)))
     visible = check(scene)
     assert visible > 70
-    splats, spans = project([scene], View.of(CAMERA, 0.0), np.ones((7, 10), np.bool_))
+    splats, spans = project([scene], KernelCamera.of(CAMERA, 0.0), np.ones((7, 10), np.bool_))
     assert np.isfinite(splats.records[found_in(splats, spans)]).all()
 
 
@@ -105,7 +103,7 @@ def test_the_smallest_and_the_farthest_end_where_float32_would():
 
 
 def test_gaussians_go_behind_those_that_are_there():
-    scene, view = cloud(BLOCK + 9), View.of(CAMERA, 0.0)
+    scene, view = cloud(BLOCK + 9), KernelCamera.of(CAMERA, 0.0)
     wanted = wanted_tiles(view, None)
     alone, spans = project([scene], view, wanted)
     there = Splats.allocate(1000)

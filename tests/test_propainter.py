@@ -26,6 +26,7 @@ from safetensors.torch import save_file
 from scenes import Scene, box_before_wall, shifted
 from torch import Tensor, nn
 
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.errors import InputError
 from spackle.pseudo.inpainters import InpainterOptions, get_inpainter
 from spackle.pseudo.manifest import load_manifest
@@ -33,7 +34,6 @@ from spackle.pseudo.propainter import DILATION, PropainterInpainter, dilated, pa
 from spackle.pseudo.propainter_weights import NETWORKS, give_weights, weight_files
 from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views
 from spackle.render import get_renderer
-from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind
 
 OURS = ("torchvision", "pytorchcv.models.propainter")  # modules that hold the convolution
 SHORT = ["--base", "rgbd", "--views", 3, "--threads", 1, "--trajectory", "swipe", "--disparity", 0.3, 0.4]

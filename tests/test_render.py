@@ -16,10 +16,9 @@ from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer, cpu, get_renderer, touched_tiles
-from spackle.render.approx import decode_srgb, encode_srgb, exp2
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+from spackle.render.blend import decode_srgb, encode_srgb, exp2
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
-from spackle.rendering import Rendering
 
 CPU, TWIN = CpuRenderer(), ReferenceRenderer()
 CAMERA = Camera.from_focal(100.0, 33, 33)  # an odd size: the axis meets the centre of pixel (16, 16)

@@ -15,13 +15,13 @@ from scenes import away, box_before_wall, psnr, same_bits, shifted, slanted_plan
 
 import spackle
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import Completer, Cues, ResidualNet, hole_area_ratio, hole_mask
 from spackle.residual.complete import PASSES
 from spackle.residual.seeds import cell_centers
-from spackle.trajectory import TRAJECTORIES, DepthRange, trajectory
 
 CPU = CpuRenderer()
 SOURCES = Path(spackle.__file__).parent

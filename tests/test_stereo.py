@@ -21,14 +21,13 @@ from torch import Tensor
 
 import spackle
 from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.depth_colors import HOLE, INFERNO, DepthColors
+from spackle.camera_path import TRAJECTORIES, DepthRange
+from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.jobs.film import cover, fly, make_film
 from spackle.jobs.video_options import VideoOptions
 from spackle.render import CpuRenderer
 from spackle.scene import scene_path
 from spackle.stereo import DUBOIS_LEFT, DUBOIS_RIGHT, LAYOUTS, Stereo, anaglyph, default_ipd
-from spackle.trajectory import TRAJECTORIES, DepthRange
 
 CPU = CpuRenderer()
 CAMERA = Camera.from_focal(60, 64, 48)
@@ -155,7 +154,7 @@ def test_near_is_bright_holes_are_grey_and_the_scale_is_linear_in_inverse_depth(
     luma = shown @ torch.tensor([0.2126, 0.7152, 0.0722])
     assert bool((luma.diff() > 0).all())
     odd = colors(torch.tensor([[0.0, 0.5, 50.0]]), torch.tensor([[False, True, True]]))[0]
-    assert odd[0].tolist() == [HOLE] * 3
+    assert odd[0].tolist() == [UNKNOWN_GREY] * 3
     torch.testing.assert_close(odd[1:], torch.tensor([INFERNO[-1], INFERNO[0]]))
 
 

@@ -38,12 +38,9 @@ from spackle.evaluation.suite.video import EACH, LIFT, RATIO, RATIO_KEPT, SCENE,
 from spackle.evaluation.table import to_markdown
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, GsplatRenderer
-from spackle.render.approx import alpha_of, encode_srgb, exp2, natural_log
-from spackle.render.blend import blend_splats, is_full
-from spackle.render.patch import STATE, blend_patch, span_of
+from spackle.render.blend import STATE, alpha_of, blend_patch, blend_splats, encode_srgb, exp2, is_full, span_of
 from spackle.render.pipeline import draw, wanted_tiles
-from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, View, X, Y
-from spackle.render.project_forward import cover, pack_block
+from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, KernelCamera, X, Y, cover, natural_log, pack_block
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.network import IN_CHANNELS, compile_network
 
@@ -93,7 +90,7 @@ def test_the_projections_needs_counted_by_hand() -> None:
 def test_patches_that_are_drawn_are_counted_as_a_plain_loop_counts_them() -> None:
     scene, camera = photo_scene(SIDE)
     scene = dataclasses.replace(scene, scales=5 * scene.scales, opacities=0.1 + 0.9 * scene.opacities)  # full tiles
-    view = View.of(camera, 0.0)
+    view = KernelCamera.of(camera, 0.0)
     drawing = draw([scene], view, wanted_tiles(view, None), None)
     found = counts.walked(drawing)
     records, patches, splats = drawing.splats.records, 0, 0

@@ -26,7 +26,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual.compose import DELTA_CHANNELS, compose
 from spackle.residual.hole_features import CELL, Cues
 from spackle.training import composites, sources

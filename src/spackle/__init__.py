@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from spackle.gaussians import Gaussians
     from spackle.image import Photo, load_photo
     from spackle.render import Renderer, get_renderer
-    from spackle.rendering import Rendering
+    from spackle.render.protocol import Rendering
     from spackle.residual import Completer, hole_area_ratio, hole_mask
     from spackle.scene import Scene, complete, predict
 

@@ -12,6 +12,10 @@ from numba.core.dispatcher import Dispatcher
 
 R = TypeVar("R")
 
+# Constants of float32 kernels: a Python float would widen a whole expression to float64.
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+MANTISSA = np.int32(23)  # bits of a float32 behind its point
+
 # Fused multiply-adds are welcome. Reordered sums, and the promise that no NaN or infinity occurs, are
 # not: the first would break bits that must repeat, the second the tests that keep bad values out.
 _FASTMATH = {"contract", "nsz", "afn"}

@@ -57,6 +57,10 @@ class Camera:
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
+    def even(self) -> Camera:
+        """The same view with an even width and height: an odd side grows by one."""
+        return self.resized(self.width + self.width % 2, self.height + self.height % 2)
+
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
         """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down.
 

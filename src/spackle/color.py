@@ -1,9 +1,18 @@
-"""Transfer between sRGB, which photos and screens use, and linear RGB, in which light adds up."""
+"""Colours: the transfer between sRGB, which photos and screens use, and linear RGB, in which light adds up.
+
+And depth as colours: inverse depth, near bright, on one scale for a whole video.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
 
 
 def srgb_to_linear(srgb: Tensor) -> Tensor:
@@ -18,3 +27,57 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
     # The inner clamp keeps the gradient of the unused branch finite at zero.
     power = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, linear * 12.92, power)
+
+
+MEASURED, LOOKS = 50_000, 60  # Gaussians and views that are looked at for the scale: torch's quantile stops at 16 M
+FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
+UNKNOWN_GREY = 0.5  # grey, which the map does not hold
+# Seventeen colours at equal steps of matplotlib's inferno (CC0): even in lightness, and told apart by the colour-blind.
+INFERNO = (
+    *((0.001, 0.000, 0.014), (0.042, 0.028, 0.141), (0.129, 0.047, 0.291), (0.238, 0.037, 0.396)),
+    *((0.342, 0.062, 0.429), (0.441, 0.099, 0.432), (0.541, 0.135, 0.415), (0.640, 0.171, 0.381)),
+    *((0.736, 0.216, 0.330), (0.817, 0.271, 0.270), (0.890, 0.348, 0.198), (0.944, 0.443, 0.120)),
+    *((0.977, 0.551, 0.039), (0.988, 0.668, 0.058), (0.976, 0.790, 0.196), (0.949, 0.910, 0.395)),
+    (0.988, 0.998, 0.645),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthColors:
+    """A scale of colours between two depths; what lies beyond has the colour of the end."""
+
+    near: float  # the brightest
+    far: float  # the darkest
+
+    @staticmethod
+    def over(gaussians: Gaussians, cameras: Sequence[Camera]) -> DepthColors:
+        """The scale for all of these views: what lies within their frames, but for 0.2 % at either end.
+
+        Raises:
+            ValueError: no view has anything in its frame.
+        """
+        step = max(1, len(gaussians) // MEASURED)
+        means = gaussians.means.detach()[::step].cpu()
+        looks = cameras[:: max(1, len(cameras) // LOOKS)]
+        inverse = torch.cat([_inverse_in_frame(means, camera) for camera in looks]).double()
+        if len(inverse) == 0:
+            raise ValueError("nothing of the scene is in view")
+        low, high = torch.quantile(inverse, torch.tensor([FARTHEST, NEAREST], dtype=torch.float64)).tolist()
+        return DepthColors(1 / high, 1 / low)
+
+    def __call__(self, depth: Tensor, known: Tensor) -> Tensor:
+        """Depth [H, W] as sRGB [H, W, 3], linear in inverse depth; grey where `known` [H, W] is false."""
+        span = max(1 / self.near - 1 / self.far, 1e-12)
+        share = ((1 / depth.clamp_min(1e-6) - 1 / self.far) / span).clamp(0, 1)
+        table = depth.new_tensor(INFERNO)
+        place = share * (len(INFERNO) - 1)
+        below = place.floor().clamp_max(len(INFERNO) - 2)
+        colors = torch.lerp(table[below.long()], table[below.long() + 1], (place - below)[..., None])
+        return colors.where(known[..., None], colors.new_tensor(UNKNOWN_GREY))
+
+
+def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
+    """1/z of the points [N, 3] within a view's frame."""
+    uv, z = camera.to("cpu").project(means)
+    inside = (z > 0.01) & (uv >= 0).all(dim=-1) & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
+    return 1 / z[inside]

@@ -15,17 +15,16 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import BaseSettings, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajectory
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.formats.video import check_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
-from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import shipped_network
-from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 PATH_FRAMES = 60
 LOG = logging.getLogger("spackle")
@@ -58,7 +57,7 @@ class Scene:
             ValueError: the path leads through a view that cannot be.
         """
         count = frames or keyframes.frame_count(fps)
-        return keyframes.cameras(even_camera(self.camera), count, DepthRange.of(self.base))
+        return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))
 
     def render(self, camera: Camera, renderer: Renderer | None = None) -> Rendering:
         """One view of the whole scene."""
@@ -115,7 +114,7 @@ def predict(
             downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
             what could not be used. A network is then loaded for this photo alone: for many, load a base once.
         kind: the path that the scene is completed for.
-        disparity: how far the path goes, see `spackle.trajectory.max_offset`.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         renderer: the CPU's where None.
 
@@ -166,10 +165,5 @@ def scene_path(
     in a row by a video that starts again.
     """
     once = looped and kind != "swipe"
-    path = trajectory(kind, even_camera(camera), disparity, DepthRange.of(base), frames + once)
+    path = trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames + once)
     return path[:frames]
-
-
-def even_camera(camera: Camera) -> Camera:
-    """The same view with an even width and height, as videos want it."""
-    return camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange
 from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.trajectory import DepthRange
 
 StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
 LAYOUTS: tuple[StereoLayout, ...] = get_args(StereoLayout)

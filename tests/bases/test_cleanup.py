@@ -27,10 +27,10 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import HOLE, OPEN, SETTLED, Sampled, find_edges, sample, settle
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
 from spackle.render import CpuRenderer
 from spackle.residual import hole_mask
-from spackle.trajectory import DepthRange, extremes
 
 FOCAL = (100.0, 110.0)
 FACTORS = [(1.0, 1.0), (1.25, 1.25), (2.0, 2.0), (3.3, 2.9), (4.0, 4.0), (12.0, 12.0), (0.5, 0.5), (0.7, 0.7)]

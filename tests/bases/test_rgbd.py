@@ -30,13 +30,13 @@ from spackle.bases.cleanup import COLOR_COST, MEDIAN, NEAR_COST, fill_missing
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import RgbdBase, lift
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
 from spackle.fill import far_fill
 from spackle.image import Photo
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.trajectory import DepthRange, extremes, trajectory
 
 CPU = CpuRenderer()
 

@@ -24,6 +24,7 @@ from scenes import box_before_wall, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, max_offset
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case, LoadedCase, load_case
@@ -37,7 +38,6 @@ from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_m
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
-from spackle.trajectory import DepthRange, max_offset
 
 TABLES = ("tables.md", "tables.tex")
 FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package

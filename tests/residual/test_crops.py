@@ -14,13 +14,13 @@ from scenes import Scene, box_before_wall, texture
 from torch import Tensor, nn
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds
 from spackle.residual.complete import SEEDS_HAR
 from spackle.residual.network import STRIDE, predict_deltas, shipped_network
 from spackle.residual.seeds import Rim
 from spackle.residual.sparse import Crop, crops_around
-from spackle.trajectory import DepthRange, extremes
 
 
 @settings(deadline=None, max_examples=60)

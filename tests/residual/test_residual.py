@@ -30,11 +30,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, TrajectoryKind, extremes, trajectory
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
 from spackle.residual.hole_features import CELL
@@ -51,7 +52,6 @@ from spackle.residual.occlusion_guard import (
 from spackle.residual.seeds import BEHIND, BLOB_CELLS, OPACITY, Rim, cell_centers
 from spackle.residual.view_order import farthest_first
 from spackle.surface import surface_slope
-from spackle.trajectory import DepthRange, TrajectoryKind, extremes, trajectory
 
 CPU = CpuRenderer()
 PROPERTY = settings(deadline=None, max_examples=40)

@@ -10,14 +10,14 @@ from scenes import box_before_wall, psnr, same_bits
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, TrajectoryKind, trajectory
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, farthest_first, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.complete import WIDEST
 from spackle.residual.rim_underlay import COARSE, REACH_CELLS, rim_underlay
 from spackle.residual.view_order import SettledFrames, has_speck, reach_of
-from spackle.trajectory import DepthRange, TrajectoryKind, trajectory
 
 CPU = CpuRenderer()
 FRAMES = 60

@@ -12,6 +12,7 @@ from scenes import box_before_wall
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.suite.flops import counted
 from spackle.render import CpuRenderer
 from spackle.residual import Cues, ResidualNet, make_seeds
@@ -19,7 +20,6 @@ from spackle.residual import network as residual_network
 from spackle.residual.network import IN_CHANNELS, network_input, predict_deltas, shipped_network
 from spackle.residual.seeds import Rim
 from spackle.residual.sparse import Cells, conv_rows, relu_rows, upsampled
-from spackle.trajectory import DepthRange, extremes
 
 
 @pytest.fixture(scope="module")

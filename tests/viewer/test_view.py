@@ -24,9 +24,9 @@ from scenes import box_before_wall
 
 import spackle
 from spackle.formats import save_ply
+from spackle.formats.scene_files import SceneFile
 from spackle.image import film_to_pixels
 from spackle.jobs.options import PredictOptions
-from spackle.jobs.scene_file import SceneFile
 from spackle.jobs.view_scene import page_of
 
 # The command line in a process of its own; a photo takes for ever.

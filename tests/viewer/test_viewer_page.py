@@ -23,6 +23,7 @@ from scenes import box_before_wall, psnr
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import save_png
@@ -30,7 +31,6 @@ from spackle.gaussians import Gaussians
 from spackle.gaussians import quat_to_matrix as matrices
 from spackle.render import CpuRenderer
 from spackle.scene import Scene, complete, scene_path
-from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
 from spackle.viewer import PageScene, page_files, page_scene, single_html
 from spackle.viewer.page import BYTES, encode_layer
 from spackle.viewer.server import ViewerServer

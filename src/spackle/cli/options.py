@@ -11,8 +11,8 @@ import typer
 from spackle.errors import InputError
 
 if TYPE_CHECKING:  # torch takes seconds to load
+    from spackle.camera_path import TrajectoryKind
     from spackle.jobs.video_options import VideoOptions
-    from spackle.trajectory import TrajectoryKind
 
 DEFAULT_DISPARITY = 0.3
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended

@@ -21,7 +21,7 @@ from spackle.evaluation.efficiency_results import ViewCost
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import Renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from spackle.gaussians import Gaussians
 from spackle.pseudo.opencv import OpencvInpainter
 from spackle.pseudo.views import ViewStack
 from spackle.render import Renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import Cues

@@ -11,16 +11,16 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
 from spackle.errors import reason_in_a_line
 from spackle.evaluation.methods import Method, Shot, View
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.results import Row
 from spackle.render import Renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.training.distance import hole_distance
 from spackle.training.features import FeatureNet
-from spackle.trajectory import DepthRange, extremes
 
 NEAR = "near"
 
@@ -65,7 +65,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
         ValueError: no Gaussian stands in front of the camera, or a disparity that no path has.
     """
     lens = prediction.camera
-    even = lens.resized(lens.width + lens.width % 2, lens.height + lens.height % 2)
+    even = lens.even()
     reach = DepthRange.of(prediction.gaussians)
     return [
         Wanted(f"{disparity:g}", name, camera)

@@ -17,6 +17,7 @@ import torch
 import spackle
 from spackle.bases.open import NETWORKS, BaseError, kind_of
 from spackle.bases.sharp import SharpBase
+from spackle.camera_path import MAX_DISPARITY
 from spackle.choose import Load
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.digest import digest_of, weights_digest
@@ -35,7 +36,6 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.network import load_residual
 from spackle.training.features import FeatureNet, load_features
-from spackle.trajectory import MAX_DISPARITY
 
 BASE = PredictOptions(base="sharp")  # the paper's
 DEFAULT_METHODS = ("base", "spackle")

@@ -109,7 +109,7 @@ def _weights(run: Run) -> str:
 
 LARGE_VIEWS = (
     "Views: the two ends of a swipe at that disparity, where the eye is farthest left and farthest right and looks at "
-    "the focus point (spackle.trajectory.extremes), at the photo's working size with both sides even; means over views"
+    "the focus point (spackle.camera_path.extremes), at the photo's working size with both sides even; means over views"
 )
 FILLING = ("spackle", "spackle-scene", "seeds", "dense", "direct-ft")  # methods that leave an opacity to measure
 ADDING = ("spackle", "spackle-scene", "seeds", "dense")

@@ -1,8 +1,7 @@
 """Files in and out: scenes, videos, pictures and cameras, each written whole or not at all."""
 
 from spackle.formats.atomic import atomic_path, check_writable
-from spackle.formats.cameras import load_cameras, save_cameras
-from spackle.formats.keyframes import load_path
+from spackle.formats.camera_files import load_cameras, load_path, save_cameras
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
 from spackle.formats.png import save_depth_png, save_gray_png, save_png
 from spackle.formats.video import VideoWriter, save_video

@@ -1,4 +1,7 @@
-"""Clips in: the frames of any video that FFmpeg decodes, upright, in sRGB, with their times."""
+"""Clips in: the frames of any video that FFmpeg decodes, upright, in sRGB, with their times.
+
+And clips out: H.264 with the times of another clip's frames, and its sound.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,27 @@ from pathlib import Path
 import av
 import numpy as np
 import torch
+from av.audio.stream import AudioStream
 from av.container import InputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
+from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
 from spackle.image import MAX_PIXELS, check_file
 
 SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
     *(".wmv", ".flv", ".3gp", ".ogv"),
 )
-UNSPECIFIED, BT709, BT601 = 2, 1, 5  # FFmpeg's numbers of matrices
+UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of matrices
 HD_ROWS = 720  # a video that says nothing of its colours has BT.709's from this height on, as players take it
 LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # FFmpeg opens what they name
 HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's numbers of transfers
 DEFAULT_RATE = Fraction(25)
+CLOCK = Fraction(1, 90_000)  # seconds in which times are written
+RATES = (Fraction(1, 1000), Fraction(1000))  # frames a second that an encoder takes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,3 +215,92 @@ def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...
         time = at_rate if tick is None else tick - start
         times.append(time if not times or time > times[-1] else at_rate)
     return tuple(times)
+
+
+class ClipWriter(VideoWriter):
+    """Writes as many frames as a clip has, at its times, with its sound; the file appears when the block ends well."""
+
+    def __init__(self, path: str | os.PathLike[str], clip: Clip) -> None:
+        """Prepare to write an .mp4.
+
+        Raises:
+            InputError: no file can be written there.
+        """
+        super().__init__(path)
+        self.clip = clip
+
+    @property
+    def sound(self) -> bool:
+        """Whether sound has been copied."""
+        return isinstance(self._encoder, _ClipEncoder) and self._encoder.sound
+
+    def _open(self, height: int, width: int) -> StreamEncoder:
+        return _ClipEncoder(self._temporary, width, height, self.clip)
+
+
+class _ClipEncoder(StreamEncoder):
+    """Frames are encoded as if they came evenly, and their packets moved to where they belong."""
+
+    def __init__(self, path: Path, width: int, height: int, clip: Clip) -> None:
+        self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
+        super().__init__(H264, path, width, height, self._even, 1)
+        self._clip = clip
+        self._input = av.open(str(clip.path)) if clip.audio in self._container.supported_codecs else None
+        self.sound = False
+        if self._input is not None:
+            source = self._input.streams.audio[0]
+            self._output = self._container.add_stream_from_template(source)
+            self._sounds = self._input.demux(source)
+            self._held: av.Packet[AudioStream] | None = None
+
+    def finish(self) -> None:
+        """The rest of the picture, and of the sound as long as that lasts."""
+        self._write(self._stream.encode(None))
+        self._copy_sound(self._clip.seconds)
+        self.close()
+
+    def close(self) -> None:
+        """Write the index."""
+        super().close()
+        if self._input is not None:
+            self._input.close()
+
+    def _write(self, packets: list[av.Packet[VideoStream]]) -> None:
+        for packet in packets:
+            assert packet.time_base is not None
+            assert packet.pts is not None
+            assert packet.dts is not None
+            times = [self._time(round(ticks * packet.time_base * self._even)) for ticks in (packet.pts, packet.dts)]
+            packet.time_base = CLOCK
+            packet.pts, packet.dts = (round(time / CLOCK) for time in times)
+            packet.duration = 0
+            self._copy_sound(times[1])
+            self._container.mux(packet)
+
+    def _time(self, index: int) -> Fraction:
+        """When a frame is shown; before the first, and after the last one, at the mean rate."""
+        times = self._clip.times
+        if 0 <= index < len(times):
+            return times[index]
+        return times[0] + index / self._even if index < 0 else times[-1] + (index - len(times) + 1) / self._even
+
+    def _copy_sound(self, until: Fraction) -> None:
+        """Sound of the clip as far as a time, packet by packet; a damaged rest is left out."""
+        while self._input is not None:
+            try:
+                packet = self._held or next(self._sounds, None)
+            except av.FFmpegError:
+                return
+            if packet is None or packet.pts is None or packet.time_base is None:
+                return
+            ticks = round(self._clip.start / packet.time_base)
+            begin, lasts = packet.pts - ticks, packet.duration or 0
+            self._held = packet if begin * packet.time_base >= until else None
+            if self._held is not None:
+                return
+            if begin + lasts <= 0:
+                continue  # before the first picture
+            packet.pts, packet.dts = begin, None if packet.dts is None else packet.dts - ticks
+            packet.stream = self._output
+            self._container.mux(packet)
+            self.sound = True

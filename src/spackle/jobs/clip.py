@@ -11,9 +11,9 @@ from typing import Any
 import spackle
 from spackle.bases.open import Choice, all_finite
 from spackle.bases.protocol import BasePrediction
+from spackle.camera_path import spelled
 from spackle.errors import InputError
-from spackle.formats.clip import Clip, clip_frames, read_clip
-from spackle.formats.clip_writer import ClipWriter
+from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.jobs.clip_frames import FIGURES, ClipChoices, ClipCompleter, Drawn
 from spackle.jobs.options import PredictOptions
@@ -24,7 +24,6 @@ from spackle.opencv import OpenCV
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter, Step
 from spackle.residual import hole_area_ratio
-from spackle.trajectory import spelled
 
 FILES = ("video.mp4", "report.json")
 NOT_FOR_CLIPS = {

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, TrajectoryKind, view_at
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
 from spackle.residual.occlusion_guard import OcclusionGuard
 from spackle.residual.temporal import (
@@ -30,8 +31,6 @@ from spackle.residual.temporal import (
     sample,
     track,
 )
-from spackle.scene import even_camera
-from spackle.trajectory import DepthRange, TrajectoryKind, view_at
 
 FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
 
@@ -106,7 +105,7 @@ class ClipCompleter:
         """
         with self.timed("depth"):
             base, shield, now, past = self._steadied(rgb, prediction)
-        choices, even = self._choices, even_camera(prediction.camera)
+        choices, even = self._choices, prediction.camera.even()
         camera = view_at(choices.trajectory, even, choices.disparity, now.depths, self._count, choices.frames)
         with self.timed("complete"):
             before, aux = self._renderer.render(base, camera), Gaussians.empty()

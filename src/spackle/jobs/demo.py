@@ -17,6 +17,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video
 from spackle.jobs.report import write_report
@@ -25,9 +26,8 @@ from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.residual.network import shipped_network
-from spackle.scene import Scene, complete, even_camera, scene_path
+from spackle.scene import Scene, complete, scene_path
 from spackle.training.distance import hole_psnr
-from spackle.trajectory import DepthRange, extremes
 
 FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
 DISPARITY = 0.3
@@ -146,13 +146,13 @@ def _complete_path(
 
 
 def _sides(prediction: BasePrediction) -> tuple[Camera, Camera]:
-    return extremes(even_camera(prediction.camera), DISPARITY, DepthRange.of(prediction.gaussians))
+    return extremes(prediction.camera.even(), DISPARITY, DepthRange.of(prediction.gaussians))
 
 
 @torch.no_grad()
 def _compare_extremes(scene: Scene, pair: StereoPair, renderer: Renderer, path: Path) -> dict[str, float]:
     """comparison.png, and the mean HAR of the two extremes before and after."""
-    sides = extremes(even_camera(scene.camera), DISPARITY, DepthRange.of(scene.base))
+    sides = extremes(scene.camera.even(), DISPARITY, DepthRange.of(scene.base))
     before = [renderer.render(scene.base, camera) for camera in sides]
     after = [scene.render(camera, renderer) for camera in sides]
     rows = [

@@ -10,45 +10,11 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from spackle.errors import InputError
-from spackle.formats import atomic_path, check_writable, save_ply
-from spackle.formats.compressed_ply import encode_compressed_ply
-from spackle.formats.gltf import encode_glb
-from spackle.formats.ply_header import read_header
-from spackle.formats.sog import encode_sog
-from spackle.formats.splat import encode_splat
-from spackle.formats.spz import LARGEST, encode_spz, spz_grid
-from spackle.jobs.scene_file import SceneFile
+from spackle.formats import atomic_path, check_writable
+from spackle.formats.ply import read_header
+from spackle.formats.scene_files import SCENE_WRITERS, SceneFile
+from spackle.formats.spz import LARGEST, spz_grid
 from spackle.progress import Reporter
-
-
-def _ply(scene: SceneFile, path: Path) -> None:
-    save_ply(
-        scene.gaussians,
-        path,
-        camera=scene.untilted_camera,
-        base_count=scene.base_count,
-        disparity=scene.disparity,
-    )
-
-
-def _compressed_ply(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
-
-
-def _spz(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_spz(scene.gaussians))
-
-
-def _splat(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_splat(scene.gaussians))
-
-
-def _sog(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_sog(scene.gaussians))
-
-
-def _glb(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_glb(scene.gaussians, scene.camera, scene.base_count))
 
 
 def _html(scene: SceneFile, path: Path) -> None:
@@ -59,16 +25,7 @@ def _html(scene: SceneFile, path: Path) -> None:
     path.write_bytes(single_html(page_of(scene, PredictOptions())))
 
 
-# By the end of a name; the first that fits counts.
-WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
-    ".compressed.ply": _compressed_ply,
-    ".ply": _ply,
-    ".spz": _spz,
-    ".splat": _splat,
-    ".sog": _sog,
-    ".glb": _glb,
-    ".html": _html,
-}
+WRITERS: dict[str, Callable[[SceneFile, Path], object]] = {**SCENE_WRITERS, ".html": _html}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -108,7 +65,7 @@ def _harmonics(scene: Path) -> int:
     return sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields)
 
 
-def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:
+def writer_of(output: Path) -> Callable[[SceneFile, Path], object]:
     """What writes a file of this name.
 
     Raises:
@@ -129,7 +86,7 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
     reporter.say(f"{output}: {len(scene.gaussians):,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
     result = {"file": output, "gaussians": len(scene.gaussians), "bytes": size, "seconds": round(seconds, 3)}
     far = 0
-    if writer_of(output) is _spz:
+    if output.name.lower().endswith(".spz"):
         bits, far = spz_grid(scene.gaussians)
         if far:
             reach = f"{LARGEST / 2**bits:,.0f} m"

@@ -11,16 +11,15 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.depth_colors import DepthColors
+from spackle.camera_path import DepthRange, KeyframePath, PathError, TrajectoryKind
+from spackle.color import DepthColors
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.jobs.options import MAX_FRAMES
 from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions
-from spackle.keyframes import KeyframePath, PathError
-from spackle.rendering import Rendering
-from spackle.scene import PATH_FRAMES, even_camera, scene_path
+from spackle.render.protocol import Rendering
+from spackle.scene import PATH_FRAMES, scene_path
 from spackle.stereo import Stereo, default_ipd
-from spackle.trajectory import DepthRange, TrajectoryKind
 
 COVERED = 0.5  # less opaque pixels have no depth that a person would call one
 
@@ -134,7 +133,7 @@ def fly(
         count = frames or kind.frame_count(options.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{kind.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
-        return kind.cameras(even_camera(camera), count, DepthRange.of(gaussians))
+        return kind.cameras(camera.even(), count, DepthRange.of(gaussians))
     return scene_path(gaussians, camera, kind, disparity, frames or PATH_FRAMES, looped=options.plays != 1)
 
 

@@ -10,11 +10,11 @@ from typing import Literal
 
 from spackle.bases.open import AUTO, BaseSettings
 from spackle.camera import Camera
+from spackle.camera_path import MAX_DISPARITY, TrajectoryKind
 from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.jobs.video_options import MAX_VIDEO_SIDE, VideoOptions, check_video_options
 from spackle.residual.network import SHIPPED
-from spackle.trajectory import MAX_DISPARITY, TrajectoryKind
 
 Mode = Literal["scene", "view"]
 MAX_FRAMES = 10_000

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import KeyframePath, PathError, TrajectoryKind
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path, load_ply, load_ply_camera, save_png, save_video
 from spackle.formats.video import FORMATS, is_video_name
@@ -20,11 +21,9 @@ from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.jobs.film import Film, cover, fly, make_film
 from spackle.jobs.options import check_path_options, check_view_options, video_problem
 from spackle.jobs.video_options import VideoOptions, named_format
-from spackle.keyframes import KeyframePath, PathError
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
-from spackle.trajectory import TrajectoryKind
 
 DEFAULT_SIZE = (1280, 720)
 

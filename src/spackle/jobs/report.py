@@ -10,12 +10,12 @@ from typing import Any
 import spackle
 from spackle.bases.open import Choice
 from spackle.bases.protocol import BasePrediction
+from spackle.camera_path import spelled
 from spackle.formats import atomic_path
 from spackle.image import Photo
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.setup import Tools
 from spackle.jobs.views import Completed
-from spackle.trajectory import spelled
 
 
 def focal_source(photo: Photo, prediction: BasePrediction) -> str:

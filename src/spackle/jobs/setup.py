@@ -8,13 +8,13 @@ from typing import cast
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.protocol import Base
 from spackle.camera import Camera
+from spackle.camera_path import KeyframePath
 from spackle.choose import Load
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path
 from spackle.image import Photo
 from spackle.jobs.options import PredictOptions, check_options, video_problem
 from spackle.jobs.request import shared_digest
-from spackle.keyframes import KeyframePath
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.network import load_residual

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from spackle.bases.open import AUTO
 from spackle.errors import InputError
+from spackle.formats.scene_files import SceneFile
 from spackle.image import Photo, load_photo
 from spackle.jobs.options import PredictOptions, check_options
 from spackle.jobs.predict import complete_photo
-from spackle.jobs.scene_file import SceneFile
 from spackle.jobs.setup import Tools, set_up
 from spackle.jobs.view_open import announce
 from spackle.jobs.view_scene import is_scene, page_of

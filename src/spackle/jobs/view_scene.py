@@ -10,11 +10,11 @@ import torch
 
 from spackle.camera import Camera
 from spackle.errors import InputError
+from spackle.formats.scene_files import SceneFile, at_origin
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.render import DEFAULT_SIZE
-from spackle.jobs.scene_file import SceneFile, at_origin
 from spackle.viewer import PageScene, page_scene
 
 MAGIC = b"ply"

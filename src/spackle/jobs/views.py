@@ -12,18 +12,16 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, PathError, extremes
 from spackle.errors import InputError
 from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
 from spackle.jobs.film import Film, fly, make_film
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.setup import Tools
-from spackle.keyframes import PathError
 from spackle.progress import Step
 from spackle.render import Renderer
 from spackle.residual import Completer, hole_area_ratio, hole_mask
-from spackle.scene import even_camera
-from spackle.trajectory import DepthRange, extremes
 
 MOST_CHECKED = 16  # views at keyframes whose holes are measured
 
@@ -78,7 +76,7 @@ def make_plan(photo: Path, prediction: BasePrediction, options: PredictOptions, 
         path = fly(
             gaussians, camera, tools.path or options.trajectory, options.disparity, options.frames, options.video
         )
-        others = _checked(gaussians, even_camera(camera), options, tools)
+        others = _checked(gaussians, camera.even(), options, tools)
     except PathError as error:
         raise InputError(f"{options.path}: {error}") from error
     except ValueError as error:

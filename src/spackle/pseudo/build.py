@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from spackle.bases.protocol import BasePrediction
+from spackle.camera_path import DepthRange, TrajectoryKind
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo, resize_photo
 from spackle.pseudo.archive import pack
@@ -20,7 +21,6 @@ from spackle.pseudo.sample import to_members
 from spackle.pseudo.views import DISPARITY, VIEWS, PathChoice, ViewStack, draw_path, path_cameras, render_views
 from spackle.render import Renderer
 from spackle.residual.hole_features import MASK_THRESHOLD
-from spackle.trajectory import DepthRange, TrajectoryKind
 
 Seconds = dict[str, float]  # of each stage
 Predict = Callable[[Photo], BasePrediction]
@@ -86,7 +86,7 @@ def _draw(
 ) -> tuple[PathChoice, ViewStack]:
     path = draw_path(choices.seed, photo.sha256, choices.trajectory, choices.disparity)
     gaussians, camera = prediction.gaussians, prediction.camera
-    even = camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)
+    even = camera.even()
     try:
         cameras = path_cameras(path, even, DepthRange.of(gaussians), choices.views)
     except ValueError as error:

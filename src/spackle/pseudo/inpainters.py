@@ -16,7 +16,7 @@ from spackle.pseudo.opencv import OpencvInpainter
 from spackle.pseudo.propainter import SIDE, PropainterInpainter
 from spackle.pseudo.views import ViewStack
 from spackle.render import Renderer
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, hole_mask
 
 

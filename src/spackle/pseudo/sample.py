@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats.cameras import checked_camera
+from spackle.formats.camera_files import checked_camera
 from spackle.gaussians import Gaussians
 from spackle.pseudo.archive import unpack
 from spackle.pseudo.encode import (
@@ -28,7 +28,7 @@ from spackle.pseudo.encode import (
     encode_rgb,
 )  # fmt: skip
 from spackle.pseudo.views import PathChoice, ViewStack
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual import hole_mask
 from spackle.residual.hole_features import MASK_THRESHOLD
-from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 
 VIEWS = 20  # the paper's, the photo's own view among them
 DISPARITY = (0.1, 0.6)  # from a small move to the widest in the paper's figures
@@ -58,7 +58,7 @@ def draw_path(
         seed: the dataset's.
         photo_sha256: of the photo's file.
         kind: this one; drawn where None.
-        disparity: between these two, see `spackle.trajectory.max_offset`.
+        disparity: between these two, see `spackle.camera_path.max_offset`.
     """
     digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
     rng = np.random.default_rng(list(digest))

@@ -14,13 +14,11 @@ from torch.autograd.function import once_differentiable
 
 from spackle.device import run_chunks, thread_count
 from spackle.gaussians import Gaussians
-from spackle.render.blend_backward import backward_tiles, collect_sums, count_wanted
-from spackle.render.paste import tile_mask
+from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums, count_wanted
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array, draw
-from spackle.render.project import View
+from spackle.render.project import KernelCamera
 from spackle.render.project_backward import project_backward
-from spackle.render.walk import SUMS
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering, tile_mask
 
 Array = npt.NDArray[Any]
 
@@ -28,7 +26,7 @@ FIELDS = 5  # tensors in a set of Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
-class Wanted:
+class GradientRows:
     """The sets that want gradients, and the rows of the gradient table that they share."""
 
     sets: list[int]
@@ -36,7 +34,7 @@ class Wanted:
     rows: int
 
     @staticmethod
-    def of(sizes: Sequence[int], wants: Sequence[bool]) -> Wanted:
+    def of(sizes: Sequence[int], wants: Sequence[bool]) -> GradientRows:
         """Lay the table out for sets of these sizes."""
         first, row, sets, ranges = 0, 0, [], []
         for k, (size, want) in enumerate(zip(sizes, wants, strict=True)):
@@ -45,14 +43,14 @@ class Wanted:
                 ranges.append((first, first + size, row))
                 row += size
             first += size
-        return Wanted(sets, np.array(ranges, np.int64).reshape(-1, 3), row)
+        return GradientRows(sets, np.array(ranges, np.int64).reshape(-1, 3), row)
 
 
 class Draw(torch.autograd.Function):
     """Draw sets of Gaussians, given as a flat row of tensors, over the three images of `onto`."""
 
     @staticmethod
-    def forward(ctx: Any, view: View, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Draw.
 
         Args:
@@ -83,7 +81,7 @@ class Draw(torch.autograd.Function):
             for gradient, need in zip(gradients, needs[:3], strict=True)
         ]
         wants = [any(needs[3 + k * FIELDS : 3 + (k + 1) * FIELDS]) for k in range(len(ctx.sizes))]
-        wanted = Wanted.of(ctx.sizes, wants)
+        wanted = GradientRows.of(ctx.sizes, wants)
         table = pixel_sums(ctx.drawing, outputs, tuple(as_array(g) for g in gradients), wanted)
         results: list[Tensor | None] = [None] * len(fields)
         for k, (_, _, row) in zip(wanted.sets, wanted.ranges, strict=True):
@@ -99,7 +97,9 @@ def keep_undrawn(gradient: Tensor, wanted: Array) -> Tensor:
     return torch.where(drawn if gradient.ndim == 2 else drawn[..., None], 0, gradient)
 
 
-def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], wanted: Wanted) -> Array:
+def pixel_sums(
+    drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], wanted: GradientRows
+) -> Array:
     """What the pixels give to each Gaussian that wants gradients, [wanted.rows, SUMS] float32.
 
     Each tile writes sums of its own, which are added up in the order of the tiles: the result does not
@@ -129,7 +129,7 @@ def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Ar
     return table
 
 
-def set_gradients(fields: Sequence[Tensor], view: View, table: Array) -> list[Tensor | None]:
+def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
     """The gradients of one set's five tensors."""
     arrays = [as_array(t) for t in fields[:4]]
     gradients = [np.zeros(tuple(t.shape), np.float32) for t in fields]
@@ -141,7 +141,9 @@ def set_gradients(fields: Sequence[Tensor], view: View, table: Array) -> list[Te
     return [torch.from_numpy(g) for g in gradients]
 
 
-def draw_differentiably(sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None) -> Rendering:
+def draw_differentiably(
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None
+) -> Rendering:
     """Draw with gradients; see `draw`."""
     under = [None] * 3 if onto is None else [t.float() for t in (onto.rgb, onto.depth, onto.alpha)]
     fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]

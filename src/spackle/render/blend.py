@@ -1,4 +1,8 @@
-"""Blending of tiles: front to back, in linear light."""
+"""Blending of tiles: front to back, in linear light.
+
+A tile's pixels lie in patches of sixteen, each of which fills a vector register. The functions of a pixel have no
+branches or calls, so that loops over them run in vector registers.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +10,179 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle._numba import kernel
-from spackle.render.approx import ONE, ZERO, encode_srgb
-from spackle.render.patch import PLANE, STATE, blend_splat, place_of
-from spackle.render.project import RECORD
-from spackle.render.protocol import TILE
+from spackle._numba import HALF, MANTISSA, ONE, ZERO, inlined_kernel, kernel
+from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, HALF_WIDTH, PEAK, RED, SLOPE, X, Y
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
+
+# Constants of the pixels' functions are float32 throughout: a Python float would widen a whole expression to float64.
+LIMIT = np.float32(ALPHA_MAX)
+FAINT = np.float32(ALPHA_MIN)
+LOWEST = np.float32(-60.0)
+ROUND = np.float32(1.5 * 2.0**23)  # adding this rounds a small float to an integer in its low bits
+ROUND_BITS = np.int32(0x4B400000)
+KNEE = np.float32(0.0031308)  # where sRGB turns from a line into a power
+LINE = np.float32(12.92)
+
+
+def _power_series(function: Any, low: float, high: float, degree: int) -> list[np.float32]:
+    """Coefficients of a near-minimax polynomial on low..high, lowest power first."""
+    fit = Chebyshev.interpolate(function, degree, [low, high])
+    return [np.float32(c) for c in fit.convert(kind=Polynomial).coef]
+
+
+# 2^x on -½..½, to 1e-7.
+E0, E1, E2, E3, E4, E5 = _power_series(np.exp2, -0.5, 0.5, 5)
+# sRGB's power in t, where the fourth root of the linear value is MIDDLE + SPREAD·t, to 2e-7.
+_root = float(KNEE) ** 0.25
+MIDDLE, SPREAD = np.float32((1 + _root) / 2), np.float32((1 - _root) / 2)
+S0, S1, S2, S3, S4, S5, S6, S7, S8 = _power_series(
+    lambda t: 1.055 * ((1 + _root) / 2 + (1 - _root) / 2 * t) ** (5 / 3) - 0.055, -1.0, 1.0, 8
+)
+# Its inverse is y²·q^1.6, where q is the fourth root of y, to a few 1e-8 of itself.
+ENCODED_KNEE = np.float32(0.04045)
+_low_root = ((float(ENCODED_KNEE) + 0.055) / 1.055) ** 0.25
+D0, D1, D2, D3, D4, D5 = _power_series(lambda q: q**1.6, _low_root, 1.0, 5)
+
+
+@kernel
+def exp2(x: np.float32) -> np.float32:
+    """2^x for x in -60..60."""
+    shifted = x + ROUND
+    f = x - (shifted - ROUND)
+    series = E0 + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * E5))))
+    exponent = (np.float32(shifted).view(np.int32) - ROUND_BITS) << MANTISSA
+    return np.int32(np.float32(series).view(np.int32) + exponent).view(np.float32)
+
+
+@kernel
+def alpha_of(power: np.float32) -> np.float32:
+    """A Gaussian's alpha where its opacity has fallen to 2^power: clamped, and 0 where too faint."""
+    alpha = min(exp2(max(power, LOWEST)), LIMIT)
+    return alpha if alpha >= FAINT else ZERO
+
+
+@kernel
+def encode_srgb(linear: np.float32) -> np.float32:
+    """Linear light to sRGB, both clamped to 0..1."""
+    value = min(max(linear, ZERO), ONE)
+    t = (np.sqrt(np.sqrt(value)) - MIDDLE) / SPREAD
+    curve = S0 + t * (S1 + t * (S2 + t * (S3 + t * (S4 + t * (S5 + t * (S6 + t * (S7 + t * S8)))))))
+    return LINE * value if value <= KNEE else min(curve, ONE)
+
+
+@kernel
+def decode_srgb(encoded: np.float32) -> np.float32:
+    """sRGB to linear light, both clamped to 0..1."""
+    value = min(max(encoded, ZERO), ONE)
+    y = (value + np.float32(0.055)) / np.float32(1.055)
+    q = np.sqrt(np.sqrt(y))
+    curve = y * y * (D0 + q * (D1 + q * (D2 + q * (D3 + q * (D4 + q * D5)))))
+    return value / LINE if value <= ENCODED_KNEE else min(curve, ONE)
+
+
+@kernel
+def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
+    """The derivative of `encode_srgb`, whose value is known: 0 where it clamps."""
+    slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
+    return slope if ZERO <= linear <= ONE else ZERO
+
 
 Array = npt.NDArray[Any]
 
+# A tile's state is one flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red,
+# green, blue, depth, alpha. One buffer, because the compiler then knows that the planes do not overlap.
+# Alpha has a sum of its own: as 1 - light a faint one would lose digits, and depth, its quotient, too.
+PLANE = TILE * TILE
+STATE = 6 * PLANE
+
+# A plane is its patches one after the other, of PATCH × PATCH pixels each: most Gaussians are small, and touch
+# about two thirds as many of these as rows of the tile.
+PATCH = 4
+PATCHES = TILE // PATCH  # along a tile's side
+LANES = PATCH * PATCH
+
+STOP = np.float32(TRANSMITTANCE_STOP)
+SLACK = np.float32(1e-3)  # pixels; room for rounding
+SIDE = np.float32(TILE)
+
+
+@kernel
+def blend_patch(
+    state: Array,
+    offset: np.uint64,
+    left: np.float32,
+    top: np.float32,
+    x: np.float32,
+    y: np.float32,
+    slope: np.float32,
+    across: np.float32,
+    fall: np.float32,
+    peak: np.float32,
+    red: np.float32,
+    green: np.float32,
+    blue: np.float32,
+    depth: np.float32,
+) -> None:
+    """Draw one Gaussian into the patch whose first pixel is (left, top): this, and its centre, counted in the tile."""
+    for lane in range(LANES):
+        i = offset + np.uint64(lane)
+        dy = np.float32(lane // PATCH) + top - y
+        u = np.float32(lane % PATCH) + left - (x + slope * dy)
+        alpha = alpha_of(peak - fall * dy * dy - across * u * u)
+        light = state[i]
+        after = light * (ONE - alpha)
+        full = after <= STOP
+        weight = ZERO if full else alpha * light
+        state[i] = ZERO if full else after
+        state[i + np.uint64(1 * PLANE)] += weight * red
+        state[i + np.uint64(2 * PLANE)] += weight * green
+        state[i + np.uint64(3 * PLANE)] += weight * blue
+        state[i + np.uint64(4 * PLANE)] += weight * depth
+        state[i + np.uint64(5 * PLANE)] += weight
+
+
+@kernel
+def span_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
+    """Which of the tile's rows, or columns, first..last (exclusive), a Gaussian may reach from a centre in the tile."""
+    # Truncation rounds up where one is added; a call to ceil or floor would cost more than a patch.
+    first = int(max(center - reach - SLACK, -ONE) + ONE)
+    last = min(int(min(center + reach + SLACK, SIDE)) + 1, TILE)
+    return first, last
+
+
+@kernel
+def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
+    """The same in patches."""
+    first, last = span_of(center, reach)
+    return first // PATCH, (last + PATCH - 1) // PATCH
+
+
+@inlined_kernel
+def blend_splat(state: Array, records: Array, index: int, left: int, top: int) -> None:
+    """Draw one Gaussian into the tile whose first pixel is (left, top)."""
+    record = records[index]
+    x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
+    first_row, last_row = patches_of(y, record[HALF_HEIGHT])
+    first_column, last_column = patches_of(x, record[HALF_WIDTH])
+    for row in range(first_row, last_row):
+        for column in range(first_column, last_column):
+            blend_patch(
+                state, np.uint64((row * PATCHES + column) * LANES), np.float32(column * PATCH), np.float32(row * PATCH),
+                x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK],
+                record[RED], record[GREEN], record[BLUE], record[DEPTH],
+            )  # fmt: skip
+
+
+@inlined_kernel
+def place_of(row: int, column: int) -> int:
+    """Where a plane keeps a pixel of the tile."""
+    patch = row // PATCH * PATCHES + column // PATCH
+    return patch * LANES + row % PATCH * PATCH + column % PATCH
+
+
+RECORD = BLUE + 1  # floats in a record
 CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.autograd import draw_differentiably
-from spackle.render.kept import Memory
 from spackle.render.pipeline import draw, wanted_tiles
-from spackle.render.project import View
-from spackle.rendering import Rendering
+from spackle.render.project import KernelCamera
+from spackle.render.projection_cache import ProjectionCache
+from spackle.render.protocol import Rendering
 
 
 class CpuRenderer:
@@ -24,7 +24,7 @@ class CpuRenderer:
     """
 
     def __init__(self) -> None:
-        self._memory = Memory()
+        self._memory = ProjectionCache()
 
     def __reduce__(self) -> tuple[type[CpuRenderer], tuple[()]]:
         """Copies, as other processes get them, remember nothing."""
@@ -41,7 +41,7 @@ class CpuRenderer:
     ) -> Rendering:
         """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
         sets = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
-        view = View.of(camera, eps2d)
+        view = KernelCamera.of(camera, eps2d)
         wanted = wanted_tiles(view, tiles)
         onto = onto if tiles is not None else None
         inputs = [t for part in sets for t in part.tensors] + ([onto.rgb, onto.depth, onto.alpha] if onto else [])

@@ -14,12 +14,10 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
+from spackle.render.binning import TileLists, list_tiles, sort_by_depth
 from spackle.render.blend import blend_tiles
-from spackle.render.project import Splats, View, count_before
-from spackle.render.project_forward import project_chunk
-from spackle.render.sort import sort_by_depth
-from spackle.render.tiles import TileLists, list_tiles
-from spackle.rendering import Rendering
+from spackle.render.project import KernelCamera, Splats, count_before, project_chunk
+from spackle.render.protocol import Rendering
 
 Array = npt.NDArray[Any]
 
@@ -37,7 +35,7 @@ class Canvas:
     linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
 
     @staticmethod
-    def prepare(view: View, onto: Rendering | None, keep_linear: bool) -> Canvas:
+    def prepare(view: KernelCamera, onto: Rendering | None, keep_linear: bool) -> Canvas:
         """Black and empty, or a copy of `onto`."""
         size = (view.height, view.width)
         linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
@@ -56,7 +54,7 @@ class Canvas:
 class Drawing:
     """A finished drawing, and what its gradient needs to know."""
 
-    view: View
+    view: KernelCamera
     wanted: Array  # [rows, columns] bool, the tiles that were drawn
     splats: Splats
     lists: TileLists
@@ -64,7 +62,7 @@ class Drawing:
 
 
 def draw(
-    sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
 ) -> Drawing:
     """Draw sets of Gaussians as one, in the wanted tiles, over a copy of `onto`.
 
@@ -88,7 +86,7 @@ def as_array(tensor: Tensor) -> Array:
     return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
 
 
-def wanted_tiles(view: View, tiles: Tensor | None) -> Array:
+def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
     """The tiles to draw, [rows, columns] bool."""
     if tiles is None:
         return np.ones(view.tiles, np.bool_)
@@ -99,7 +97,7 @@ def wanted_tiles(view: View, tiles: Tensor | None) -> Array:
 
 def touched_tiles(gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> Tensor:
     """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go."""
-    view = View.of(camera, eps2d)
+    view = KernelCamera.of(camera, eps2d)
     everywhere = wanted_tiles(view, None)
     splats, spans = project([gaussians], view, everywhere)
     lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, everywhere)
@@ -107,7 +105,7 @@ def touched_tiles(gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> T
 
 
 def project(
-    sets: Sequence[Gaussians], view: View, wanted: Array, splats: Splats | None = None, first: int = 0
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, splats: Splats | None = None, first: int = 0
 ) -> tuple[Splats, Array]:
     """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
 

@@ -1,15 +1,30 @@
-"""What every renderer backend promises."""
+"""What every renderer backend promises, and what it returns."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.rendering import Rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendering:
+    """One view: three images of the same size."""
+
+    rgb: Tensor  # [H, W, 3] sRGB in 0..1, over black
+    depth: Tensor  # [H, W] expected z, normalised by alpha; 0 where alpha is 0
+    alpha: Tensor  # [H, W] accumulated opacity in 0..1
+
+    def detach(self) -> Rendering:
+        """The same values cut off from autograd."""
+        return Rendering(self.rgb.detach(), self.depth.detach(), self.alpha.detach())
+
 
 ALPHA_MAX = 0.999  # one Gaussian's largest alpha (released gsplat; its main branch has 0.99)
 ALPHA_MIN = 1.0 / 255.0  # fainter contributions are skipped
@@ -44,3 +59,23 @@ class Renderer(Protocol):
                 empty tiles where None.
         """
         ...
+
+
+def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
+    """[H, W] bool: the pixels of the chosen tiles, [rows, columns] bool.
+
+    Raises:
+        ValueError: the tiles are not those of an image of this size.
+    """
+    if tuple(tiles.shape) != (-(-height // TILE), -(-width // TILE)):
+        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected one of each {TILE}×{TILE} pixels")
+    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+
+
+def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
+    """Keep the chosen tiles of a rendering, [rows, columns] bool, and the rest of `onto`, or black."""
+    mask = tile_mask(tiles, *rendering.alpha.shape)
+    parts = (rendering.rgb, rendering.depth, rendering.alpha)
+    others = (onto.rgb, onto.depth, onto.alpha) if onto is not None else tuple(torch.zeros_like(p) for p in parts)
+    rgb = torch.where(mask[..., None], parts[0], others[0])
+    return Rendering(rgb, torch.where(mask, parts[1], others[1]), torch.where(mask, parts[2], others[2]))

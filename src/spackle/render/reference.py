@@ -13,9 +13,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.gaussians import Gaussians, quat_to_matrix
-from spackle.render.paste import paste
-from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTANCE_STOP
-from spackle.rendering import Rendering
+from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TRANSMITTANCE_STOP, Rendering, paste
 
 
 class ReferenceRenderer:

@@ -12,7 +12,7 @@ from spackle.camera import Camera
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import MASK_THRESHOLD, Cues, hole_area_ratio
 from spackle.residual.network import ResidualNet, predict_deltas

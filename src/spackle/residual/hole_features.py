@@ -11,8 +11,8 @@ from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.device import run_chunks
-from spackle.render.approx import decode_srgb, encode_srgb
-from spackle.rendering import Rendering
+from spackle.render.blend import decode_srgb, encode_srgb
+from spackle.render.protocol import Rendering
 
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3

@@ -14,7 +14,7 @@ from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual.hole_features import MASK_THRESHOLD
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this

@@ -24,7 +24,7 @@ from spackle.color import srgb_to_linear
 from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual.hole_features import CELL, hole_mask
 
 # Of two sRGB pictures [H, W, 3]: how far from each pixel of the first its content lies in the second, [H, W, 2].

@@ -18,7 +18,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.gaussians import Gaussians
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual.hole_features import CELL, Cues
 from spackle.residual.seeds import Rim, Seeds
 from spackle.training.sample import Sample

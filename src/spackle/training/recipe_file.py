@@ -11,12 +11,12 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union
 
+from spackle.camera_path import MAX_DISPARITY
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 from spackle.residual.hole_features import CELL
 from spackle.training.depth.recipe import LITE_RANGES, LiteRecipe, check_lite
 from spackle.training.recipe import OptimRecipe, Recipe
-from spackle.trajectory import MAX_DISPARITY
 
 R = TypeVar("R", Recipe, LiteRecipe)
 

@@ -11,8 +11,7 @@ from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import ALPHA_MIN, TILE
-from spackle.rendering import Rendering
+from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
 from spackle.residual.hole_features import CELL, Cues, hole_mask
 from spackle.residual.seeds import Rim, Seeds, make_seeds
 

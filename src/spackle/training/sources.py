@@ -15,13 +15,13 @@ from torch import Tensor
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.errors import InputError
 from spackle.image import film_to_pixels, load_photo
 from spackle.render import Renderer
 from spackle.training.composites import composite
 from spackle.training.reverse_view import reverse_view, seen_from, with_backing
 from spackle.training.sample import Sample
-from spackle.trajectory import TRAJECTORIES, DepthRange, trajectory
 
 COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
 FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.trajectory import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 
 SAMPLES = 121  # of a path, between which the page goes straight
 USUAL, FOREIGN = 0.3, 0.6  # disparities that a scene is good for if nobody says: a completed one, one of others

@@ -30,7 +30,7 @@ from spackle.evaluation.suite.renderer import redraw_need
 from spackle.evaluation.suite.values import Found, Need, Row, Target
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
-from spackle.render.project import View
+from spackle.render.project import KernelCamera
 from spackle.residual import CELL, ResidualNet, hole_area_ratio
 from spackle.residual.compose import DELTA_CHANNELS
 from spackle.residual.network import STRIDE, compile_network, predict_deltas
@@ -106,7 +106,7 @@ def _needs(view: HoledView, looks: list[Look]) -> Mapping[str, Need]:
     """Of each stage, over all looks."""
     camera = view.camera
     cells = -(-camera.width // CELL) * -(-camera.height // CELL)
-    needs = {RENDER: functools.reduce(operator.add, drawing_needs([view.base], View.of(camera, 0.0)).values())}
+    needs = {RENDER: functools.reduce(operator.add, drawing_needs([view.base], KernelCamera.of(camera, 0.0)).values())}
     # Each look reads the picture and writes its cells; each new Gaussian is made of its cell's deltas and written.
     needs[CUES] = Need(float(len(looks) * (camera.width * camera.height * PIXEL + cells * (CELL_FLOATS * FLOAT + 1))))
     needs[PLACE] = Need(float(sum(len(look.new) for look in looks) * (DELTA_CHANNELS * FLOAT + GAUSSIAN)))

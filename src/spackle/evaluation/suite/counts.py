@@ -9,18 +9,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spackle._numba import kernel
+from spackle._numba import ONE, ZERO, kernel
 from spackle.device import run_chunks
 from spackle.evaluation.suite.arithmetic import operations_of
 from spackle.evaluation.suite.values import Need
 from spackle.gaussians import Gaussians
 from spackle.render import project as projection
-from spackle.render import project_forward as forward
-from spackle.render.approx import ONE, ZERO, alpha_of, encode_srgb, exp2, natural_log
-from spackle.render.blend import CHECK_EVERY, is_full
-from spackle.render.patch import LANES, PLANE, STATE, blend_patch, blend_splat, patches_of
+from spackle.render.blend import (
+    CHECK_EVERY,
+    LANES,
+    PLANE,
+    STATE,
+    alpha_of,
+    blend_patch,
+    blend_splat,
+    encode_srgb,
+    exp2,
+    is_full,
+    patches_of,
+)
 from spackle.render.pipeline import BLEND_GRAIN, Drawing, draw, wanted_tiles
-from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, View, X, Y
+from spackle.render.project import HALF_HEIGHT, HALF_WIDTH, KernelCamera, X, Y, natural_log
 from spackle.render.protocol import TILE
 
 Array = npt.NDArray[Any]
@@ -46,7 +55,7 @@ class Walk:
     patches: int  # of sixteen pixels, that they are drawn into
 
 
-def drawing_needs(sets: Sequence[Gaussians], view: View, tiles: Array | None = None) -> dict[str, Need]:
+def drawing_needs(sets: Sequence[Gaussians], view: KernelCamera, tiles: Array | None = None) -> dict[str, Need]:
     """Needs of "project", "sort", "bin" and "blend" where sets are drawn, in some tiles or in all."""
     wanted = wanted_tiles(view, None) if tiles is None else tiles
     drawing = draw(sets, view, wanted, None)
@@ -66,7 +75,14 @@ def project_need(gaussians: int, visible: int) -> Need:
     A visible one's operations are those written in `measure_block` and what it calls, and in `pack_block`, in float64;
     of any other it takes the depth to know that.
     """
-    parts = (forward.measure_block, forward.covariance, natural_log, forward.cover, forward.cover, forward.pack_block)
+    parts = (
+        projection.measure_block,
+        projection.covariance,
+        natural_log,
+        projection.cover,
+        projection.cover,
+        projection.pack_block,
+    )
     each = sum(operations_of(part, INTEGERS | EDGES) for part in parts)
     operations = float(visible * each + (gaussians - visible) * DEPTH_TEST)
     return Need(float(gaussians * GAUSSIAN + visible * (RECORD + BOX + KEY + ID)), {"fp64": operations})

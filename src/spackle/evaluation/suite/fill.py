@@ -8,19 +8,19 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import MAX_DISPARITY, DepthRange, extremes
 from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.evaluation.suite.clock import Lap
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
-from spackle.rendering import Rendering
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, Seeds, hole_area_ratio, make_seeds
 from spackle.residual.complete import CLOSED_HAR, PASSES
 from spackle.residual.compose import compose
 from spackle.residual.network import predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
 from spackle.residual.seeds import Rim
-from spackle.trajectory import MAX_DISPARITY, DepthRange, extremes
 
 RENDER = "base render of the view"
 CUES, NETWORK, PLACE, REDRAW = "mask, cues, seeds, rim", "network", "compose, push behind the photo", "redraw"
@@ -100,7 +100,7 @@ def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float)
     Raises:
         InputError: there is no such view.
     """
-    even = camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)
+    even = camera.even()
     depths = DepthRange.of(base)
 
     def holes(disparity: float) -> float:

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import torch
 
+from spackle.camera_path import DepthRange, trajectory
 from spackle.evaluation.suite.clock import TOTAL, measure
 from spackle.evaluation.suite.scenes import SIDE, photo_scene
 from spackle.evaluation.suite.values import Found, Row
 from spackle.render import GsplatRenderer
-from spackle.trajectory import DepthRange, trajectory
 
 BATCH = 4
 VIEW, VIEWS, HOME = "one view", f"{BATCH} views in one call", "one view, images back on the processor"

@@ -16,8 +16,7 @@ from spackle.device import run_chunks
 from spackle.evaluation.suite.clock import Lap
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
-from spackle.render.project import View
-from spackle.render.project_forward import covariance
+from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
 
 Array = npt.NDArray[Any]
@@ -26,7 +25,7 @@ Array = npt.NDArray[Any]
 def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None) -> Tensor:
     """RGB [H, W, 3] sRGB of Gaussians, with `eps2d` 0; depth and alpha are drawn, too, as ours are."""
     means, quats, scales, opacities, colors = (t.numpy() for t in scene.tensors)
-    view = View.of(camera, 0.0)
+    view = KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
     lens, size = (view.lens, view.pose), (view.width, view.height)
     run_chunks(

@@ -17,11 +17,10 @@ from spackle.evaluation.suite.scenes import SIDE, photo_scene
 from spackle.evaluation.suite.values import Found, Need, Row, Target
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, touched_tiles
+from spackle.render.binning import list_tiles, sort_by_depth
 from spackle.render.pipeline import Canvas, blend, project, wanted_tiles
-from spackle.render.project import View
-from spackle.render.sort import sort_by_depth
-from spackle.render.tiles import list_tiles
-from spackle.rendering import Rendering
+from spackle.render.project import KernelCamera
+from spackle.render.protocol import Rendering
 
 STAGES = ("project", "sort", "bin", "blend")
 CALL, RATIO = "whole call: RGB, depth, alpha", "naive over ours"
@@ -42,7 +41,7 @@ def renderer_section(runs: int, side: int = SIDE) -> Found:
             "naive": lambda lap: naive_render(scene, camera, lap),
         },
     )
-    needs = drawing_needs([scene], View.of(camera, 0.0))
+    needs = drawing_needs([scene], KernelCamera.of(camera, 0.0))
     rows = [Row(stage, times["ours", stage], need=needs[stage]) for stage in STAGES]
     whole = functools.reduce(operator.add, needs.values())
     rows.append(Row(CALL, times["call", TOTAL], need=whole, target=CALL_MS))
@@ -56,7 +55,7 @@ def renderer_section(runs: int, side: int = SIDE) -> Found:
 
 def stages(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     """What `spackle.render.pipeline.draw` does, step by step."""
-    view = View.of(camera, 0.0)
+    view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
     canvas = Canvas.prepare(view, None, False)
     splats, spans = project([scene], view, wanted)
@@ -115,7 +114,7 @@ def band(scene: Gaussians, camera: Camera) -> list[Gaussians]:
 
 def redraw_need(there: list[Gaussians], more: list[Gaussians], camera: Camera, tiles: Tensor) -> Need:
     """What is new is projected, sorted and dealt out; the wanted tiles are blended, all others copied."""
-    view, wanted = View.of(camera, 0.0), tiles.numpy()
+    view, wanted = KernelCamera.of(camera, 0.0), tiles.numpy()
     new = drawing_needs(more, view, wanted)
     blended = drawing_needs([*there, *more], view, wanted)["blend"]
     copied = Need(2.0 * PIXEL * camera.width * camera.height)

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, trajectory
 from spackle.evaluation.suite.clock import TOTAL, Lap, measure
 from spackle.evaluation.suite.values import Found, Row, Target
 from spackle.formats import save_video
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual import Completer, ResidualNet
-from spackle.trajectory import DepthRange, trajectory
 
 FRAMES = 60
 DISPARITY = 0.3
@@ -96,7 +96,7 @@ def video_section(
 
 def _path(prediction: BasePrediction, frames: int) -> list[Camera]:
     camera = prediction.camera
-    even = camera.resized(camera.width + camera.width % 2, camera.height + camera.height % 2)
+    even = camera.even()
     return trajectory("rotate_forward", even, DISPARITY, DepthRange.of(prediction.gaussians), frames)
 
 

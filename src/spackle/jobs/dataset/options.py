@@ -9,6 +9,7 @@ from typing import Any
 
 import spackle
 from spackle.bases.open import find_depth, kind_of
+from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind, spelled
 from spackle.device import Precision
 from spackle.digest import digest_of, fingerprint, weights_digest
 from spackle.errors import InputError
@@ -20,7 +21,6 @@ from spackle.pseudo.inpainters import Inpainter, InpainterOptions
 from spackle.pseudo.photos import PhotoFile
 from spackle.pseudo.propainter import MIN_SIDE, SIDE
 from spackle.pseudo.propainter_weights import weight_files
-from spackle.trajectory import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind, spelled
 
 MAX_VIEWS = 100  # two digits name a view
 MAX_PHOTOS = 1_000_000  # six digits name a photo

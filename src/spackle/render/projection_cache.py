@@ -4,21 +4,48 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
+from spackle.render.binning import TileLists, list_tiles, sort_by_depth
 from spackle.render.pipeline import Canvas, Drawing, blend, project
-from spackle.render.project import DEPTH, Splats, View
-from spackle.render.sort import sort_by_depth
-from spackle.render.tiles import TileLists, list_tiles
-from spackle.render.unchanged import Snapshot
-from spackle.rendering import Rendering
+from spackle.render.project import DEPTH, KernelCamera, Splats
+from spackle.render.protocol import Rendering
+
+State = tuple[int, int]  # the count of a tensor's changes in place, and where it lies
+
+
+class Snapshot:
+    """Tensors as they are now; they may go when nobody else holds them."""
+
+    def __init__(self, tensors: Sequence[Tensor]) -> None:
+        self._seen = [(weakref.ref(tensor), _state(tensor)) for tensor in tensors]
+
+    @staticmethod
+    def possible(tensors: Sequence[Tensor]) -> bool:
+        """Whether changes of these would be noticed: tensors of inference mode do not count theirs."""
+        return not any(tensor.is_inference() for tensor in tensors)
+
+    def shows(self, tensors: Sequence[Tensor]) -> bool:
+        """Whether these are the same tensors, unchanged."""
+        return len(tensors) == len(self._seen) and all(
+            ref() is tensor and state == _state(tensor)
+            for (ref, state), tensor in zip(self._seen, tensors, strict=True)
+        )
+
+
+def _state(tensor: Tensor) -> State:
+    """What changes when PyTorch changes a tensor in place; a write to its memory by others is not seen."""
+    return tensor._version, tensor.data_ptr()
+
 
 Array = npt.NDArray[Any]
 
@@ -26,27 +53,27 @@ MERGE_GRAIN = 64  # tiles a thread merges at a time
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
+class CachedDrawing:
     """What was projected and dealt out to tiles, and the tensors that it came from as they were then."""
 
-    view: View
+    view: KernelCamera
     splats: Splats  # with room for more
     lists: TileLists
     snapshot: Snapshot
     sets: int
     count: int  # Gaussians in those sets
 
-    def shows(self, sets: Sequence[Gaussians], view: View) -> bool:
+    def shows(self, sets: Sequence[Gaussians], view: KernelCamera) -> bool:
         """Whether these sets begin with those that were drawn, unchanged, and are seen from the same camera."""
         flat = [tensor for part in sets[: self.sets] for tensor in part.tensors]
         return self.view.same_as(view) and self.snapshot.shows(flat)
 
 
-class Memory:
+class ProjectionCache:
     """The last whole drawing of a renderer; one thread at a time may draw onto it."""
 
     def __init__(self) -> None:
-        self._kept: Kept | None = None
+        self._kept: CachedDrawing | None = None
         self._lock = threading.Lock()
 
     def keep(self, sets: Sequence[Gaussians], drawing: Drawing) -> None:
@@ -55,9 +82,11 @@ class Memory:
         self._kept = None
         if Snapshot.possible(flat):
             count = sum(len(part) for part in sets)
-            self._kept = Kept(drawing.view, drawing.splats, drawing.lists, Snapshot(flat), len(sets), count)
+            self._kept = CachedDrawing(drawing.view, drawing.splats, drawing.lists, Snapshot(flat), len(sets), count)
 
-    def redraw(self, sets: Sequence[Gaussians], view: View, wanted: Array, onto: Rendering | None) -> Drawing | None:
+    def redraw(
+        self, sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None
+    ) -> Drawing | None:
         """What `draw` would give, bit for bit, or None where the last whole drawing is of no help."""
         if not self._lock.acquire(blocking=False):
             return None
@@ -73,7 +102,7 @@ class Memory:
             self._lock.release()
 
 
-def _add(kept: Kept, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:
+def _add(kept: CachedDrawing, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:
     """Draw more sets together with those that are there, in the wanted tiles."""
     splats, view = kept.splats, kept.view
     _, spans = project(more, view, wanted, splats, kept.count)

@@ -1,4 +1,4 @@
-"""Camera files: which views to render, as JSON."""
+"""JSON files of cameras: which views to render, or where the camera is at which time."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import UNITS, Keyframe, KeyframePath, PathError
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats.atomic import atomic_path
 from spackle.image import check_file
 
-MAX_FILE_BYTES = 64 << 20
-MAX_FRAMES = 10_000
+MAX_CAMERA_BYTES, MAX_PATH_BYTES = 64 << 20, 4 << 20
+MAX_FRAMES = 10_000  # cameras or keyframes
 MAX_SIZE = 16_384
+MAX_NUMBER = 1e6  # in a path: a thousand kilometres, eleven days
 RIGID_TOLERANCE = 1e-3
 ZERO_TOLERANCE = 1e-6
 
-_SHAPES = (("K", 3), ("world_to_camera", 4))
+_REQUIRED = ("time", "eye", "target")
+_KEYFRAME_NAMES = (*_REQUIRED, "up", "fov")
+_PATH_NAMES = ("keyframes", "closed", "unit")
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
@@ -35,13 +39,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
             positive focal lengths, with skew or a last row other than 0 0 1; world_to_camera that is
             not a rotation and a translation; a size outside 1..16384.
     """
-    if check_file(path, "camera file") > MAX_FILE_BYTES:
-        raise InputError(f"{path}: too long for a camera file (at most 64 MiB): split it")
-    try:
-        with open(path, encoding="utf-8") as file:
-            content = json.load(file)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error
+    content = _read_json(path, "camera file", MAX_CAMERA_BYTES, dict)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f'{path}: needs a list "frames" with at least one camera')
@@ -53,8 +51,9 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         if not isinstance(frame, dict):
             raise InputError(f'{where}: must be an object with "K" and "world_to_camera"')
         width, height = (frame.get(side, content.get(side)) for side in ("width", "height"))
-        K, world_to_camera = (_matrix(frame.get(name), n, name, where) for name, n in _SHAPES)
-        cameras.append(checked_camera(K, world_to_camera, width, height, where))
+        K = _matrix(frame.get("K"), 3, "K", where)
+        pose = _matrix(frame.get("world_to_camera"), 4, "world_to_camera", where)
+        cameras.append(checked_camera(K, pose, width, height, where))
     return cameras
 
 
@@ -95,6 +94,46 @@ def checked_camera(K: Tensor, world_to_camera: Tensor, width: object, height: ob
     return Camera(K.float(), world_to_camera.float(), *sizes)
 
 
+def load_path(path: str | os.PathLike[str]) -> KeyframePath:
+    """Read `{"keyframes": [{"time": s, "eye": [x, y, z], "target": [x, y, z]}, …]}`.
+
+    A keyframe may carry "up" [x, y, z] and "fov" in degrees, the file "closed" and "unit", as in `KeyframePath`.
+    The world is the photo's camera (OpenCV: x right, y down, z forward).
+
+    Raises:
+        InputError: not such a file, or not a path: fewer than two keyframes or more than 10,000, times that do not
+            increase, a number that is not finite or beyond a million, an eye at its target, an up along the view,
+            a fov outside 1..170 degrees, or a name that is unknown or there twice.
+    """
+    content = _read_json(path, "path file", MAX_PATH_BYTES, _without_doubles)
+    if not isinstance(content, dict) or not isinstance(content.get("keyframes"), list):
+        raise InputError(f'{path}: needs a list "keyframes" of objects with "time", "eye" and "target"')
+    _check_names(content, _PATH_NAMES, str(path))
+    entries, closed, unit = content["keyframes"], content.get("closed", False), content.get("unit", "metres")
+    if len(entries) > MAX_FRAMES:
+        raise InputError(f"{path}: {len(entries)} keyframes are too many (at most {MAX_FRAMES})")
+    if not isinstance(closed, bool):
+        raise InputError(f'{path}: "closed" must be true or false')
+    if unit not in UNITS:
+        raise InputError(f'{path}: "unit" must be {" or ".join(UNITS)}')
+    keys = [_keyframe(entry, f"{path}: keyframe {index}") for index, entry in enumerate(entries)]
+    try:
+        return KeyframePath(tuple(keys), closed, unit)
+    except PathError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_json(path: str | os.PathLike[str], kind: str, limit: int, pairs: Any) -> Any:
+    """The content of a file of at most `limit` bytes; InputError where it is not JSON."""
+    if check_file(path, kind) > limit:
+        raise InputError(f"{path}: too long for a {kind} (at most {limit >> 20} MiB): is it the right file?")
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            return json.load(file, object_pairs_hook=pairs)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error
+
+
 def _matrix(rows: object, n: int, name: str, where: str) -> Tensor:
     """A list of n lists of n numbers as float64 [n, n]."""
     problem = f"{where}: {name} must be a list of {n} rows of {n} numbers"
@@ -106,3 +145,42 @@ def _matrix(rows: object, n: int, name: str, where: str) -> Tensor:
         return torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64)
     except OverflowError:  # a whole number with 400 digits
         raise InputError(f"{where}: {name} must be finite") from None
+
+
+def _keyframe(entry: object, where: str) -> Keyframe:
+    if not isinstance(entry, dict) or any(name not in entry for name in _REQUIRED):
+        raise InputError(f'{where}: must be an object with "time", "eye" and "target"')
+    _check_names(entry, _KEYFRAME_NAMES, where)
+    given: dict[str, Any] = {}
+    for name, value in entry.items():
+        vector = name in ("eye", "target", "up")
+        if vector and not (isinstance(value, list) and len(value) == 3):
+            raise InputError(f'{where}: "{name}" must be a list of three numbers')
+        given[name] = tuple(_number(part, name, where) for part in value) if vector else _number(value, name, where)
+    try:
+        return Keyframe(**given)
+    except PathError as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+def _number(value: Any, name: str, where: str) -> float:
+    if type(value) not in (int, float):
+        raise InputError(f'{where}: "{name}" must hold numbers, not {reason_in_a_line(json.dumps(value))}')
+    if not -MAX_NUMBER <= value <= MAX_NUMBER:  # NaN is not, either
+        raise InputError(f'{where}: "{name}" must be a finite number, at most a million, got {str(value)[:20]}')
+    return float(value)
+
+
+def _check_names(entry: dict[str, Any], known: tuple[str, ...], where: str) -> None:
+    if unknown := sorted(set(entry) - set(known)):
+        raise InputError(f"{where}: unknown name {reason_in_a_line(unknown[0])!r}: there are {', '.join(known)}")
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; ValueError where a name is there twice."""
+    found: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise ValueError(f"the name {name!r} is there twice in one object")
+        found[name] = value
+    return found
