@@ -1,4 +1,4 @@
-"""What may import what: the house's rooms, the light package, and the core dependencies alone."""
+"""What may import what: the rooms of the house, the light package, and the core dependencies alone."""
 
 from __future__ import annotations
 
@@ -18,31 +18,37 @@ FILES = sorted(SOURCES.rglob("*.py"))
 OPTIONAL = ("gsplat", "transformers", "pyiqa", "propainter", "ray", "viser", "skimage", "yaml", "tensorboard")
 OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
-# Rooms in the order in which the data flows; each may import itself and what is named here.
-# Thin, on top of everything; "" is the package itself.
-SHELL = {
-    "",
-    "__main__",
-    "choose",
-    "cli",
-    "jobs",
-    "scene",
-}
-ALLOWED = {
+# The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
+# they are named here; all others are values.
+SHARED = {"digest", "machine", "output_folder", "progress", "signals"}
+BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "formats", "downloads", "shared"}
+BELOW_DATASET = {*BELOW_SCENE, "scene"}
+ALLOWED: dict[str, set[str]] = {
     "values": set(),
-    "render": {"values"},
-    "bases": {"values"},
-    "residual": {"values", "render"},
-    "formats": {"values"},
     "downloads": {"values"},
-    "pseudo": {"values", "render", "bases", "residual", "formats"},
-    "training": {"values", "render", "bases", "residual", "formats", "pseudo"},
-    "evaluation": {"values", "render", "bases", "residual", "formats", "pseudo", "training"},
-    "viewer": {"values", "formats", "residual"},
-    "shell": {
-        *("values", "render", "bases", "residual", "formats", "downloads"),
-        *("pseudo", "training", "evaluation", "viewer"),
-    },
+    "formats": {"values"},
+    "shared": {"values", "downloads", "formats"},
+    "render": {"values"},
+    "bases": {"values", "downloads", "shared"},
+    "inpaint": {"values", "downloads"},
+    "residual": {"values", "render", "inpaint"},
+    "scene": BELOW_SCENE,
+    "dataset": BELOW_DATASET,
+    "training": {*BELOW_DATASET, "dataset"},
+    "evaluation": {*BELOW_DATASET, "dataset", "training"},
+    "viewer": {"values", "formats", "scene"},
+    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer"},
+    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app"},
+}
+# Where a folder's files still move to: it may import what its new room may, and is imported as that room is.
+MOVES = {"jobs": "app", "pseudo": "dataset", "choose": "app"}
+# Imports from a room above that have still to go.
+TOLERATED = {("evaluation", "app")}
+
+# Names that more than one class still has. The list may only become shorter.
+SHARED_NAMES = {
+    *("Block", "DirectFt", "Drawn", "Found", "Look", "Measured", "Method", "Plan", "Record", "Row", "Source", "Start"),
+    "View",
 }
 
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.
@@ -96,11 +102,13 @@ def module_of(path: Path) -> str:
 
 
 def room_of(module: str) -> str:
-    """The room of a module of ours; a folder that is no room is its own name, which no list has."""
-    parts = [*module.split(".")[1:], ""]
-    if parts[0] in SHELL:
-        return "shell"
-    return parts[0] if (SOURCES / parts[0]).is_dir() else "values"
+    """The room of a module of ours."""
+    first = [*module.split(".")[1:], ""][0]
+    if first in SHARED:
+        return "shared"
+    if first in ALLOWED or first in MOVES:
+        return MOVES.get(first, first)
+    return first if (SOURCES / first).is_dir() else "values"
 
 
 def imports_of(path: Path) -> Iterator[str]:
@@ -121,21 +129,38 @@ def name_of(path: Path) -> str:
     return path.relative_to(SOURCES).as_posix()
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_a_room_imports_only_what_the_house_allows(path: Path) -> None:
-    room = room_of(module_of(path))
-    assert room in ALLOWED, f"{room} is no room of the house"
-    for module in imports_of(path):
-        if module.partition(".")[0] == "spackle":
-            assert room_of(module) in ALLOWED[room] | {room}, f"{name_of(path)} imports {module}"
+def test_a_room_imports_only_what_the_house_allows() -> None:
+    wrong = []
+    for path in FILES:
+        if path.parent == SOURCES and path.name in ("__init__.py", "__main__.py"):
+            continue  # the package itself: everything public, and the command
+        room = room_of(module_of(path))
+        assert room in ALLOWED, f"{room} is no room of the house"
+        for module in imports_of(path):
+            other = room_of(module)
+            known = other in ALLOWED[room] | {room} or (room, other) in TOLERATED
+            if module.startswith("spackle.") and not known:
+                wrong.append(f"{name_of(path)} ({room}) imports {module} ({other})")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_two_classes_have_one_name() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(name_of(path))
+    shared = {name: files for name, files in homes.items() if len(files) > 1 and name not in SHARED_NAMES}
+    assert not shared
 
 
 def test_modules_import_each_other_in_one_direction() -> None:
-    ours = {module_of(path): path for path in FILES if path.name != "__init__.py"}
+    ours = {module_of(path): path for path in FILES if path.parent != SOURCES or path.name != "__init__.py"}
+    # Everywhere in a file: what a function imports late is a circle all the same.
     waiting = {module: {m for m in imports_of(path) if m in ours} for module, path in ours.items()}
     while free := {module for module, needs in waiting.items() if not needs & set(waiting)}:
         waiting = {module: needs for module, needs in waiting.items() if module not in free}
-    assert not waiting, "these import each other in a circle"
+    assert not waiting, f"in a circle, or behind one: {sorted(waiting)}"
 
 
 @pytest.mark.parametrize("package", OPTIONAL)
