@@ -1,7 +1,4 @@
-"""A fixed number of frames, spread evenly over many scenes, the same on every machine.
-
-Photos of one scene with their poses: which are a photo's second views, and the case that it makes.
-"""
+"""Photos of one scene with their poses: a choice of them, their second views, and the cases that they make."""
 
 from __future__ import annotations
 
@@ -9,9 +6,9 @@ import dataclasses
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,77 +16,8 @@ from numpy.typing import NDArray
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.evaluation.case import Case, Points, SecondView
+from spackle.evaluation.case import Case, SecondView
 from spackle.evaluation.datasets.colmap import Model
-
-T = TypeVar("T")
-
-
-def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[T]], count: int) -> list[tuple[str, T]]:
-    """At most `count` frames, as many from each scene as there is room for.
-
-    Names alone seed the choice: the scenes are taken in the order of their hashed names, and `GROUP/REST` in
-    turns by group, so that no group is favoured. With more scenes than frames, the first scenes give one each.
-    With fewer, all give the same number, or all they have; within a scene the frames stand at equal distances,
-    from a start that the scene's name decides.
-
-    Args:
-        scenes: names, no two alike.
-        frames: a scene's frames in their order; asked only for scenes that are used.
-        count: how many frames are wanted in all.
-
-    Returns:
-        (scene, frame), by the order of `scenes`, then of the scene's frames.
-    """
-    order = _in_turns(scenes)
-    if len(order) >= count:
-        order = order[:count]
-    held = {scene: frames(scene) for scene in order}
-    shares = _shares({scene: len(held[scene]) for scene in order}, count)
-    return [
-        (scene, frame) for scene in scenes if scene in held for frame in _equally(held[scene], shares[scene], scene)
-    ]
-
-
-def frames_of(scene: str, picked: Sequence[tuple[str, T]]) -> list[T]:
-    """What `spread` took of one scene."""
-    return [frame for name, frame in picked if name == scene]
-
-
-def _in_turns(scenes: Sequence[str]) -> list[str]:
-    """Round after round, one scene of each group."""
-    groups: dict[str, list[str]] = {}
-    for scene in sorted(scenes, key=_hash):
-        groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
-    rounds = [(place, _hash(group), scene) for group, names in groups.items() for place, scene in enumerate(names)]
-    return [scene for _, _, scene in sorted(rounds)]
-
-
-def _shares(sizes: dict[str, int], count: int) -> dict[str, int]:
-    """How many each gives: what is left is divided evenly until it is gone, or nobody has more."""
-    shares = dict.fromkeys(sizes, 0)
-    left = min(count, sum(sizes.values()))
-    while left:
-        open_ = [name for name in sizes if shares[name] < sizes[name]]
-        each = max(1, left // len(open_))
-        for name in open_[:left]:
-            more = min(each, sizes[name] - shares[name])
-            shares[name] += more
-            left -= more
-    return shares
-
-
-def _equally(frames: Sequence[T], count: int, seed: str) -> list[T]:
-    """`count` frames at equal distances."""
-    if not count:
-        return []
-    start = _hash(seed) % len(frames) / len(frames)
-    return [frames[int((place + start) * len(frames) / count)] for place in range(count)]
-
-
-def _hash(name: str) -> int:
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
-
 
 MAX_SECONDS = 3
 BASELINES = (0.05, 0.25)  # of the photo's middle depth; a rectified pair of Middlebury's has 0.05 to 0.2
@@ -106,6 +34,42 @@ class Posed:
     camera: Camera  # world of the scene, float64
     depth: float  # in the middle of what it sees; nan where that is not known
     ids: NDArray[Any] | None = None  # of the points that it sees
+
+
+def posed_by(model: Model, names: Sequence[str], photos: Sequence[Path]) -> list[Posed]:
+    """The views of a model with the photo files that they stand for, all in the same order."""
+    posed = []
+    for view, name, photo in zip(model.views, names, photos, strict=True):
+        z = model.points(view).z
+        posed.append(Posed(name, photo, view.camera, float(z.median()) if len(z) else math.nan, view.ids))
+    return posed
+
+
+def check_two(scene: Path, count: int) -> None:
+    """InputError where a scene has no second photo."""
+    if count < 2:
+        raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
+
+
+def make_cases(
+    views: Sequence[Posed],
+    wanted: Iterable[int] | None = None,
+    *,
+    model: Model | None = None,
+    bounds: Mapping[Path, tuple[float, float]] | None = None,
+    metric: bool = False,
+) -> list[Case]:
+    """Photos as cases, their second views in their own frames.
+
+    Args:
+        views: all photos of a scene.
+        wanted: which of them become cases; all where None.
+        model: where the views' points are; its views are in the order of `views`.
+        bounds: nearest and farthest depth by photo, where known.
+        metric: the poses' lengths are metres.
+    """
+    chosen = near_views(views, range(len(views)) if wanted is None else wanted)
+    return [_make_case(views, index, others, model, bounds or {}, metric) for index, others in chosen.items()]
 
 
 def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple[int, ...]]:
@@ -132,59 +96,6 @@ def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple
     return chosen
 
 
-def make_case(
-    views: Sequence[Posed],
-    index: int,
-    seconds: Sequence[int],
-    *,
-    model: Model | None = None,
-    bounds: tuple[float, float] | None = None,
-    metric: bool = False,
-) -> Case:
-    """A photo as a case, its second views in its own frame.
-
-    Args:
-        model: where the views' points are; its views are in the order of `views`.
-    """
-    view = views[index]
-    own = view.camera.world_to_camera
-
-    def beside(other: Posed) -> SecondView:
-        relative = other.camera.world_to_camera @ torch.linalg.inv(own)
-        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
-        return SecondView(other.name, other.photo, camera)
-
-    def points() -> Points:
-        assert model is not None
-        return model.points(model.views[index])
-
-    camera = dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32)
-    return Case(
-        view.name,
-        view.photo,
-        camera,
-        points=None if model is None or not len(model.views[index].ids) else points,
-        bounds=bounds,
-        seconds=tuple(beside(views[other]) for other in seconds),
-        metric=metric,
-    )
-
-
-def posed_by(model: Model, names: Sequence[str], photos: Sequence[Path]) -> list[Posed]:
-    """The views of a model with the photo files that they stand for, all in the same order."""
-    posed = []
-    for view, name, photo in zip(model.views, names, photos, strict=True):
-        z = model.points(view).z
-        posed.append(Posed(name, photo, view.camera, float(z.median()) if len(z) else math.nan, view.ids))
-    return posed
-
-
-def check_two(scene: Path, count: int) -> None:
-    """InputError where a scene has no second photo."""
-    if count < 2:
-        raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
-
-
 def _sees_the_same(view: Posed, other: Posed) -> bool:
     if view.ids is not None and other.ids is not None:
         return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
@@ -198,3 +109,88 @@ def _has_middle_of(view: Posed, other: Posed) -> bool:
     uv, z = view.camera.project(camera.unproject(middle, torch.tensor(other.depth, dtype=torch.float64)))
     size = torch.tensor([view.camera.width, view.camera.height])
     return bool((z > 0) & (uv >= 0).all() & (uv <= size).all())
+
+
+def _make_case(
+    views: Sequence[Posed],
+    index: int,
+    seconds: Sequence[int],
+    model: Model | None,
+    bounds: Mapping[Path, tuple[float, float]],
+    metric: bool,
+) -> Case:
+    view = views[index]
+    to_world = torch.linalg.inv(view.camera.world_to_camera)
+
+    def beside(other: Posed) -> SecondView:
+        relative = other.camera.world_to_camera @ to_world
+        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
+        return SecondView(other.name, other.photo, camera)
+
+    points = None
+    if model is not None and len(model.views[index].ids):
+        points = lambda: model.points(model.views[index])  # noqa: E731
+    return Case(
+        view.name,
+        view.photo,
+        dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32),
+        points=points,
+        bounds=bounds.get(view.photo),
+        seconds=tuple(beside(views[other]) for other in seconds),
+        metric=metric,
+    )
+
+
+def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
+    """At most `count` frames, as many from each scene as there is room for; the same on every machine.
+
+    Names alone seed the choice: the scenes are taken in the order of their hashed names, and `GROUP/REST` in
+    turns by group, so that no group is favoured. With more scenes than frames, the first scenes give one each.
+    With fewer, all give the same number, or all they have; within a scene the frames stand at equal distances,
+    from a start that the scene's name decides.
+
+    Args:
+        scenes: names, no two alike.
+        frames: a scene's frames in their order; asked only for scenes that are used.
+        count: how many frames are wanted in all.
+
+    Returns:
+        Scenes in the order of `scenes`, each with its frames in their order; those that are not used are left out.
+    """
+    order = _in_turns(scenes)[:count]
+    held = {scene: frames(scene) for scene in order}
+    shares = _shares({scene: len(held[scene]) for scene in order}, count)
+    return {scene: _equally(held[scene], shares[scene], scene) for scene in scenes if scene in held}
+
+
+def _in_turns(scenes: Sequence[str]) -> list[str]:
+    """Round after round, one scene of each group."""
+    groups: dict[str, list[str]] = {}
+    for scene in sorted(scenes, key=_hash):
+        groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
+    rounds = [(place, _hash(group), scene) for group, names in groups.items() for place, scene in enumerate(names)]
+    return [scene for _, _, scene in sorted(rounds)]
+
+
+def _shares(sizes: dict[str, int], count: int) -> dict[str, int]:
+    """How many each gives: what is left is divided evenly until it is gone, or nobody has more."""
+    shares = dict.fromkeys(sizes, 0)
+    left = min(count, sum(sizes.values()))
+    while left:
+        open_ = [name for name in sizes if shares[name] < sizes[name]]
+        each = max(1, left // len(open_))
+        for name in open_[:left]:
+            more = min(each, sizes[name] - shares[name])
+            shares[name] += more
+            left -= more
+    return shares
+
+
+def _equally(frames: Sequence[int], count: int, seed: str) -> list[int]:
+    """`count` frames at equal distances."""
+    start = _hash(seed) % len(frames) / len(frames) if count else 0
+    return [frames[int((place + start) * len(frames) / count)] for place in range(count)]
+
+
+def _hash(name: str) -> int:
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")

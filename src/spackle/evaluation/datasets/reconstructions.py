@@ -1,9 +1,4 @@
-"""ETH3D: high-resolution photos with COLMAP models in metres, and rectified grey pairs.
-
-Tanks and Temples: video frames of large scenes, with COLMAP models.
-
-LLFF: eight scenes, photographed by hand from a grid of places that face them.
-"""
+"""Photos with COLMAP models, or with LLFF's table of poses: ETH3D, Tanks and Temples, LLFF."""
 
 from __future__ import annotations
 
@@ -20,10 +15,12 @@ from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
 from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
-from spackle.evaluation.datasets.multiview import Posed, check_two, frames_of, make_case, near_views, posed_by, spread
+from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
 from spackle.evaluation.datasets.stereo import TRUTHS_2014, pair_of_2014
 
-CALIBRATION = "dslr_calibration_undistorted"
+ETH3D_MODEL = "dslr_calibration_undistorted"
+LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that is there
+LLFF_BOUNDS = "poses_bounds.npy"
 
 
 class Eth3d:
@@ -51,16 +48,14 @@ class Eth3d:
 
 
 def _photos_of(scene: Path) -> list[Case]:
-    folder = scene / CALIBRATION
+    folder = scene / ETH3D_MODEL
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
     model = read_model(folder)
     check_two(scene, len(model.views))
     photos = [_photo(scene, view.name) for view in model.views]
     names = [f"{scene.name}/{Path(view.name).stem}" for view in model.views]
-    views = posed_by(model, names, photos)
-    seconds = near_views(views, range(len(views)))
-    return [make_case(views, index, others, model=model, metric=True) for index, others in seconds.items()]
+    return make_cases(posed_by(model, names, photos), model=model, metric=True)
 
 
 def _photo(scene: Path, name: str) -> Path:
@@ -77,8 +72,8 @@ def _photo(scene: Path, name: str) -> Path:
 def _pair_of(scene: Path) -> Case:
     """The truth lies beside the photos, or in the folder that its own archive makes."""
     apart = scene.parent.parent / "two_view_training_gt" / scene.name
-    truth = next((at / name for at in (scene, apart) for name in TRUTHS_2014 if (at / name).is_file()), None)
-    return pair_of_2014(scene, truth)
+    places = [at / name for at in (scene, apart) for name in TRUTHS_2014]
+    return pair_of_2014(scene, next((place for place in places if place.is_file()), None))
 
 
 class Tanks:
@@ -101,21 +96,16 @@ class Tanks:
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo that is taken; see `EvalDataset`."""
         scenes = by_name(scene_folders(root, self.name))
-        read = {name: _read(scene) for name, scene in scenes.items()}
+        read = {name: _read_tanks(scene) for name, scene in scenes.items()}
         picked = spread(list(scenes), lambda name: range(len(read[name][1])), self.paper_images)
         return [
             case
             for name, (model, views) in read.items()
-            for case in _tanks_cases(model, views, frames_of(name, picked))
+            for case in make_cases(views, picked.get(name, []), model=model)
         ]
 
 
-def _tanks_cases(model: Model, views: list[Posed], wanted: list[int]) -> list[Case]:
-    seconds = near_views(views, wanted)
-    return [make_case(views, index, others, model=model) for index, others in seconds.items()]
-
-
-def _read(scene: Path) -> tuple[Model, list[Posed]]:
+def _read_tanks(scene: Path) -> tuple[Model, list[Posed]]:
     folder = model_folder(scene)
     model = read_model(folder)
     check_two(scene, len(model.views))
@@ -128,12 +118,8 @@ def _read(scene: Path) -> tuple[Model, list[Posed]]:
     return model, posed_by(model, names, photos)
 
 
-PHOTO_FOLDERS = ("images_4", "images", "images_8")  # the first that is there
-BOUNDS_FILE = "poses_bounds.npy"
-
-
 class Llff:
-    """Scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
+    """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
     bounds only where it has no points. Its photos' names need not be the files': those are matched by name, else by
@@ -154,37 +140,30 @@ class Llff:
 
 
 def _llff_cases(scene: Path) -> list[Case]:
-    photos = next((found for name in PHOTO_FOLDERS if (found := photo_files(scene / name))), None)
+    photos = next((found for name in LLFF_PHOTOS if (found := photo_files(scene / name))), None)
     if photos is None:
-        raise InputError(f"{scene}: no photos: expected them in {', '.join(PHOTO_FOLDERS)}")
+        raise InputError(f"{scene}: no photos: expected them in {', '.join(LLFF_PHOTOS)}")
     check_two(scene, len(photos))
-    table = read_bounds(scene / BOUNDS_FILE, len(photos)) if (scene / BOUNDS_FILE).is_file() else None
-    bounds: list[tuple[float, float] | None] = [None] * len(photos)
-    if table is not None:
-        bounds = [(float(near), float(far)) for near, far in table[:, 15:]]
+    table = _read_bounds(scene / LLFF_BOUNDS, len(photos)) if (scene / LLFF_BOUNDS).is_file() else None
+    bounds = (
+        {} if table is None else {p: (float(row[15]), float(row[16])) for p, row in zip(photos, table, strict=True)}
+    )
     model = read_model(model_folder(scene)) if (scene / "sparse").is_dir() else None
     if model is not None:
         check_two(scene, len(model.views))
         files = _match(scene, [view.name for view in model.views], photos)
-        views = posed_by(model, [_name(scene, file) for file in files], files)
-        bounds = [bounds[photos.index(file)] for file in files]
-    else:
-        assert table is not None  # a scene has one or the other
-        views = [_posed(scene, photo, row) for photo, row in zip(photos, table, strict=True)]
-    return _all(views, model, bounds)
+        views = posed_by(model, [f"{scene.name}/{file.stem}" for file in files], files)
+        return make_cases(views, model=model, bounds=bounds)
+    assert table is not None  # a scene has one or the other
+    views = []
+    for photo, row in zip(photos, table, strict=True):
+        near, far = bounds[photo]
+        views.append(Posed(f"{scene.name}/{photo.stem}", photo, _camera_of_row(row), 2 / (1 / near + 1 / far)))
+    return make_cases(views, bounds=bounds)
 
 
-def _all(views: list[Posed], model: Model | None, bounds: Sequence[tuple[float, float] | None]) -> list[Case]:
-    seconds = near_views(views, range(len(views)))
-    return [make_case(views, index, others, model=model, bounds=bounds[index]) for index, others in seconds.items()]
-
-
-def read_bounds(path: Path, count: int) -> NDArray[Any]:
-    """[count, 17]: for each photo by name a 3×5 matrix and its nearest and farthest depth.
-
-    Raises:
-        InputError: another table, or one for another number of photos.
-    """
+def _read_bounds(path: Path, count: int) -> NDArray[Any]:
+    """[count, 17]: for each photo by name a 3×5 matrix and its nearest and farthest depth."""
     try:
         table: NDArray[Any] = np.load(path, allow_pickle=False)
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f" or not np.isfinite(table).all():
@@ -199,7 +178,7 @@ def read_bounds(path: Path, count: int) -> NDArray[Any]:
     return table
 
 
-def camera_of_row(row: NDArray[Any]) -> Camera:
+def _camera_of_row(row: NDArray[Any]) -> Camera:
     """A row of `poses_bounds.npy` as a camera, float64.
 
     Its matrix is camera-to-world with the columns down, right, backwards; then the eye; then height, width and focal
@@ -214,11 +193,6 @@ def camera_of_row(row: NDArray[Any]) -> Camera:
     return Camera(K, torch.linalg.inv(pose), round(width), round(height))
 
 
-def _posed(scene: Path, photo: Path, row: NDArray[Any]) -> Posed:
-    near, far = float(row[15]), float(row[16])
-    return Posed(_name(scene, photo), photo, camera_of_row(row), 2 / (1 / near + 1 / far))
-
-
 def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
     """The file of each photo of the model; its suffix may differ (JPEG made of PNG)."""
     stems = {photo.stem: photo for photo in photos}
@@ -230,7 +204,3 @@ def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Pa
             "under other names: unpack the scene again"
         )
     return list(photos)
-
-
-def _name(scene: Path, photo: Path) -> str:
-    return f"{scene.name}/{photo.stem}"

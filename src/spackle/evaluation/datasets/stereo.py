@@ -1,13 +1,7 @@
-"""Rectified pairs: Middlebury's calib.txt, and disparities as depth.
-
-Middlebury stereo: the sets of 2014, and of 2001, 2003, 2005 and 2006.
-
-Booster: stereo at 12 megapixels of scenes with glass and mirrors.
-"""
+"""Rectified pairs: Middlebury and Booster, with disparities as depth."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import re
@@ -33,6 +27,14 @@ MAX_TEXT_BYTES = 1 << 16
 # to half a pixel only; the pair does not notice, because both cameras move alike.)
 HALF_PIXEL = 0.5
 TRUTHS_2014 = ("disp0GT.pfm", "disp0.pfm")  # MiddEval3 and ETH3D; the sets as they were published
+# Published for the sets of 2005 and 2006 at full size, height 1110; nearly exact, the site says.
+FOCAL_2006, BASELINE_2006, HEIGHT_2006 = 3740.0, 0.160, 1110
+# Of the sets of 2001 and 2003 only the disparities are known. Any lens makes the pair exact, with its own depth; these
+# numbers, for 450 pixels of width, give depths like those of the later sets.
+FOCAL_OLD, BASELINE_OLD, DOFFS_OLD, WIDTH_OLD = 1000.0, 0.1, 30.0, 450
+SCALE_2001 = 8  # grey levels a pixel of disparity
+WIDTH_2003_FULL = 1800  # Cones and Teddy: 450, 900 or 1800 wide, 4, 2 or 1 grey levels a pixel
+LIGHT_2006 = "Illum2/Exp1"  # in the archives with seven views and all lights
 
 
 class BrokenPhoto(InputError):
@@ -46,6 +48,13 @@ class Pair:
     left: Camera  # at the world's origin
     doffs: float  # the right principal point's x minus the left one's, pixels
     baseline: float  # the right eye stands this far to the right; the unit is the dataset's length
+
+    @staticmethod
+    def of(lens: tuple[float, float, float], doffs: float, baseline: float, size: tuple[int, int]) -> Pair:
+        """From (focal, cx, cy) in pixels with centres at half-integers, and (width, height)."""
+        focal, cx, cy = lens
+        matrix = torch.tensor([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+        return Pair(Camera(matrix, torch.eye(4), *size), doffs, baseline)
 
     @property
     def right(self) -> Camera:
@@ -61,6 +70,8 @@ class Pair:
         Args:
             disparity: [H, W] as stored, `unit` pixels each.
             known: [H, W].
+            unit: pixels.
+            path: for messages.
         """
         reach = self.left.focal[0] * self.baseline
         with np.errstate(all="ignore"):  # what is not known may be anything
@@ -83,22 +94,22 @@ class Pair:
         return Case(name, photos[0], self.left, depth=depth, seconds=(right,), metric=metric)
 
 
-def make_pair(K: tuple[float, float, float], doffs: float, baseline: float, size: tuple[int, int]) -> Pair:
-    """From (focal, cx, cy) in pixels with centres at half-integers, and (width, height)."""
-    focal, cx, cy = K
-    matrix = torch.tensor([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-    return Pair(Camera(matrix, torch.eye(4), *size), doffs, baseline)
+def pair_of_2014(folder: Path, truth: Path | None = None) -> Case:
+    """A folder in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
+    calib = folder / "calib.txt"
+    pair = _read_calib(calib)
+    found = [at for at in (truth, *(folder / name for name in TRUTHS_2014)) if at is not None and at.is_file()]
+    if not found:
+        raise InputError(f"{folder}: no {' or '.join(TRUTHS_2014)}: unpack the ground truth, or leave test scenes out")
+
+    def depth() -> DepthMap:
+        return dataclasses.replace(load_depth(found[0], calib=calib), K=pair.left.K)
+
+    return pair.case(folder.name, (folder / "im0.png", folder / "im1.png"), depth, metric=True)
 
 
-def read_calib(path: Path) -> Pair:
-    """Middlebury's `calib.txt`: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline in mm, width, height.
-
-    Returns:
-        The pair in metres.
-
-    Raises:
-        InputError: a file that is missing or says something else.
-    """
+def _read_calib(path: Path) -> Pair:
+    """Middlebury's `calib.txt`, in metres: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline in mm, width, height."""
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
     facts = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", read_text(path, "calibration"), re.MULTILINE))
     try:
@@ -111,23 +122,7 @@ def read_calib(path: Path) -> Pair:
         ) from error
     if not (focal > 0 and baseline > 0 and min(size) > 0):
         raise InputError(f"{path}: focal length, baseline and size must be positive: the file is damaged")
-    return make_pair((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), doffs, baseline, size)
-
-
-def pair_of_2014(folder: Path, truth: Path | None = None) -> Case:
-    """A folder in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
-    calib = folder / "calib.txt"
-    pair = read_calib(calib)
-    if truth is None:
-        truth = next((folder / name for name in TRUTHS_2014 if (folder / name).is_file()), None)
-    if truth is None:
-        raise InputError(f"{folder}: no {' or '.join(TRUTHS_2014)}: unpack the ground truth, or leave test scenes out")
-    at = truth
-
-    def depth() -> DepthMap:
-        return dataclasses.replace(load_depth(at, calib=calib), K=pair.left.K)
-
-    return pair.case(folder.name, (folder / "im0.png", folder / "im1.png"), depth, metric=True)
+    return Pair.of((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), doffs, baseline, size)
 
 
 def read_text(path: Path, kind: str, at_most: int = MAX_TEXT_BYTES) -> str:
@@ -137,7 +132,7 @@ def read_text(path: Path, kind: str, at_most: int = MAX_TEXT_BYTES) -> str:
     return path.read_text(encoding="utf-8", errors="replace")
 
 
-def picture_size(path: Path) -> tuple[int, int]:
+def _picture_size(path: Path) -> tuple[int, int]:
     """(width, height) from a picture's header; BrokenPhoto where it cannot be read, InputError where it is missing."""
     try:
         return read_image(path, lambda image: (image.width, image.height))
@@ -145,28 +140,6 @@ def picture_size(path: Path) -> tuple[int, int]:
         if path.exists():
             raise BrokenPhoto(str(error)) from error
         raise
-
-
-def read_levels(path: Path) -> NDArray[Any]:
-    """The whole numbers [H, W] of a grey picture, as stored."""
-
-    def levels(image: Any) -> NDArray[Any]:
-        if image.mode not in ("L", "I", "I;16", "I;16B", "RGB"):
-            raise InputError(f"{path}: pixels of mode {image.mode} are no disparities: give the dataset's own file")
-        values = np.asarray(image)
-        return values if values.ndim == 2 else values[..., 0]  # grey that was saved as colour
-
-    return read_image(path, levels)
-
-
-# Published for the sets of 2005 and 2006 at full size, height 1110; nearly exact, the site says.
-FOCAL_2006, BASELINE_2006, HEIGHT_2006 = 3740.0, 0.160, 1110
-# Of the sets of 2001 and 2003 only the disparities are known. Any lens makes the pair exact, with its own depth; these
-# numbers, for 450 pixels of width, give depths like those of the later sets.
-FOCAL_OLD, BASELINE_OLD, DOFFS_OLD, WIDTH_OLD = 1000.0, 0.1, 30.0, 450
-SCALE_2001 = 8  # grey levels a pixel of disparity
-WIDTH_2003_FULL = 1800  # Cones and Teddy: 450, 900 or 1800 wide, 4, 2 or 1 grey levels a pixel
-LIGHT_2006 = "Illum2/Exp1"  # in the archives with seven views and all lights
 
 
 class Middlebury:
@@ -189,31 +162,28 @@ class Middlebury:
         folders = scene_folders(root, self.name)
         perfect = {folder.name for folder in folders}
         kept = [f for f in folders if f.name.replace("-imperfect", "-perfect") not in perfect - {f.name}]
-        return [_case(folder) for folder in by_name(kept).values()]
+        return [_middlebury_case(folder) for folder in by_name(kept).values()]
 
 
-def _case(folder: Path) -> Case:
+def _middlebury_case(folder: Path) -> Case:
+    def has(*names: str) -> bool:
+        return any((folder / name).is_file() for name in names)
+
     try:
-        return _readable(folder)
+        if has("calib.txt", "im0.png"):
+            return pair_of_2014(folder)
+        if has("scene.json"):
+            return _described(folder)
+        return _of_2006(folder) if has("disp1.png", "view1.png") else _of_2003(folder)
     except BrokenPhoto as error:
         return Case(folder.name, folder, problem=str(error))
-
-
-def _readable(folder: Path) -> Case:
-    if (folder / "calib.txt").is_file() or (folder / "im0.png").is_file():
-        return pair_of_2014(folder)
-    if (folder / "scene.json").is_file():
-        return _described(folder)
-    if (folder / "disp1.png").is_file() or (folder / "view1.png").is_file():
-        return _of_2006(folder)
-    return _of_2003(folder)
 
 
 def _of_2006(folder: Path) -> Case:
     """Grey level 0 is unknown; levels and dmin are pixels of the full size."""
     photos = folder if (folder / "view1.png").is_file() else folder / LIGHT_2006
-    left, right, truth = photos / "view1.png", photos / "view5.png", folder / "disp1.png"
-    width, height = picture_size(left)
+    left, right = photos / "view1.png", photos / "view5.png"
+    width, height = _picture_size(left)
     shrink = round(HEIGHT_2006 / height)
     if abs(height * shrink - HEIGHT_2006) > shrink or not 1 <= shrink <= 3:
         raise InputError(f"{left}: {height} pixels high: expected 1110, 555 or 370, as the sets of 2005 and 2006 are")
@@ -222,28 +192,35 @@ def _of_2006(folder: Path) -> Case:
     except ValueError as error:
         raise InputError(f"{folder / 'dmin.txt'}: not a number: unpack the scene again") from error
     lens = FOCAL_2006 / shrink, width / 2, height / 2
-    pair = make_pair(lens, dmin / shrink, BASELINE_2006, (width, height))
-    return pair.case(folder.name, (left, right), lambda: _levels(pair, truth, 1 / shrink), metric=True)
+    pair = Pair.of(lens, dmin / shrink, BASELINE_2006, (width, height))
+    return pair.case(folder.name, (left, right), lambda: _levels(pair, folder / "disp1.png", 1 / shrink), metric=True)
 
 
 def _of_2003(folder: Path) -> Case:
     """Also 2001: grey level 0 is unknown; the width tells how many levels a pixel has."""
     suffix = ".ppm" if (folder / "im2.ppm").is_file() else ".png"
     left, right = folder / f"im2{suffix}", folder / f"im6{suffix}"
-    truth = next((folder / name for name in ("disp2.pgm", "disp2.png") if (folder / name).is_file()), None)
-    if truth is None:
+    truths = [folder / name for name in ("disp2.pgm", "disp2.png") if (folder / name).is_file()]
+    if not truths:
         raise InputError(f"{folder}: no disp2.pgm or disp2.png: unpack the whole scene")
-    at = truth
-    width, height = picture_size(left)
+    width, height = _picture_size(left)
     scale = WIDTH_2003_FULL // width if width in (450, 900, 1800) else SCALE_2001
     size = width / WIDTH_OLD
     lens = FOCAL_OLD * size, width / 2, height / 2
-    pair = make_pair(lens, DOFFS_OLD * size, BASELINE_OLD, (width, height))
-    return pair.case(folder.name, (left, right), lambda: _levels(pair, at, 1 / scale), metric=False)
+    pair = Pair.of(lens, DOFFS_OLD * size, BASELINE_OLD, (width, height))
+    return pair.case(folder.name, (left, right), lambda: _levels(pair, truths[0], 1 / scale), metric=False)
 
 
 def _levels(pair: Pair, path: Path, unit: float) -> DepthMap:
-    stored = read_levels(path)
+    """The whole numbers of a grey picture as disparities of `unit` pixels each."""
+
+    def levels(image: Any) -> NDArray[Any]:
+        if image.mode not in ("L", "I", "I;16", "I;16B", "RGB"):
+            raise InputError(f"{path}: pixels of mode {image.mode} are no disparities: give the dataset's own file")
+        values = np.asarray(image)
+        return values if values.ndim == 2 else values[..., 0]  # grey that was saved as colour
+
+    stored = read_image(path, levels)
     return pair.depth(stored, stored > 0, unit, path)
 
 
@@ -258,15 +235,12 @@ def _described(folder: Path) -> Case:
         raise InputError(
             f"{path}: not a scene description: needs the photos, the disparity map and the lens"
         ) from error
-    pair = make_pair((focal, cx, cy), doffs, baseline, picture_size(left))
+    pair = Pair.of((focal, cx, cy), doffs, baseline, _picture_size(left))
     return pair.case(folder.name, (left, right), lambda: load_depth(truth, calib=path), metric=False)
 
 
-CALIBRATION = "calib_00-02.xml"
-
-
 class Booster:
-    """The balanced training scenes: each photo of the left camera (one a light) is a case.
+    """Stereo at 12 megapixels of scenes with glass and mirrors: each photo of a left camera (one a light) is a case.
 
     `train/balanced/SCENE/camera_00/im*.png` at 4112×3008, the right photo of the same name in `camera_02`, one
     `disp_00.npy` and one `calib_00-02.xml` (OpenCV: proj_matL, proj_matR, baselineLR in millimetres) for all lights.
@@ -281,24 +255,29 @@ class Booster:
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo of a left camera; see `EvalDataset`."""
-        return [case for scene in by_name(scene_folders(root, self.name)).values() for case in _cases(scene)]
+        return [case for scene in by_name(scene_folders(root, self.name)).values() for case in _booster_cases(scene)]
 
 
-def _cases(scene: Path) -> list[Case]:
+def _booster_cases(scene: Path) -> list[Case]:
     photos = photo_files(scene / "camera_00")
     if not photos:
         raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
-    try:
-        size = _first_size(photos)
-    except BrokenPhoto as error:
-        return [Case(f"{scene.name}/{photo.stem}", photo, problem=str(error)) for photo in photos]
-    pair = _pair(scene / CALIBRATION, size)
+    size, problems = None, []
+    for photo in photos:  # all of a scene are of one size
+        try:
+            size = _picture_size(photo)
+            break
+        except BrokenPhoto as error:
+            problems.append(str(error))
+    if size is None:
+        return [Case(f"{scene.name}/{p.stem}", p, problem=why) for p, why in zip(photos, problems, strict=True)]
+    pair = _read_opencv(scene / "calib_00-02.xml", size)
     truth = scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
 
     def depth() -> DepthMap:
-        stored = _read(truth)
+        stored = _read_disparities(truth)
         return pair.depth(stored, np.isfinite(stored) & (stored > 0), 1.0, truth)
 
     def case(photo: Path) -> Case:
@@ -308,19 +287,16 @@ def _cases(scene: Path) -> list[Case]:
     return [case(photo) for photo in photos]
 
 
-def _first_size(photos: Sequence[Path]) -> tuple[int, int]:
-    """Of the first photo that can be read: all of a scene are of one size."""
-    for photo in photos[:-1]:
-        with contextlib.suppress(BrokenPhoto):
-            return picture_size(photo)
-    return picture_size(photos[-1])
-
-
-def _pair(path: Path, size: tuple[int, int]) -> Pair:
+def _read_opencv(path: Path, size: tuple[int, int]) -> Pair:
     text = read_text(path, "calibration")
+
+    def matrix(entry: ElementTree.Element) -> NDArray[np.float64]:
+        rows, columns = (int(entry.findtext(name, "")) for name in ("rows", "cols"))
+        return np.array(entry.findtext("data", "").split(), np.float64).reshape(rows, columns)
+
     try:
         entries = {entry.tag: entry for entry in ElementTree.fromstring(text)}
-        left, right = (_matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
+        left, right = (matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
         baseline = float(entries["baselineLR"].text or "") / 1000
         focal, cx, cy = float(left[0, 0]), float(left[0, 2]), float(left[1, 2])
         if not (focal > 0 and baseline > 0):
@@ -329,16 +305,10 @@ def _pair(path: Path, size: tuple[int, int]) -> Pair:
         raise InputError(
             f"{path}: not a Booster calibration ({reason_in_a_line(error)}): needs proj_matL, proj_matR and baselineLR"
         ) from error
-    return make_pair((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), float(right[0, 2]) - cx, baseline, size)
+    return Pair.of((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), float(right[0, 2]) - cx, baseline, size)
 
 
-def _matrix(entry: ElementTree.Element) -> NDArray[np.float64]:
-    """OpenCV's <rows>, <cols>, <data>."""
-    rows, columns = (int(entry.findtext(name, "")) for name in ("rows", "cols"))
-    return np.array(entry.findtext("data", "").split(), np.float64).reshape(rows, columns)
-
-
-def _read(path: Path) -> NDArray[Any]:
+def _read_disparities(path: Path) -> NDArray[Any]:
     """Float disparities [H, W]; nothing is unpickled."""
     try:
         stored: NDArray[Any] = np.load(path, allow_pickle=False)

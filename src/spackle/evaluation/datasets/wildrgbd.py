@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.depth_map import load_depth
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.folders import by_name, scene_folders
-from spackle.evaluation.datasets.multiview import Posed, check_two, frames_of, make_case, near_views, spread
+from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL, read_text
 
 MAX_POSES_BYTES = 1 << 24
@@ -50,12 +50,7 @@ class WildRgbd:
             return range(len(read[name]))
 
         picked = spread(sorted(scenes), frames, self.paper_images)
-        return [case for name in sorted(read) for case in _cases(read[name], frames_of(name, picked))]
-
-
-def _cases(views: list[Posed], wanted: list[int]) -> list[Case]:
-    seconds = near_views(views, wanted)
-    return [_with_depth(make_case(views, index, others, metric=True)) for index, others in seconds.items()]
+        return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
 
 
 def _scene_name(folder: Path) -> str:
@@ -70,13 +65,9 @@ def _with_depth(case: Case) -> Case:
     at = case.photo.parent.parent / "depth" / case.photo.name
     if not at.is_file():
         raise InputError(f"{at}: no such depth map, but {case.photo} is there: unpack the scene again")
-    camera = case.camera
-    assert camera is not None
-
-    def depth() -> DepthMap:
-        return dataclasses.replace(load_depth(at), K=camera.K)
-
-    return dataclasses.replace(case, depth=depth)
+    assert case.camera is not None
+    K = case.camera.K
+    return dataclasses.replace(case, depth=lambda: dataclasses.replace(load_depth(at), K=K))
 
 
 def _views(name: str, scene: Path) -> list[Posed]:
