@@ -27,6 +27,7 @@ test: $(VENV)/.installed
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow || test $$? -eq 5  # 5: nothing is marked
+	$(BIN)/python -m pytest -m "slow or not slow" research/lite/tests
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

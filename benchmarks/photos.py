@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import torch
+from method import colored, ends, sheet
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -22,7 +23,6 @@ from spackle.formats import save_png
 from spackle.image import load_photo, resize_photo
 from spackle.render.protocol import Rendering
 from spackle.scene import complete, scene_path
-from spackle.training.depth.pictures import colored, ends, sheet
 
 RED = torch.tensor([0.85, 0.1, 0.1])
 FRAMES = 60

@@ -26,11 +26,13 @@ from spackle.device import PRECISIONS, pick_dtype
 from spackle.machine import hardware
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet
-from spackle.training.cache import Cache, load_sample
+from spackle.training.data import Cache
 from spackle.training.features import FeatureNet, ResNet50, SqueezeNet
+from spackle.training.method import Objective
 from spackle.training.recipe import LossRecipe
+from spackle.training.residual_method import complete_samples
+from spackle.training.sample import load_sample
 from spackle.training.sources import Composites
-from spackle.training.validation import Judge
 
 PHOTOS = ("astronaut", "coffee", "chelsea", "rocket")
 STAGES = ("load", "network", "compose + render", "losses", "backward", "optimiser")
@@ -53,7 +55,7 @@ def make_samples(folder: Path, count: int, cells: int) -> list[Path]:
 class Step:
     """One step after another, on the same network."""
 
-    def __init__(self, judge: Judge) -> None:
+    def __init__(self, judge: Objective) -> None:
         torch.manual_seed(0)
         self.judge = judge
         self.network = ResidualNet().to(judge.device, memory_format=torch.channels_last)
@@ -73,7 +75,7 @@ class Step:
         self.marks = []
         self.mark()
         samples = [load_sample(file) for file in files]
-        batch = self.judge.complete(self.network, samples)
+        batch = complete_samples(self.network, samples, self.judge.renderer, self.judge.precision)
         self.mark()
         loss, _ = self.judge.total(batch)
         self.mark()
@@ -109,7 +111,7 @@ def main() -> None:
     if options.features != "none":
         features = (SqueezeNet() if options.features == "squeezenet" else ResNet50()).to(device)
     dtype = pick_dtype(options.precision, device)
-    judge = Judge(LossRecipe(feature_size=options.feature_size), features, get_renderer(), dtype, device)
+    judge = Objective(LossRecipe(feature_size=options.feature_size), features, get_renderer(), dtype, device)
     with tempfile.TemporaryDirectory() as folder:
         files = make_samples(Path(folder), options.batch, options.cells)
         step, picks = Step(judge), np.random.default_rng(0)

@@ -54,8 +54,8 @@ from spackle.pseudo.views import APART, PathChoice, draw_path, path_cameras, ren
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 from spackle.training.data import Supply
-from spackle.training.pseudo_source import PseudoViews
 from spackle.training.recipe import DataRecipe
+from spackle.training.sources import PseudoViews
 
 VIEWS = 4
 SHORT = ["--base", "rgbd", "--views", VIEWS, "--shard-size", 2, "--threads", 1]

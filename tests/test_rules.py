@@ -178,7 +178,6 @@ TWINS = {
     "residual/hole_features.py": "test_residual.py",
     "residual/seeds.py": "test_residual.py",
     "surface.py": "test_surface.py",
-    "training/depth/raycast.py": "test_lite_scenes.py",
 }
 
 

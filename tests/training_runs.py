@@ -12,6 +12,8 @@ import torch
 
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
 
+CLI = "from spackle.cli import main\nmain()"
+
 
 def state(folder: Path) -> Checkpoint:
     checkpoint, _ = load_checkpoint(folder)
@@ -34,9 +36,9 @@ def one_thread_at_a_time() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
+def started(arguments: Sequence[str], code: str, entry: str = CLI, **environment: str) -> subprocess.Popen[str]:
     """A command in a process of its own, with something done before it."""
-    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
+    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\n{entry}"
     return subprocess.Popen(
         [sys.executable, "-c", code],
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
@@ -49,7 +51,7 @@ def killed_at(number: int) -> str:
     """Code for `started`: the process is killed when a step begins."""
     return f"""
 import os
-from spackle.training.loop import Trainer
+from spackle.training.trainer import Trainer
 step = Trainer.step
 Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
 """

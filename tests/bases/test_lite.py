@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from depth_loss import score_depth, vertical_ramp
 from safetensors.torch import load_file, save_file
 from torch.nn.functional import interpolate
+from weights import save_networks
 
 import spackle
 from spackle.bases.lite.base import FARTHEST, LOOKS, NEAREST_M, SHIPPED, LiteBase, merged, network_size
 from spackle.bases.lite.network import SCALE, STRIDE, LiteNet, Size, load_networks
 from spackle.errors import InputError
 from spackle.image import Photo
-from spackle.training.depth.export import save_networks
-from spackle.training.depth.score import score_depth, vertical_ramp
 
 BOTH_WAYS = [look for look in LOOKS if look.mirrored]
 

@@ -16,18 +16,24 @@ class MethodChoice(str, Enum):
 
     residual = "residual"
     direct_ft = "direct-ft"
-    lite = "lite"
 
 
 def train(
-    recipe: Annotated[Path, typer.Option("--recipe", metavar="FILE.yaml", help="What to learn from, and how.")],
+    recipe: Annotated[
+        Path,
+        typer.Option(
+            "--recipe",
+            metavar="RECIPE",
+            help="What to learn from, and how: cpu, paper, reverse_view, direct_ft, or a YAML file.",
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on.")],
     overrides: Annotated[
         list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
     ] = None,
     method: Annotated[
         MethodChoice,
-        typer.Option(help="What learns: the residual; direct-ft: SHARP's decoder, for comparison; lite: its network."),
+        typer.Option(help="What learns: the residual, or (direct-ft) SHARP's decoder, for comparison."),
     ] = MethodChoice.residual,
     checkpoint: Annotated[
         Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
@@ -35,9 +41,9 @@ def train(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start anew where OUT holds a run.")] = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Train the residual, SHARP itself or lite: best.safetensors, last.safetensors, run.json, pictures and logs."""
-    from spackle.jobs.train.recipe import train_recipe
+    """Train the residual or SHARP itself: best.safetensors, last.safetensors, run.json, pictures and logs."""
     from spackle.progress import Reporter
+    from spackle.training.run import train_recipe
 
     speaker, choices = Reporter(verbose), overrides or []
     ended = train_recipe(
@@ -49,4 +55,4 @@ def train(
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command(short_help="Train the residual, SHARP's decoder, or lite")(train)
+    app.command(short_help="Train the residual or SHARP's decoder")(train)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import atomic_path
-from spackle.training.recipe import differences
+from spackle.training.recipe import AnyRecipe, differences
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 BEST, LAST, RUN, PICTURES, LOGS, BAD = (
@@ -34,7 +34,7 @@ class Progress:
     seconds: float = 0.0  # of all its starts together
     history: tuple[dict[str, float], ...] = ()  # what each validation found
 
-    def judged(self, found: dict[str, float], aim: str, min_delta: float) -> Progress:
+    def validated(self, found: dict[str, float], aim: str, min_delta: float) -> Progress:
         """After a validation whose number called `aim` says which weights are best; the lower the better."""
         history = (*self.history, found)
         best = math.inf if self.best is None else self.best
@@ -99,7 +99,7 @@ def _read(path: Path) -> Checkpoint:
     return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)})
 
 
-def check_same_run(checkpoint: Checkpoint, method: str, recipe: dict[str, Any], digest: str, folder: Path) -> None:
+def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
     """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
     if checkpoint.method != method:
         raise InputError(

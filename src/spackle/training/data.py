@@ -1,20 +1,23 @@
-"""A recipe's data as files of samples, made where they are not there yet."""
+"""A recipe's data as files of samples: each view is made once and read many times."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from spackle.errors import InputError
+from spackle.formats import atomic_path
 from spackle.image import PHOTO_SUFFIXES
 from spackle.render import Renderer
-from spackle.training.cache import Cache, digest_of
-from spackle.training.pseudo_source import PseudoViews
 from spackle.training.recipe import DataRecipe, plain
-from spackle.training.sources import Composites, RgbdFrames, Source, StereoPairs
+from spackle.training.sample import Sample, random_crops, save_sample
+from spackle.training.sources import Composites, PseudoViews, RgbdFrames, Source, StereoPairs
 
 TRAIN, VALIDATION = "train", "validation"
 SAMPLES_VERSION = 2  # goes up whenever the same recipe would make other samples
@@ -22,8 +25,54 @@ Step = Callable[[int, int], None]  # (done, of how many)
 
 
 @dataclasses.dataclass(frozen=True)
+class Cache:
+    """A folder of samples, numbered by the view that they are crops of."""
+
+    folder: Path
+    sources: Sequence[Source]
+    shares: Sequence[float]  # of each source
+    seed: int
+    crops: int  # of a view, at most
+    cells: int  # along a crop's side
+
+    def fill(self, views: int, progress: Step, warn: Callable[[str], None]) -> list[Path]:
+        """Make what is missing of the first views, warning of bad photos; returns the samples' files in order."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        files: list[Path] = []
+        for index in range(views):
+            files += self._view(index, warn)
+            progress(index + 1, views)
+        return files
+
+    def _view(self, index: int, warn: Callable[[str], None]) -> list[Path]:
+        marker = self.folder / f"{index:06d}.done"
+        try:
+            files = [self._file(index, number) for number in range(int(marker.read_text()))]
+            if all(file.is_file() for file in files):
+                return files
+        except (FileNotFoundError, ValueError):
+            pass
+        rng = np.random.default_rng([self.seed, index])
+        source = self.sources[rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares))]
+        crops: list[Sample] = []
+        try:
+            crops = random_crops(source.view(rng), rng, self.crops, self.cells)
+        except (InputError, ValueError) as error:
+            warn(f"view {index} ({source.name}) passed over: {error}")
+        files = [self._file(index, number) for number in range(len(crops))]
+        for crop, file in zip(crops, files, strict=True):
+            save_sample(crop, file)
+        with atomic_path(marker) as temporary:
+            temporary.write_text(f"{len(crops)}\n")
+        return files
+
+    def _file(self, index: int, number: int) -> Path:
+        return self.folder / f"{index:06d}-{number}.safetensors"
+
+
+@dataclasses.dataclass(frozen=True)
 class SampleFiles:
-    """What a run learns from, and what it is judged by."""
+    """What a run learns from, and what it is validated on."""
 
     train: Sequence[Path]
     validation: Sequence[Path]
@@ -70,9 +119,8 @@ class Supply:
                 add(StereoPairs(scenes, renderer, data.disparity, reverse, name), share, data.stereo, scenes)
         if data.pseudo is not None and data.shares.pseudo > 0:
             views = PseudoViews(data.pseudo)
-            sources.append(views)
-            shares.append(data.shares.pseudo)
-            names.extend([views.name, views.digest])
+            add(views, data.shares.pseudo, data.pseudo, ())
+            names.append(views.digest)
         if not sources:
             raise InputError(
                 "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
@@ -95,9 +143,9 @@ class Supply:
 
         Args:
             folder: for a folder of the digest's name, with train/ and validation/ in it.
-            train: told how many views are there.
+            train: called with the views that are there, of how many.
             validation: likewise.
-            warn: told of each view that was passed over, and why.
+            warn: called with each view that was passed over, and why.
 
         Raises:
             InputError: where nothing can be written, or no view has a hole to learn from.
@@ -116,9 +164,9 @@ class Supply:
                 )
             return files
 
-        judged = fill(VALIDATION, 2 * data.seed + 1, data.validation_views, validation)
+        validated = fill(VALIDATION, 2 * data.seed + 1, data.validation_views, validation)
         learned = fill(TRAIN, 2 * data.seed, data.views, train)
-        return SampleFiles(learned, judged, digest)
+        return SampleFiles(learned, validated, digest)
 
 
 def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
@@ -134,3 +182,8 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
     if not found:
         raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
     return found
+
+
+def digest_of(value: object) -> str:
+    """Twelve hexadecimal digits that tell one recipe's data from another's."""
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:12]

@@ -18,22 +18,89 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner
-from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.device import enough_memory
+from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of
+from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
+from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
+from spackle.downloads import check_recorded, installed
+from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.pseudo import PseudoSample
+from spackle.jobs.dataset.options import weights_digest
+from spackle.pseudo import PseudoFiles, PseudoSample
 from spackle.render import Renderer
-from spackle.training.method import MethodName
-from spackle.training.pseudo_photos import VIEWS_AT_ONCE, PseudoPhotos
-from spackle.training.step import Batch
-from spackle.training.validation import PICTURED, Judge
-from spackle.training.view_method import ViewMethod
+from spackle.training.data import digest_of
+from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod
+from spackle.training.plan import Plan, RunContext, Start, load_objective, parameters
+from spackle.training.recipe import DataRecipe, Recipe
+from spackle.training.sources import PseudoViews
 
+BASE = "sharp"  # the base whose decoder can learn
+VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
 PICTURE_SIDE = 512  # pixels of a picture's longer side
 
 
-def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoSample], renderer: Renderer) -> Batch:
+@dataclasses.dataclass(frozen=True)
+class PseudoPhotos:
+    """A pseudo-supervised dataset by its photos: some are learned from, the others are for validation."""
+
+    files: PseudoFiles
+    learned: tuple[int, ...]  # places in the dataset
+    validation: tuple[int, ...]  # others
+    digest: str
+
+    @staticmethod
+    def of(data: DataRecipe, location: Path, weights_sha256: str) -> PseudoPhotos:
+        """Divide a dataset: whole photos, in a random order of `data.seed`.
+
+        Args:
+            data: views, validation_views and seed count.
+            location: of the dataset (see `only_dataset`).
+            weights_sha256: of the checkpoint whose decoder learns.
+
+        Raises:
+            InputError: no finished dataset, one that teaches nothing, one of another base or of other weights, or one
+                with a single photo.
+        """
+        files = PseudoViews(location).files
+        _check_base(files, weights_sha256)
+        photos, per_photo = len(files), len(files.samples[0][1].holes)
+        if photos < 2:
+            raise InputError(f"{location}: a single photo, but one must learn and another judge: build it with more")
+        order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
+        held = min(max(1, data.validation_views // per_photo), photos // 2)
+        learned = order[held:][: max(1, data.views // per_photo)]
+        digest = digest_of((files.manifest.digest, learned, order[:held]))
+        return PseudoPhotos(files, tuple(learned), tuple(order[:held]), digest)
+
+    def drawn(self, place: int, rng: np.random.Generator) -> list[PseudoSample]:
+        """`VIEWS_AT_ONCE` views of a photo: its own, and others at random; all of them where there are fewer.
+
+        Raises:
+            InputError: a shard that is missing or damaged.
+        """
+        group = self.files.group(place)
+        others = 1 + rng.permutation(group.views - 1)[: VIEWS_AT_ONCE - 1]
+        return [group.view(index) for index in [0, *sorted(int(other) for other in others)]]
+
+    def all(self, place: int) -> list[PseudoSample]:
+        """Every view of a photo; InputError likewise."""
+        group = self.files.group(place)
+        return [group.view(index) for index in range(group.views)]
+
+    def widest(self, place: int) -> list[PseudoSample]:
+        """A photo's own view and the one with the largest hole; InputError likewise."""
+        holes: Sequence[float] = self.files.samples[place][1].holes
+        group = self.files.group(place)
+        return [group.view(index) for index in (0, int(np.argmax(holes)))]
+
+    def name(self, place: int) -> str:
+        """What a photo is called in its folder."""
+        return self.files.samples[place][1].photo
+
+
+def render_photo(
+    decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoSample], renderer: Renderer
+) -> ViewBatch:
     """Predict a photo's Gaussians anew, and draw them in some of its views.
 
     Args:
@@ -51,7 +118,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoS
         gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     hole = torch.stack([view.mask for view in views])
-    return Batch(
+    return ViewBatch(
         rgb=torch.stack([rendering.rgb for rendering in drawn]),
         alpha=torch.stack([rendering.alpha for rendering in drawn]),
         base_rgb=torch.stack([view.rendering.rgb for view in views]),
@@ -61,50 +128,34 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoS
     )
 
 
-@dataclasses.dataclass(frozen=True)
 class DirectFt(ViewMethod):
     """Items are photos, one at a time: SHARP's decoder keeps gigabytes for the gradient of each."""
 
-    base: TunableSharp
-    owner: Owner
-    photos: PseudoPhotos
-    judge: Judge
-    views: int  # of a step, of all processes together: a multiple of VIEWS_AT_ONCE
-    seed: int  # of the views that are drawn
-
-    name: ClassVar[MethodName] = "direct-ft"
-    at_once: ClassVar[int] = 1
+    name: ClassVar[str] = "direct-ft"
     columns: ClassVar[str] = "base, fine-tuned, target"
     remedy: ClassVar[str] = "build the dataset without the photos that are named there"
+    at_once = 1
 
-    @property
-    def digest(self) -> str:
-        """The dataset's, its SHARP weights included, and of how it is divided."""
-        return self.photos.digest
+    def __init__(
+        self, base: TunableSharp, owner: Owner, photos: PseudoPhotos, objective: Objective, views: int, seed: int
+    ) -> None:
+        """A step takes `views` of all processes together, a multiple of VIEWS_AT_ONCE; `seed` draws them."""
+        super().__init__(objective)
+        self.base, self.owner, self.photos, self.seed, self.digest = base, owner, photos, seed, photos.digest
+        self.items, self.validation_items = len(photos.learned), len(photos.validation)
+        self.items_a_step = views // VIEWS_AT_ONCE
 
-    @property
-    def items(self) -> int:
-        """Photos to learn from."""
-        return len(self.photos.learned)
-
-    @property
-    def judged_items(self) -> int:
-        """Photos to be judged by, in all of their views."""
-        return len(self.photos.judged)
-
-    @property
-    def items_a_step(self) -> int:
-        """Photos of a step."""
-        return self.views // VIEWS_AT_ONCE
-
-    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> Batch:
+    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
         """Views of one photo, drawn with what the decoder says; InputError where they cannot be read."""
-        return render_photo(network, self.base, self._drawn(step, *items), self.judge.renderer)
+        return self._render(network, self._drawn(step, *items))
 
-    def complete_judged(self, network: nn.Module, items: Sequence[int]) -> Batch:
+    def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
         """All views of one photo, likewise."""
         (item,) = items
-        return render_photo(network, self.base, self.photos.all(self.photos.judged[item]), self.judge.renderer)
+        return self._render(network, self.photos.all(self.photos.validation[item]))
+
+    def _render(self, decoder: nn.Module, views: Sequence[PseudoSample]) -> ViewBatch:
+        return render_photo(decoder, self.base, views, self.objective.renderer)
 
     def _drawn(self, step: int, item: int) -> list[PseudoSample]:
         """The views that a step takes of a photo: nothing but the arguments decides."""
@@ -113,10 +164,9 @@ class DirectFt(ViewMethod):
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
         """[H, W, 3] sRGB: of some photos their own view and the one with the largest hole, a row each."""
-        places, rows = self.photos.judged, []
+        places, rows = self.photos.validation, []
         for place in places[:: max(1, 2 * len(places) // PICTURED)][: PICTURED // 2]:
-            views = self.photos.widest(place)
-            done = render_photo(network, self.base, views, self.judge.renderer)
+            done = self._render(network, self.photos.widest(place))
             rows += [torch.cat(row, dim=1) for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
         shown = [_reduced(row, len(self.columns.split(","))) for row in rows]
         widest = max(row.shape[1] for row in shown)
@@ -144,3 +194,89 @@ def _reduced(row: Tensor, pictures: int) -> Tensor:
     scale = min(1.0, PICTURE_SIDE / max(height, width))
     size = max(1, round(height * scale)), pictures * max(1, round(width * scale))
     return interpolate(row.movedim(-1, 0)[None], size, mode="area")[0].movedim(0, -1)
+
+
+def plan_direct_ft(context: RunContext[Recipe], checkpoint: Path | None) -> Plan:
+    """Find a checkpoint and a dataset that belong together; the network is not loaded yet.
+
+    Args:
+        context: whose recipe has no data but data.pseudo.
+        checkpoint: SHARP's; the downloaded one where None.
+
+    Raises:
+        InputError: a recipe, checkpoint or dataset that cannot be used.
+    """
+    objective, recipe, least = load_objective(context), context.recipe, VIEWS_AT_ONCE * context.ranks.count
+    if recipe.optim.batch % least:
+        raise InputError(
+            f"optim.batch={recipe.optim.batch}: with --method direct-ft each process takes {VIEWS_AT_ONCE} views "
+            f"of a photo at a time: give a multiple of {least}"
+        )
+    if recipe.init is not None:
+        raise InputError(f"init={recipe.init}: --method direct-ft starts from SHARP's checkpoint: leave it out")
+    data = _only_dataset(recipe.data)
+    owner = _find_owner(checkpoint)
+    photos = PseudoPhotos.of(recipe.data, data, owner.sha256)
+
+    def start() -> Start:
+        base = TunableSharp.load(owner.path, objective.precision, objective.device)
+        decoder = base.network.gaussian_decoder().let_learn()
+        counts = parameters(base.network)
+        method = DirectFt(base, owner, photos, objective, recipe.optim.batch, recipe.run.seed)
+        context.reporter.say(
+            f"{method.items} photos to learn from, {method.validation_items} to be judged by; "
+            f"{counts['learn']:,} weights of SHARP learn, {counts['stay']:,} stay"
+        )
+        samples = {"train": method.items, "validation": method.validation_items, "digest": photos.digest}
+        weights = {"file": owner.path.name, "sha256": owner.sha256}
+        features = objective.features.name if objective.features else "none"
+        facts = {"features": features, "samples": samples, "parameters": counts, "checkpoint": weights}
+        return Start(method, decoder, facts)
+
+    return Plan(DirectFt.name, photos.digest, start)
+
+
+def _only_dataset(data: DataRecipe) -> Path:
+    """The dataset that a recipe names; InputError where it names none, or other sources."""
+    for key, value in (("photos", data.photos), ("rgbd", data.rgbd), ("stereo", data.stereo)):
+        if value:
+            raise InputError(
+                f"data.{key}: its samples have Gaussians that cannot change, and --method direct-ft changes them: "
+                f"leave it out (data.{key}={'[]' if key == 'rgbd' else 'null'}) and give data.pseudo"
+            )
+    if data.pseudo is None:
+        raise InputError(
+            "data.pseudo: missing, and --method direct-ft learns from nothing else: "
+            "give a dataset of `spackle dataset build --base sharp`"
+        )
+    return data.pseudo
+
+
+def _check_base(files: PseudoFiles, weights_sha256: str) -> None:
+    """InputError unless the dataset's renderings and masks are those of the weights that are to learn."""
+    base, location = files.manifest.config.get("base", {}), files.location
+    if base.get("name") != BASE:
+        raise InputError(
+            f"{location}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
+            "build one with --base sharp"
+        )
+    if base.get("weights") != weights_sha256:
+        raise InputError(
+            f"{location}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
+            "give them with -c, or build a dataset with these"
+        )
+
+
+def _find_owner(checkpoint: Path | None) -> Owner:
+    """The checkpoint that learns, held to its record where it was downloaded."""
+    path = checkpoint or installed("sharp")
+    if path is None:
+        raise InputError(
+            "--method direct-ft: no weights of SHARP on this machine: `spackle weights get sharp` downloads them "
+            "(2.8 GB, for research only), -c FILE takes a local copy"
+        )
+    read_checkpoint_tensors(path)  # refuses what is none, and reads no numbers yet
+    if owner_of(path) is not None:
+        raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
+    record = check_recorded(path)
+    return Owner(path, weights_digest(path) if record is None else record.sha256)

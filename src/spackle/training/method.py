@@ -1,60 +1,47 @@
-"""What is trained, and on what, as the loop sees it: the loop knows of steps and losses, not of Gaussians."""
+"""What is trained, and on what, as the trainer sees it: it knows of items and losses, not of Gaussians."""
 
 from __future__ import annotations
 
+import abc
+import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Protocol, TypeVar
+from typing import ClassVar, TypeVar
 
+import torch
 from torch import Tensor, nn
 
+from spackle.render import Renderer
+from spackle.residual.hole_features import hole_area_ratio
+from spackle.training.distance import hole_psnr
+from spackle.training.features import FeatureNet
+from spackle.training.losses import total_loss
+from spackle.training.ranks import Ranks
+from spackle.training.recipe import LossRecipe
+
 T = TypeVar("T")
-MethodName = Literal["residual", "direct-ft", "lite"]  # as --method spells them, and checkpoints
+PICTURED = 6  # views in the picture
+DECIBELS = ("hole_psnr", "seen_psnr")
+MEASURES = ("loss", "color", "alpha", "preserve", "perceptual", *DECIBELS, "har_before", "har_after")
+PLACES = {"hole_psnr": "in the hole", "seen_psnr": "to the base outside of it"}
 
 
-class Method(Protocol):
+class Method(abc.ABC):
     """A network's task: items, which are counted from 0, in; a loss out."""
 
-    @property
-    def name(self) -> MethodName:
-        """What `--method` calls it."""
+    name: ClassVar[str]  # as `--method` and checkpoints have it
+    columns: ClassVar[str]  # what the pictures show from left to right
+    remedy: ClassVar[str]  # what to do about items that make a loss that is no number
+    aim: ClassVar[str] = "loss"  # which measure says what weights are best: the lower the better
+    measures: Sequence[str]  # what `measure` finds, by name
+    digest: str  # of everything that decides what is learned from, but not of where it lies
+    items: int  # to learn from; an epoch has each once
+    validation_items: int
+    items_a_step: int  # of all processes together
+    at_once: int  # go through the network together; a step with more adds up their gradients
 
-    @property
-    def digest(self) -> str:
-        """Of everything that decides what is learned from, but not of where it lies."""
-
-    @property
-    def items(self) -> int:
-        """How many there are to learn from; an epoch has each once."""
-
-    @property
-    def judged_items(self) -> int:
-        """How many there are to be judged by."""
-
-    @property
-    def items_a_step(self) -> int:
-        """How many a step takes, of all processes together."""
-
-    @property
-    def at_once(self) -> int:
-        """How many go through the network together; a step with more adds up their gradients."""
-
-    @property
-    def columns(self) -> str:
-        """What the pictures show from left to right."""
-
-    @property
-    def remedy(self) -> str:
-        """What to do about items that make a loss that is no number."""
-
-    @property
-    def measures(self) -> Sequence[str]:
-        """What `judged` finds, by name."""
-
-    @property
-    def aim(self) -> str:
-        """Which of them says what weights are best: the lower the better."""
-
+    @abc.abstractmethod
     def loss(self, network: nn.Module, step: int, items: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [] of items to learn from, with gradients, and its terms []; the same for the same step.
 
@@ -62,23 +49,139 @@ class Method(Protocol):
             InputError: an item that cannot be read.
         """
 
-    def judged(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
-        """How good a network is on items to be judged by: values of each measure; InputError likewise."""
+    @abc.abstractmethod
+    def measure(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
+        """How good a network is on validation items: values of each measure; InputError likewise."""
 
-    def words(self, found: Mapping[str, float]) -> str:
+    @abc.abstractmethod
+    def describe(self, found: Mapping[str, float]) -> str:
         """What a line about a validation says behind its aim: the means of the measures, from a comma on."""
 
+    @abc.abstractmethod
     def picture(self, network: nn.Module) -> Tensor:
-        """[H, W, 3] sRGB: rows of a few judged items in `columns`; InputError likewise."""
+        """[H, W, 3] sRGB: rows of a few validation items in `columns`; InputError likewise."""
 
+    @abc.abstractmethod
     def keep(self, step: int, items: Sequence[int], folder: Path) -> None:
         """Copy items to learn from, or their names, to a folder."""
 
+    @abc.abstractmethod
     def export(self, network: nn.Module, path: Path) -> None:
         """Write weights as the rest of the package reads them; InputError where that cannot be."""
+
+
+@torch.no_grad()
+def validate(network: nn.Module, method: Method, device: torch.device, ranks: Ranks) -> dict[str, float]:
+    """Means over the validation items, each in its own right; the same in all processes.
+
+    Args:
+        network: the averaged one.
+        method: whose items and measures count.
+        device: where the processes' sums are added up.
+        ranks: the processes that share the work.
+
+    Returns:
+        The method's measures, but those that no item has.
+
+    Raises:
+        InputError: an item that cannot be read.
+    """
+    totals, counts = dict.fromkeys(method.measures, 0.0), dict.fromkeys(method.measures, 0)
+    mine = range(ranks.rank, method.validation_items, ranks.count)
+    for part in chunks(mine, method.at_once):
+        for name, values in method.measure(network, part).items():
+            totals[name] += sum(values)
+            counts[name] += len(values)
+    sums = ranks.sum([*totals.values(), *counts.values()], device)
+    pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
+    return {name: total / count for name, total, count in pairs if count}
 
 
 def chunks(values: Sequence[T], size: int) -> Iterator[Sequence[T]]:
     """`size` of them at a time, the last ones perhaps fewer."""
     for start in range(0, len(values), size):
         yield values[start : start + size]
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewBatch:
+    """Completed views and their truth, stacked."""
+
+    rgb: Tensor  # [B, H, W, 3] sRGB of base and aux Gaussians, with gradients
+    alpha: Tensor  # [B, H, W] likewise
+    base_rgb: Tensor  # [B, H, W, 3] of the base alone
+    target: Tensor  # [B, H, W, 3]
+    hole: Tensor  # [B, H, W] bool
+    valid: Tensor  # [B, H, W] bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """The loss of completed views (eq. 6), with all that it needs besides them."""
+
+    loss: LossRecipe
+    features: FeatureNet | None
+    renderer: Renderer
+    precision: torch.dtype
+    device: torch.device  # of the networks
+
+    def total(self, batch: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [], and its terms [] unweighted; where the feature network is."""
+        rgb, alpha, base_rgb, target, hole, valid = (
+            getattr(batch, field.name).to(self.device) for field in dataclasses.fields(batch)
+        )
+        recipe = self.loss
+        return total_loss(
+            rgb, alpha, target, base_rgb, hole, valid=valid,
+            features=self.features, weights=recipe.weights, dilation=recipe.dilation, size=recipe.feature_size,
+        )  # fmt: skip
+
+
+class ViewMethod(Method):
+    """A method whose items become completed views: one loss, and one way to measure them."""
+
+    measures: Sequence[str] = MEASURES
+
+    def __init__(self, objective: Objective) -> None:
+        self.objective = objective
+
+    @abc.abstractmethod
+    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
+        """Views of items to learn from, with gradients; the same for the same step.
+
+        Raises:
+            InputError: an item that cannot be read.
+        """
+
+    @abc.abstractmethod
+    def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
+        """Views of validation items; InputError likewise."""
+
+    def loss(self, network: nn.Module, step: int, items: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [] and its terms []; InputError where an item cannot be read."""
+        return self.objective.total(self.complete(network, step, items))
+
+    def measure(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
+        """Of each view: loss and its terms; hole_psnr and seen_psnr in dB, inside of the hole against the target and
+        outside of it against the base, where they are not infinite; har_before and har_after, the share of hole pixels.
+
+        Raises:
+            InputError: an item that cannot be read.
+        """
+        done = self.complete_validation(network, items)
+        loss, terms = self.objective.total(done)
+        decibels = {
+            "hole_psnr": map(hole_psnr, done.rgb, done.target, done.hole & done.valid),
+            "seen_psnr": map(hole_psnr, done.rgb, done.base_rgb, ~done.hole),
+        }
+        return {
+            **{name: [float(value)] * len(done.rgb) for name, value in {"loss": loss, **terms}.items()},
+            **{name: [value for value in values if math.isfinite(value)] for name, values in decibels.items()},
+            "har_before": [float(hole.double().mean()) for hole in done.hole],
+            "har_after": [hole_area_ratio(alpha) for alpha in done.alpha],
+        }
+
+    def describe(self, found: Mapping[str, float]) -> str:
+        """Decibels, where there are any, and holes."""
+        psnr = "".join(f", {found[name]:.2f} dB {place}" for name, place in PLACES.items() if name in found)
+        return f"{psnr}, holes {found['har_before']:.1%} -> {found['har_after']:.2%}"

@@ -1,16 +1,55 @@
-"""What a training run is made of, as values; `spackle.training.recipe_file` reads them from YAML."""
+"""What a training run is made of: values, and how they are read from YAML with `key=value` on top.
+
+A type says which numbers a key takes (`Range`), and whether two runs that differ in it may be one (`FREE`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import os
+import typing
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Protocol, TypeVar, Union
 
+from spackle.errors import InputError, reason_in_a_line
+from spackle.image import check_file
 from spackle.device import Precision
+from spackle.residual.hole_features import CELL
 from spackle.training.losses import LossWeights
+from spackle.camera_path import MAX_DISPARITY
+
+PACKAGED = Path(__file__).parent / "recipes"
+POSITIVE = 1e-12
+LEAST_SIDE = 36  # pixels that the feature networks need
+# What may differ when a run goes on: how long it is, how often it looks up, and where its files lie.
+# The samples themselves are held together by their digest.
+FREE = "free"
 
 FeatureName = Literal["resnet50", "squeezenet", "none"]
 DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """The least and the greatest that a number may be."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        low, high = self.low, self.high
+        return f"from {low:g} to {high:g}" if low != POSITIVE else f"above 0, up to {high:g}"
+
+
+Share = Annotated[float, Range(0, 1e6)]
+Count = Annotated[int, Range(1, 1e6)]  # six digits name a sample's file
+Disparity = Annotated[float, Range(0, MAX_DISPARITY)]
+Beta = Annotated[float, Range(0, 0.999999)]
+Interval = Annotated[int, Range(1, 1e9), FREE]  # steps
+Place = Annotated[Path | None, FREE]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,51 +57,51 @@ class RgbdFolder:
     """What one depth camera took: NAME.color.jpg and NAME.depth.png."""
 
     folder: Path
-    focal_px: float
-    unit_m: float = 0.001  # metres in one step of the depth files
+    focal_px: Annotated[float, Range(1, 1e6)]
+    unit_m: Annotated[float, Range(POSITIVE, 1e3)] = 0.001  # metres in one step of the depth files
 
 
 @dataclasses.dataclass(frozen=True)
 class Shares:
     """How often a view comes from each source; they need not add up to 1. One without data counts as 0."""
 
-    composites: float = 0.66
-    rgbd: float = 0.12
-    stereo: float = 0.10  # reverse_view of the left photo
-    pairs: float = 0.12  # the true right photo
-    pseudo: float = 1.0  # renderings with completed targets
+    composites: Share = 0.66
+    rgbd: Share = 0.12
+    stereo: Share = 0.10  # reverse_view of the left photo
+    pairs: Share = 0.12  # the true right photo
+    pseudo: Annotated[Share, FREE] = 1.0  # renderings with completed targets; some checkpoints lack it
 
 
 @dataclasses.dataclass(frozen=True)
 class DataRecipe:
     """Where views with holes and their truth come from, and how many there are."""
 
-    photos: Path | None = None  # a folder, with its subfolders
-    rgbd: tuple[RgbdFolder, ...] = ()
-    stereo: Path | None = None  # a folder of scenes, each with a scene.json
-    pseudo: Path | None = None  # a dataset that `spackle dataset build` made
+    photos: Place = None  # a folder, with its subfolders
+    rgbd: Annotated[tuple[RgbdFolder, ...], FREE] = ()
+    stereo: Place = None  # a folder of scenes, each with a scene.json
+    pseudo: Place = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
-    disparity: tuple[float, float] = (0.1, 0.6)  # how far the virtual camera goes
-    views: int = 20_000  # the paper's: 1,000 photos, 20 views of each
-    crops: int = 3  # of a view, at most
-    cells: int = 96  # along a crop's side, of 2×2 pixels
-    validation_views: int = 100
-    cache: Path | None = None  # a folder for the samples; inside the output where None
-    seed: int = 0  # of the samples alone, so that runs with other seeds learn from the same ones
+    disparity: tuple[Disparity, Disparity] = (0.1, 0.6)  # how far the virtual camera goes
+    views: Count = 20_000  # the paper's: 1,000 photos, 20 views of each
+    crops: Annotated[int, Range(1, 100)] = 3  # of a view, at most
+    cells: Annotated[int, Range(16, 768)] = 96  # along a crop's side, of 2×2 pixels
+    validation_views: Count = 100
+    cache: Place = None  # a folder for the samples; inside the output where None
+    seed: Annotated[int, Range(0, 2**31 - 2)] = 0  # of the samples alone: runs with other seeds share them
 
 
 @dataclasses.dataclass(frozen=True)
 class LossRecipe:
-    """The four terms and what the perceptual one looks with (paper, "Training Details and Loss Weights")."""
+    """The four terms of eq. 6 and what the perceptual one looks with (paper, "Training Details and Loss Weights")."""
 
-    color: float = 10.0
-    alpha: float = 0.5
-    perceptual: float = 1.0
-    preserve: float = 5.0
+    color: Share = 10.0
+    alpha: Share = 0.5
+    perceptual: Share = 1.0
+    preserve: Share = 5.0
     features: FeatureName = "resnet50"
-    features_path: Path | None = None
-    feature_size: int | None = 512  # the longer side of what that network sees; None: the crop as it is
-    dilation: int = 21  # pixels
+    features_path: Place = None
+    feature_size: Annotated[int, Range(64, 4096)] | None = 512  # the longer side of what it sees; None: the crop's own
+    dilation: Annotated[int, Range(1, 1001)] = 21  # pixels
 
     @property
     def weights(self) -> LossWeights:
@@ -74,15 +113,15 @@ class LossRecipe:
 class OptimRecipe:
     """AdamW with a linear warm-up and a cosine after it (paper, "Training Details and Loss Weights")."""
 
-    lr: float = 1.6e-4
-    min_lr: float = 1.6e-5
-    warmup: int = 10_000  # steps
-    steps: int = 100_000
-    batch: int = 16  # crops of a step, of all processes together
-    betas: tuple[float, float] = (0.9, 0.999)
-    weight_decay: float = 1e-4
-    clip: float = 1.0  # the gradient's largest norm
-    ema: float = 0.999  # decay of the averaged weights, which are validated and exported; 0: no average
+    lr: Annotated[float, Range(POSITIVE, 1)] = 1.6e-4
+    min_lr: Annotated[float, Range(0, 1)] = 1.6e-5
+    warmup: Annotated[int, Range(0, 1e9)] = 10_000  # steps
+    steps: Interval = 100_000
+    batch: Annotated[int, Range(1, 1e5)] = 16  # crops of a step, of all processes together
+    betas: tuple[Beta, Beta] = (0.9, 0.999)
+    weight_decay: Annotated[float, Range(0, 10)] = 1e-4
+    clip: Annotated[float, Range(POSITIVE, 1e9)] = 1.0  # the gradient's largest norm
+    ema: Beta = 0.999  # decay of the averaged weights, which are validated and exported; 0: no average
     precision: Precision = "auto"  # of the network; auto: bf16 where the hardware multiplies it natively
 
 
@@ -90,24 +129,13 @@ class OptimRecipe:
 class RunRecipe:
     """What has no part in what is learned, but for the seed and when to stop."""
 
-    seed: int = 0  # of the first weights and of the samples' order
-    validate_every: int = 1000  # steps
-    save_every: int = 1000
-    log_every: int = 50
-    patience: int = 10  # validations without improvement before the run ends
-    min_delta: float = 1e-4  # a smaller improvement is none
-    device: DeviceName = "auto"  # of the networks; the renderer draws where it can
-
-
-@dataclasses.dataclass(frozen=True)
-class Recipe:
-    """All of a training run."""
-
-    data: DataRecipe = DataRecipe()
-    loss: LossRecipe = LossRecipe()
-    optim: OptimRecipe = OptimRecipe()
-    run: RunRecipe = RunRecipe()
-    init: Path | None = None  # weights to start from
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # of the first weights and of the samples' order
+    validate_every: Interval = 1000
+    save_every: Interval = 1000
+    log_every: Interval = 50
+    patience: Interval = 10  # validations without improvement before the run ends
+    min_delta: Annotated[float, Range(0, 1e6), FREE] = 1e-4  # a smaller improvement is none
+    device: Annotated[DeviceName, FREE] = "auto"  # of the networks; the renderer draws where it can
 
 
 class AnyRecipe(Protocol):
@@ -121,20 +149,49 @@ class AnyRecipe(Protocol):
     def run(self) -> RunRecipe:
         """How often it looks up."""
 
+    def check(self, file: str) -> None:
+        """InputError, naming the file, for values that are possible each, but not together."""
 
-# What may differ when a run goes on: how long it is, how often it looks up, and where its files lie.
-# The samples themselves are held together by their digest.
-FREE: tuple[str, ...] = (
-    "optim.steps",
-    "run.validate_every",
-    "run.save_every",
-    "run.log_every",
-    "run.patience",
-    "run.min_delta",
-)
-FREE += ("run.device", "loss.features_path", "data.cache", "data.photos", "data.stereo", "data.rgbd")
-FREE += ("data.pseudo", "data.shares.pseudo")  # younger than some checkpoints
-FREE += ("data.validation_stereo",)
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """All of a training run of the residual or of direct-ft."""
+
+    data: DataRecipe = DataRecipe()
+    loss: LossRecipe = LossRecipe()
+    optim: OptimRecipe = OptimRecipe()
+    run: RunRecipe = RunRecipe()
+    init: Path | None = None  # weights to start from
+
+    def check(self, file: str) -> None:
+        """InputError, naming the file, for values that are possible each, but not together."""
+        low, high = self.data.disparity
+        if low > high:
+            raise InputError(f"{file}: data.disparity runs from {low:g} down to {high:g}; give the smaller one first")
+        check_rates(self.optim, file)
+        if self.loss.dilation % 2 == 0:
+            raise InputError(f"{file}: loss.dilation {self.loss.dilation} is even; a square around a pixel is odd")
+        if self.loss.features == "none":
+            return
+        if self.loss.features_path is None:
+            raise InputError(
+                f"{file}: loss.features_path is missing: it names the weights of {self.loss.features}; "
+                "loss.features=none does without"
+            )
+        if (self.loss.feature_size or CELL * self.data.cells) < LEAST_SIDE:
+            raise InputError(
+                f"{file}: crops of {self.data.cells} cells are too small for {self.loss.features} "
+                f"({LEAST_SIDE} pixels): raise data.cells, or give loss.feature_size"
+            )
+
+
+R = TypeVar("R", bound=AnyRecipe)
+
+
+def check_rates(optim: OptimRecipe, file: str) -> None:
+    """InputError where the learning rate would rise."""
+    if optim.min_lr > optim.lr:
+        raise InputError(f"{file}: optim.min_lr {optim.min_lr:g} is above optim.lr {optim.lr:g}")
 
 
 def plain(value: Any) -> Any:
@@ -146,14 +203,184 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def differences(one: dict[str, Any], other: dict[str, Any], where: str = "") -> list[str]:
-    """The keys in which two plain recipes are different runs."""
-    found: list[str] = []
-    for name in sorted({*one, *other}):
-        key = where + name
-        a, b = one.get(name), other.get(name)
-        if isinstance(a, dict) and isinstance(b, dict):
-            found += differences(a, b, key + ".")
-        elif a != b and key not in FREE:
-            found.append(key)
+def differences(stored: Mapping[str, Any], recipe: Any) -> list[str]:
+    """The keys in which a plain recipe and another one are different runs."""
+    one, other = _flat(stored), _flat(plain(recipe))
+    keys = sorted(key for key in {*one, *other} if one.get(key) != other.get(key))
+    free = set(_free_keys(type(recipe)))
+    return [key for key in keys if key not in free]
+
+
+def _flat(value: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        found |= _flat(item, f"{where}{name}.") if isinstance(item, dict) else {where + name: item}
     return found
+
+
+def _free_keys(kind: type, where: str = "") -> Iterator[str]:
+    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        inner, marks = _bare(hint)
+        if dataclasses.is_dataclass(inner):
+            yield from _free_keys(typing.cast(type, inner), f"{where}{name}.")
+        elif FREE in marks:
+            yield where + name
+
+
+def load_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Recipe:
+    """Read a recipe of the residual or of direct-ft; what the file leaves out is as `Recipe` has it.
+
+    Args:
+        path: a YAML file, or the name of a packaged one such as "cpu". Relative paths in it are relative to the
+            working directory.
+        overrides: `key=value` each, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
+
+    Raises:
+        InputError: a missing or broken file, an unknown key, a value that cannot be.
+    """
+    names = sorted(file.stem for file in PACKAGED.glob("*.yaml"))
+    if os.fspath(path) in names and not os.path.isfile(path):
+        path = PACKAGED / f"{os.fspath(path)}.yaml"
+    elif os.sep not in os.fspath(path) and not os.path.exists(path):
+        raise InputError(f"{path}: no such recipe; there are {', '.join(names)}, or give a YAML file")
+    return load_recipe_as(Recipe, path, overrides)
+
+
+def load_recipe_as(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
+    """Read a file as `load_recipe` does into another dataclass of such values."""
+    check_file(path, "recipe")
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a recipe: {reason_in_a_line(error)}") from error
+    raw = _parse(text, str(path)) or {}
+    recipe: R = _build(kind, raw, "", str(path))
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not key:
+            raise InputError(f"{override!r}: neither an option nor key=value, such as optim.steps=100")
+        _set(raw, key.split("."), _parse(value, override), override)
+        recipe = _build(kind, raw, "", override)
+    recipe.check(str(path))
+    return recipe
+
+
+def _parse(text: str, file: str) -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        raise InputError("recipes are YAML, which needs a package: pip install 'spackle-nvs[train]'") from error
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
+        raise InputError(f"{file}: not YAML: {reason_in_a_line(error)}") from error
+
+
+def _set(raw: Any, keys: Sequence[str], value: Any, override: str) -> None:
+    """Put a value into nested dictionaries and lists."""
+    for depth, key in enumerate(keys):
+        last = depth == len(keys) - 1
+        place: Any = key
+        if isinstance(raw, list):
+            if not (key.isdecimal() and int(key) < len(raw)):
+                known = ".".join(keys[:depth])
+                raise InputError(f"{override}: {known} has {len(raw)} entries, counted from 0; {key} is none of them")
+            place = int(key)
+        elif not last and not isinstance(raw.get(key), (dict, list)):
+            raw[key] = {}
+        if last:
+            raw[place] = value
+        raw = raw[place]
+        if not last and not isinstance(raw, (dict, list)):
+            raise InputError(f"{override}: {'.'.join(keys[: depth + 1])} has no parts")
+
+
+def _bare(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type without its annotations and without null, and the annotations."""
+    marks: tuple[Any, ...] = ()
+    while True:
+        if typing.get_origin(kind) is Annotated:
+            kind, *more = typing.get_args(kind)
+            marks += tuple(more)
+        elif _optional(kind):
+            (kind,) = (choice for choice in typing.get_args(kind) if choice is not NoneType)
+        else:
+            return kind, marks
+
+
+def _optional(kind: Any) -> bool:
+    if typing.get_origin(kind) is Annotated:
+        kind = typing.get_args(kind)[0]
+    return typing.get_origin(kind) in (Union, UnionType) and NoneType in typing.get_args(kind)
+
+
+def _build(kind: Any, value: Any, key: str, file: str) -> Any:
+    """A value of a type out of what YAML gave, or InputError with file, key and what is allowed."""
+    if value is None and _optional(kind):
+        return None
+    inner, marks = _bare(kind)
+    if dataclasses.is_dataclass(inner):
+        return _build_fields(inner, value, key, file)
+    if typing.get_origin(inner) is tuple and isinstance(value, list):
+        first, second = typing.get_args(inner)
+        if second is ...:
+            return tuple(_build(first, item, f"{key}.{place}", file) for place, item in enumerate(value))
+        if len(value) == 2:
+            return tuple(_build(first, item, key, file) for item in value)
+    if typing.get_origin(inner) is Literal and value in typing.get_args(inner):
+        return value
+    if inner is Path and isinstance(value, str) and value and "\0" not in value:
+        return Path(value)
+    if inner in (int, float) and (number := _number(value, inner)) is not None:
+        (span,) = (mark for mark in marks if isinstance(mark, Range))
+        if span.low <= number <= span.high:
+            return number
+    raise _refused(key, value, _allowed(kind), file)
+
+
+def _build_fields(kind: Any, value: Any, key: str, file: str) -> Any:
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    value = {} if value is None else value  # a section whose keys are all commented out
+    if not isinstance(value, dict):
+        raise _refused(key, value, f"keys {', '.join(fields)}", file)
+    here = f"{key}." if key else ""
+    for name in value:
+        if name not in fields:
+            raise InputError(f"{file}: {here}{name} is unknown; there are {', '.join(fields)}")
+    for name, field in fields.items():
+        if name not in value and field.default is dataclasses.MISSING:
+            raise InputError(f"{file}: {here}{name} is missing; {key} needs it")
+    types = typing.get_type_hints(kind, include_extras=True)
+    return kind(**{name: _build(types[name], item, here + name, file) for name, item in value.items()})
+
+
+def _number(value: Any, kind: type) -> float | int | None:
+    """A finite number; YAML takes 1e-4 for text, which a person does not."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    try:
+        number = float(value)
+        if not math.isfinite(number):
+            return None
+        return number if kind is float else int(number) if number == int(number) else None
+    except (ValueError, OverflowError):
+        return None
+
+
+def _allowed(kind: Any) -> str:
+    """What a key takes, in words."""
+    inner, marks = _bare(kind)
+    if typing.get_origin(inner) is tuple:
+        first, second = typing.get_args(inner)
+        return "a list" if second is ... else f"a list of two numbers, each {_bare(first)[1][0]}"
+    if typing.get_origin(inner) is Literal:
+        words = ", ".join(typing.get_args(inner))
+    elif inner is Path:
+        words = "a path"
+    else:
+        words = f"{'a whole number' if inner is int else 'a number'} {marks[0]}"
+    return f"{words}, or null" if _optional(kind) else words
+
+
+def _refused(key: str, value: Any, allowed: str, file: str) -> InputError:
+    return InputError(f"{file}: {key or 'the recipe'} cannot be {str(value)[:60]!r}; it takes {allowed}")

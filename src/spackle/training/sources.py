@@ -1,9 +1,10 @@
-"""Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs."""
+"""Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
@@ -18,6 +19,7 @@ from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.errors import InputError
 from spackle.image import film_to_pixels, load_photo
+from spackle.pseudo import PseudoFiles
 from spackle.render import Renderer
 from spackle.training.composites import composite
 from spackle.training.reverse_view import reverse_view, seen_from, with_backing
@@ -26,6 +28,7 @@ from spackle.training.sample import Sample
 COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
 FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
 FRAMES = 24  # of a path, one of which is the virtual camera
+UNCOMPLETED = "none"  # the inpainter that leaves its holes open
 
 
 class Source(Protocol):
@@ -101,6 +104,48 @@ class StereoPairs:
         base = lift(left, depth, camera).gaussians
         rendering = self.renderer.render(base, beside)
         return Sample.of(base, rendering, beside, camera, right, torch.ones_like(rendering.alpha, dtype=torch.bool))
+
+
+class PseudoViews:
+    """Random views with holes and their completed targets of a pseudo-supervised dataset (appendix, "Dataset")."""
+
+    name = "pseudo"
+
+    def __init__(self, location: str | os.PathLike[str]) -> None:
+        """Read the manifest.
+
+        Raises:
+            InputError: no finished dataset, one without holes, or one whose targets nobody has completed.
+        """
+        self.files = PseudoFiles(location)
+        config = self.files.manifest.config
+        if config.get("inpainter", {}).get("name") == UNCOMPLETED:
+            raise InputError(f"{location}: built with --inpainter none, so its targets teach nothing: build another")
+        self._open = [
+            (photo, view)
+            for photo, (_, sample) in enumerate(self.files.samples)
+            for view, hole in enumerate(sample.holes)
+            if hole > 0
+        ]
+        if not self._open:
+            raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
+
+    @property
+    def digest(self) -> str:
+        """The same for the same dataset, wherever it lies."""
+        return self.files.manifest.digest
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        """A view, the same for the same state of `rng`; its rendering is the stored one.
+
+        Raises:
+            InputError: a shard that is missing or damaged.
+        """
+        photo, index = self._open[int(rng.integers(len(self._open)))]
+        found = self.files.group(photo).view(index, with_base=True)
+        assert found.base is not None
+        known = torch.ones_like(found.mask)
+        return Sample.of(found.base, found.rendering, found.camera, found.photo_camera, found.target, known)
 
 
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:

@@ -18,11 +18,13 @@ from spackle.evaluation.suite.values import Found, Need, Row
 from spackle.formats import save_png
 from spackle.render import Renderer
 from spackle.residual import ResidualNet
-from spackle.training.cache import Cache, load_sample
+from spackle.training.data import Cache
 from spackle.training.features import FeatureNet, SqueezeNet
+from spackle.training.method import Objective
 from spackle.training.recipe import LossRecipe
+from spackle.training.residual_method import complete_samples
+from spackle.training.sample import load_sample
 from spackle.training.sources import Composites
-from spackle.training.validation import Judge
 
 BATCH, CELLS = 4, 96
 PHOTOS, PHOTO = 4, (420, 560)
@@ -55,7 +57,7 @@ def training_section(
     torch.manual_seed(0)
     net: FeatureNet | None = SqueezeNet().to(device) if features else None
     dtype = pick_dtype("auto", device)
-    judge = Judge(LossRecipe(feature_size=None), net, renderer, dtype, device)
+    judge = Objective(LossRecipe(feature_size=None), net, renderer, dtype, device)
     network = ResidualNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), 1e-4)
     with tempfile.TemporaryDirectory() as folder:
@@ -65,7 +67,7 @@ def training_section(
         def step(lap: Lap) -> None:
             samples = [load_sample(files[pick]) for pick in picks.permutation(len(files))[:batch]]
             lap(LOAD)
-            seen = judge.complete(network, samples)
+            seen = complete_samples(network, samples, renderer, dtype)
             lap(FORWARD)
             loss, _ = judge.total(seen)
             lap(LOSS)

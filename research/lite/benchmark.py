@@ -1,0 +1,113 @@
+"""The lite base's depth beside two guesses that need no photo, on measured depth, as a Markdown table.
+
+    python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2] [--weights FILE] \
+        [--pictures PNG]
+
+Each --stereo is a folder of scenes, each with a scene.json, or of the format of ETH3D and Middlebury 2014 (calib.txt).
+Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in metres; --last takes the last share of
+its frames, those that `lite.yaml` does not learn from. Every guess gets the scale and shift that fit best
+(`depth_loss.py`). The last line is the time for a photo of 640×480, median of 9.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from depth_loss import DepthScore, score_depth, vertical_ramp
+from frames import JUDGED_SIDE, Frame, Measured, of_camera, of_scenes, reduced
+from method import colored, ends, sheet
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from spackle.bases.lite.base import LiteBase
+from spackle.evaluation.datasets.stereo import pair_of_2014
+from spackle.formats import save_png
+from spackle.image import load_photo
+from spackle.training.recipe import RgbdFolder
+
+GUESSES = ("constant", "ramp", "lite")
+
+
+def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]]:
+    """Groups of frames by name."""
+    for folder in arguments.stereo:
+        plain = [scene for scene in sorted(folder.iterdir()) if not (scene / "scene.json").is_file() and scene.is_dir()]
+        if len(plain) < len(list(folder.iterdir())):
+            yield folder.name, [file.read(JUDGED_SIDE) for file in of_scenes(folder, "--stereo")]
+        for scene in plain:
+            case = pair_of_2014(scene)
+            assert case.depth is not None
+            known = case.depth()
+            yield scene.name, [reduced(load_photo(case.photo).rgb, known.depth, known.valid, JUDGED_SIDE)]
+    for folder, unit in zip(arguments.rgbd, arguments.unit, strict=True):
+        files: list[Measured] = of_camera(RgbdFolder(folder, 1.0, unit), arguments.last)[1]
+        yield folder.name, [file.read(JUDGED_SIDE) for file in files]
+
+
+def guesses(base: LiteBase, frame: Frame) -> dict[str, Tensor]:
+    """Each guess of a frame's inverse depth, [H, W]."""
+    height, width = frame.inverse_depth.shape
+    seen = base.inverse_depth(frame.rgb.permute(1, 2, 0))[None, None]
+    seen = interpolate(seen, size=(height, width), mode="bilinear", align_corners=False)[0, 0]
+    return dict(zip(GUESSES, (torch.ones(height, width), vertical_ramp(height, width), seen), strict=True))
+
+
+def score(frame: Frame, guess: Tensor) -> DepthScore:
+    return score_depth(guess, 1 / frame.inverse_depth.where(frame.valid, 1.0), frame.valid)
+
+
+def seconds(base: LiteBase, runs: int = 9) -> float:
+    """For a photo of 640×480, from its pixels to the inverse depth."""
+    photo, times = torch.rand(480, 640, 3), []
+    for _ in range(runs + 1):
+        start = time.perf_counter()
+        base.inverse_depth(photo)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--stereo", type=Path, action="append", default=[])
+    parser.add_argument("--rgbd", type=Path, action="append", default=[])
+    parser.add_argument("--unit", type=float, action="append", default=[])
+    parser.add_argument("--last", type=float, default=0.2)
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--pictures", type=Path)
+    arguments = parser.parse_args()
+    base = LiteBase.load(arguments.weights)
+
+    print("| set | frames | constant | ramp | lite | against the better | δ < 1.25: constant | ramp | lite |")
+    print("|---|---" + "|---:" * 7 + "|")
+    rows = []
+    for name, frames in frames_of(arguments):
+        found: dict[str, list[DepthScore]] = {guess: [] for guess in GUESSES}
+        shown = range(0, len(frames), max(1, len(frames) // 3))[:3]
+        for number, frame in enumerate(frames):
+            each = guesses(base, frame)
+            for guess in GUESSES:
+                found[guess].append(score(frame, each[guess]))
+            if number in shown:
+                seen, true = each["lite"], frame.inverse_depth
+                known = colored(true, *ends(true[frame.valid]), frame.valid)
+                rows.append([frame.rgb.permute(1, 2, 0), colored(seen, *ends(seen[frame.valid])), known])
+        errors = [statistics.mean(s.abs_rel for s in found[guess]) for guess in GUESSES]
+        deltas = [statistics.mean(s.delta for s in found[guess]) for guess in GUESSES]
+        cells = [
+            *(f"{e:.4f}" for e in errors),
+            f"{errors[2] / min(errors[:2]) - 1:+.1%}",
+            *(f"{d:.1%}" for d in deltas),
+        ]
+        print(f"| {name} | {len(frames)} | {' | '.join(cells)} |", flush=True)
+    print(f"\n640×480: {seconds(base):.3f} s on {torch.get_num_threads()} threads")
+    if arguments.pictures:
+        save_png(sheet(rows, 320), arguments.pictures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""What a predicted inverse depth is compared with: the loss (up to a factor, up to a line, in its steps) and the score.
+
+The score brings a relative inverse depth to the truth by its best scale and shift, beside a guess that needs no photo.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from frames import Frame
+from mixture import DepthBatch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from spackle.bases.lite.base import network_size
+from spackle.training.recipe import Share
+
+FARTHEST = 0.02  # of the median inverse depth: what is farther, sky above all, counts as this far
+NEAREST = 20.0
+AT_MOST = 2.0  # an error in log inverse depth beyond this counts as this: such truth is more often wrong than hard
+STEEPEST = 1.0  # likewise of a step between neighbours
+SCALES = (1, 2, 4, 8)  # strides at which steps are compared
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthLossWeights:
+    """How much each term counts."""
+
+    factor: Share = 1.0
+    line: Share = 1.0
+    steps: Share = 0.5
+    offset: Share = 0.1  # of no use to anyone, but without it features grow until half precision cannot hold them
+
+
+def depth_loss(
+    predicted: Tensor, truth: Tensor, valid: Tensor, weights: DepthLossWeights
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss [], and its terms [] unweighted, as means over the pictures.
+
+    With t the true inverse depth over its median, and e = predicted − log t minus its own median:
+    factor is mean |e|; line is mean |a·exp(predicted) + b − t| / (t + 0.2) after the least-squares a ≥ 0 and b,
+    in the spirit of MiDaS (Ranftl et al. 2020); steps is the sum over `SCALES` of mean |∂e/∂x| + |∂e/∂y|;
+    offset is the size of the median that e was freed from, which the other terms do not know.
+
+    Args:
+        predicted: [B, H, W] log inverse depth.
+        truth: [B, H, W] inverse depth in any unit, 0 for infinitely far.
+        valid: [B, H, W] bool, where the truth is known.
+        weights: of the terms.
+    """
+    mask = valid.to(predicted.dtype)
+    truth = (truth / _median(truth, valid & (truth > 0)).clamp_min(1e-6)).clamp(FARTHEST, NEAREST)
+    error = predicted - truth.log()
+    offset = _median(error, valid)
+    middle = offset.detach()
+    error = error - middle
+    terms = {
+        "factor": _mean(error.abs().clamp_max(AT_MOST), mask).mean(),
+        "line": _line(predicted - middle, truth, mask).mean(),
+        "steps": _steps(error, mask).mean(),
+        "offset": offset.where(valid.any(2).any(1)[:, None, None], 0.0).abs().mean(),
+    }
+    total = weights.factor * terms["factor"] + weights.line * terms["line"] + weights.steps * terms["steps"]
+    total = total + weights.offset * terms["offset"]
+    return total, {name: term.detach() for name, term in terms.items()}
+
+
+def _line(predicted: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+    """[B] error of the inverse depth after its best scale and shift."""
+    inverse = predicted.clamp(-8, 4).exp()
+    count = mask.sum((1, 2)).clamp_min(1)
+
+    def mean(x: Tensor) -> Tensor:
+        return ((mask * x).sum((1, 2)) / count)[:, None, None]
+
+    p, t = inverse - mean(inverse), truth - mean(truth)
+    scale = (mean(p * t) / (mean(p * p) + 1e-3)).clamp_min(0)
+    return _mean((scale * p - t).abs() / (truth + 0.2), mask)
+
+
+def _steps(error: Tensor, mask: Tensor) -> Tensor:
+    """[B] how differently neighbours differ, at several strides."""
+    total = error.new_zeros(len(error))
+    for stride in SCALES:
+        e, m = error[:, ::stride, ::stride], mask[:, ::stride, ::stride]
+        for axis in (1, 2):
+            n = e.shape[axis] - 1
+            both = m.narrow(axis, 1, n) * m.narrow(axis, 0, n)
+            step = (e.narrow(axis, 1, n) - e.narrow(axis, 0, n)).abs().clamp_max(STEEPEST)
+            total = total + (step * both).sum((1, 2)) / m.sum((1, 2)).clamp_min(1)
+    return total
+
+
+def _mean(x: Tensor, mask: Tensor) -> Tensor:
+    return (x * mask).sum((1, 2)) / mask.sum((1, 2)).clamp_min(1)
+
+
+def _median(x: Tensor, valid: Tensor) -> Tensor:
+    """[B, 1, 1] of the valid values; 1 where there are none."""
+    values = [
+        one[known].median() if bool(known.any()) else one.new_ones(()) for one, known in zip(x, valid, strict=True)
+    ]
+    return torch.stack(values)[:, None, None]
+
+
+FARTHEST_FACTOR = 2.0  # an aligned depth is at most this many times the farthest true one
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthScore:
+    """Of one picture."""
+
+    abs_rel: float  # mean |z − z*| / z*
+    delta: float  # share of pixels with max(z/z*, z*/z) < 1.25
+
+
+def score_depth(inverse_depth: Tensor, depth: Tensor, valid: Tensor) -> DepthScore:
+    """Align an inverse depth to the truth by least squares in inverse depth, then compare depths.
+
+    Args:
+        inverse_depth: [H, W] up to scale and shift.
+        depth: [H, W] true z in any unit.
+        valid: [H, W] bool, where it is known.
+    """
+    true = 1 / depth[valid].double()
+    found = align(inverse_depth[valid].double(), true).clamp_min(true.min() / FARTHEST_FACTOR)
+    ratio = true / found  # of depths: found over true
+    within = torch.maximum(ratio, 1 / ratio) < 1.25
+    return DepthScore(float((ratio - 1).abs().mean()), float(within.double().mean()))
+
+
+def align(values: Tensor, true: Tensor) -> Tensor:
+    """[N] a·values + b nearest to `true` [N] by least squares; its mean where the values are all the same."""
+    v, t = values - values.mean(), true - true.mean()
+    spread = (v * v).sum()
+    scale = (v * t).sum() / spread if spread > 1e-12 * len(v) * values.abs().max() ** 2 else v.new_zeros(())
+    return scale * v + true.mean()
+
+
+def vertical_ramp(height: int, width: int) -> Tensor:
+    """[H, W] the guess that needs no photo: what stands lower in the picture is nearer."""
+    return (torch.arange(height) + 0.5)[:, None].expand(height, width)
+
+
+MEASURES = ("abs_rel", "delta", "ramp_abs_rel", "loss", "factor", "line", "steps", "offset")
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthJudge:
+    """What the loss needs besides a batch."""
+
+    weights: DepthLossWeights
+    pixels: int  # of what the network sees of a judged frame, nearly
+    precision: torch.dtype
+    device: torch.device  # of the network
+
+    def total(self, network: nn.Module, batch: DepthBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [] with gradients, and its terms [] unweighted."""
+        predicted = self._run(network, batch.rgb)
+        truth, valid = batch.inverse_depth.to(self.device), batch.valid.to(self.device)
+        return depth_loss(predicted, truth, valid, self.weights)
+
+    @torch.no_grad()
+    def measure(self, network: nn.Module, frame: Frame) -> dict[str, float]:
+        """`MEASURES` of a frame: scores at its own size, the loss at the network's."""
+        batch = self._batch(frame)
+        predicted = self._run(network, batch.rgb)
+        truth, valid = batch.inverse_depth.to(self.device), batch.valid.to(self.device)
+        loss, terms = depth_loss(predicted, truth, valid, self.weights)
+        depth = 1 / frame.inverse_depth.where(frame.valid, 1.0)
+        score = score_depth(_at_size_of(frame, predicted), depth, frame.valid)
+        ramp = score_depth(vertical_ramp(*depth.shape), depth, frame.valid)
+        scores = {"abs_rel": score.abs_rel, "delta": score.delta, "ramp_abs_rel": ramp.abs_rel, "loss": float(loss)}
+        return {**scores, **{name: float(term) for name, term in terms.items()}}
+
+    @torch.no_grad()
+    def predict(self, network: nn.Module, frame: Frame) -> Tensor:
+        """[H, W] inverse depth up to a factor, at the frame's size."""
+        return _at_size_of(frame, self._run(network, self._batch(frame).rgb))
+
+    def _run(self, network: nn.Module, rgb: Tensor) -> Tensor:
+        picture = rgb.to(self.device).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(self.device.type, self.precision, enabled=self.precision != torch.float32):
+            predicted: Tensor = network(picture)
+        return predicted.float()
+
+    def _batch(self, frame: Frame) -> DepthBatch:
+        """A frame at the size that the network sees."""
+        height, width = frame.inverse_depth.shape
+        return DepthBatch.of([frame], network_size(height, width, self.pixels))
+
+
+def _at_size_of(frame: Frame, predicted: Tensor) -> Tensor:
+    """[H, W] inverse depth from its logarithm [1, h, w]."""
+    size = frame.inverse_depth.shape
+    return interpolate(predicted.exp()[None], size=size, mode="bilinear", align_corners=False)[0, 0].cpu()

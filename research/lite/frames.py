@@ -1,0 +1,254 @@
+"""Photos with measured depth, of depth cameras and stereo pairs, and their augmentation: other views, other light."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate
+
+from spackle.errors import InputError
+from spackle.training.data import find_files
+from spackle.training.recipe import RgbdFolder
+from spackle.training.sources import load_frame, load_pair
+
+Rng = np.random.Generator
+FOCAL = 1.1  # in widths: of photos whose lens is not known; only turning the camera asks for it
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """A photo with depth."""
+
+    rgb: Tensor  # [3, H, W] sRGB in 0..1
+    inverse_depth: Tensor  # [H, W] in any unit, 0 for infinitely far
+    valid: Tensor  # [H, W] bool, where it is known
+
+
+@dataclasses.dataclass(frozen=True)
+class Turning:
+    """How far the camera of a frame is turned and zoomed."""
+
+    zoom: tuple[float, float]  # drawn between these; 1 shows as much of the frame as fits
+    degrees: tuple[float, float, float]  # standard deviations of yaw, pitch and roll
+
+
+MEASURED = Turning((1.0, 1.6), (4.0, 4.0, 4.0))  # few scenes have to look like many
+MADE = Turning((1.0, 1.4), (2.0, 2.0, 3.0))  # synthetic scenes are drawn from every side already
+GUESSED = Turning((1.0, 1.4), (3.0, 3.0, 4.0))  # photos are many
+MINGLED_SCALE = (-0.2, 0.8)  # logarithms: of the front frame's median inverse depth over the back one's
+
+
+def turned(rng: Rng, frame: Frame, height: int, width: int, turning: Turning) -> Frame:
+    """What a camera at the same place sees that looks elsewhere, and by chance its mirror image.
+
+    Turning needs no depth; the inverse depth changes by the known factor between the two cameras' axes.
+    """
+    rows, columns = frame.inverse_depth.shape
+    focal = FOCAL * columns
+    scale = max(width / columns, height / rows) * math.exp(rng.uniform(*np.log(turning.zoom)))
+    stretch = math.exp(rng.normal(0, 0.06))
+    rotation = torch.from_numpy(_rotation(np.radians(rng.normal(0, 1, 3) * turning.degrees))).float()
+    slack = [max(0.0, have * scale - want) / 2 for have, want in ((columns, width), (rows, height))]
+    cx, cy = (want / 2 + rng.uniform(-s, s) for want, s in zip((width, height), slack, strict=True))
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    ray = torch.stack([(x - cx) / (focal * scale * stretch), (y - cy) / (focal * scale), torch.ones_like(x)], -1)
+    ray = ray @ rotation  # in the frame's own camera
+    u, v = (ray[..., k] / ray[..., 2] * focal for k in (0, 1))
+    grid = torch.stack([2 * u / columns, 2 * v / rows], -1)[None]
+    rgb = grid_sample(frame.rgb[None], grid, padding_mode="reflection", align_corners=False)[0]
+    depth = torch.stack([frame.inverse_depth, frame.valid.float()])[None]
+    inverse_depth, valid = grid_sample(depth, grid, mode="nearest", padding_mode="zeros", align_corners=False)[0]
+    result = Frame(rgb, inverse_depth * ray[..., 2], valid > 0.5)
+    if rng.random() < 0.5:
+        return Frame(*(tensor.flip(-1) for tensor in (result.rgb, result.inverse_depth, result.valid)))
+    return result
+
+
+def _rotation(angles: NDArray[Any]) -> NDArray[Any]:
+    """[3, 3] from yaw, pitch and roll in radians."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
+    yaw = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    pitch = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    roll = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
+    return np.asarray(roll @ pitch @ yaw)
+
+
+def mingled(rng: Rng, back: Frame, front: Frame) -> Frame:
+    """Two frames of one size as one scene: each pixel shows the one that is nearer there, at a random relative scale.
+
+    Outlines and textures are real ones, and so is the depth; only that these things ever stood together is not.
+    """
+    both = back.valid & front.valid
+    if not bool(both.any()):
+        return back
+    medians = [frame.inverse_depth[both].median() for frame in (back, front)]
+    scale = float(medians[0] / medians[1].clamp_min(1e-9)) * math.exp(rng.uniform(*MINGLED_SCALE))
+    nearer = both & (front.inverse_depth * scale > back.inverse_depth)
+    return Frame(
+        torch.where(nearer, front.rgb, back.rgb),
+        torch.where(nearer, front.inverse_depth * scale, back.inverse_depth),
+        back.valid,
+    )
+
+
+def relit(rng: Rng, rgb: Tensor) -> Tensor:
+    """[3, H, W] in another light, through another camera: brightness, tint, contrast, glare, grey, blur, noise."""
+    tint = np.exp(rng.normal(0, 0.12, (3, 1, 1)) + rng.normal(0, 0.2)).astype(np.float32)
+    rgb = rgb * torch.from_numpy(tint)
+    mean = rgb.mean((1, 2), keepdim=True)
+    harsh = rng.uniform(0.3, 1.0) if rng.random() < 0.12 else 0.0  # black shadows, and what is bright is white
+    rgb = mean + (rgb - mean) * math.exp(rng.normal(harsh, 0.25)) + harsh * rng.uniform(-0.1, 0.3)
+    grey = rgb.mean(0, keepdim=True)
+    rgb = grey + (rgb - grey) * (0.0 if rng.random() < 0.2 else math.exp(rng.normal(0, 0.3)))
+    rgb = rgb.clamp(1e-4, 1) ** math.exp(rng.normal(0, 0.2))
+    if rng.random() < 0.2:
+        rgb = avg_pool2d(rgb[None], 3, 1, 1, count_include_pad=False)[0]
+    if rng.random() < 0.3:
+        noise = torch.from_numpy(rng.standard_normal(rgb.shape).astype(np.float32))
+        rgb = rgb + float(rng.uniform(0, 0.04)) * noise
+    return rgb.clamp(0, 1)
+
+
+SAME = 1.05  # neighbours whose depths differ by less are of one surface
+
+
+def seen_from_the_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Each pixel's depth carried to where the right photo shows it; the nearest of several stays.
+
+    Args:
+        depth: [H, W] of the left photo's pixels; both cameras look the same way, so it is the right one's as well.
+        valid: [H, W] bool, where it is known.
+        shift: [H, W] pixels to the right, negative in a pair that is not crossed.
+
+    Returns:
+        Depth [H, W], and where it is known [H, W]: not where the left photo shows nothing. A surface that the
+        right camera sees wider has cracks, which are closed where they are a pixel wide.
+    """
+    rows, columns = (place.numpy() for place in valid.nonzero(as_tuple=True))
+    z = depth[valid].numpy()
+    places = np.rint(columns + shift[valid].numpy()).astype(np.int64)
+    order = np.argsort(-z, kind="stable")  # of several values for one pixel NumPy keeps the last
+    order = order[(places[order] >= 0) & (places[order] < depth.shape[1])]
+    carried = np.full(tuple(depth.shape), np.inf, depth.numpy().dtype)
+    carried[rows[order], places[order]] = z[order]
+    _close_cracks(carried)
+    known = torch.from_numpy(np.isfinite(carried))
+    return torch.from_numpy(carried).where(known, 0.0), known
+
+
+def _close_cracks(depth: NDArray[np.float32]) -> None:
+    """A pixel between two of one surface, with nothing in it or what lies behind, is of that surface."""
+    left, middle, right = depth[:, :-2], depth[:, 1:-1], depth[:, 2:]
+    nearer, farther = np.minimum(left, right), np.maximum(left, right)
+    crack = (farther < SAME * nearer) & (middle > SAME * farther)
+    middle[crack] = farther[crack]
+
+
+LEARNED_SIDE = 480  # pixels of the longer side of what is learned from
+JUDGED_SIDE = 768  # likewise of what is judged by
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A file, and how to read it."""
+
+    path: Path  # of the photo, or of the stereo pair's folder
+    unit_m: float | None = None  # of a depth camera's files; None for a stereo pair
+    right: bool = False  # of a stereo pair's photos the right one
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages."""
+        return f"{self.path} (right)" if self.right else str(self.path)
+
+    def read(self, side: int) -> Frame:
+        """The frame, its longer side no longer than this; InputError where it cannot be read."""
+        if self.unit_m is not None:
+            rgb, stored = load_frame(self.path, self.unit_m)
+            return reduced(rgb, stored.depth, stored.valid, side)
+        rgb, other, stored, camera, beside = load_pair(self.path)
+        if not self.right:
+            return reduced(rgb, stored.depth, stored.valid, side)
+        moved = beside.world_to_camera[0, 3] * camera.K[0, 0]
+        shift = beside.K[0, 2] - camera.K[0, 2] + moved / stored.depth.clamp_min(1e-6)
+        return reduced(other, *seen_from_the_right(stored.depth, stored.valid, shift), side)
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Frames that look alike: they are judged together, and each group counts as much as another."""
+
+    name: str
+    files: Sequence[Measured]
+
+
+def of_camera(camera: RgbdFolder, held: float) -> tuple[list[Measured], list[Measured]]:
+    """The frames of a folder to learn from, and those to be judged by, which are the last ones by name.
+
+    Args:
+        camera: the folder and its unit.
+        held: the share that is judged by; one frame at least is learned from.
+
+    Raises:
+        InputError: no such folder, or nothing in it.
+    """
+    files = find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg")
+    frames = [Measured(file, camera.unit_m) for file in files]
+    judged = min(math.ceil(held * len(frames) - 1e-9), len(frames) - 1)
+    return frames[: len(frames) - judged], frames[len(frames) - judged :]
+
+
+def of_scenes(folder: Path, key: str, *, right: bool = False) -> list[Measured]:
+    """The left photos of the stereo pairs below a folder, or both; InputError where there are none."""
+    folders = [file.parent for file in find_files(folder, key, ("scene.json",), "scene.json")]
+    return [Measured(pair, right=side) for side in ((False, True) if right else (False,)) for pair in folders]
+
+
+def read_all(files: Sequence[Measured], side: int, warn: Callable[[str], None]) -> list[tuple[str, Frame]]:
+    """Frames with their names; those that cannot be read are passed over and named.
+
+    Raises:
+        InputError: none can be read.
+    """
+    frames: list[tuple[str, Frame]] = []
+    for file in files:
+        try:
+            frame = file.read(side)
+        except (InputError, ValueError) as error:
+            warn(f"passed over: {error}")
+            continue
+        if bool(frame.valid.any()):
+            frames.append((file.name, frame))
+        else:
+            warn(f"passed over: {file.name}: hardly a pixel has a depth")
+    if not frames:
+        raise InputError(f"{files[0].path}: none of {len(files)} frames can be read: see above")
+    return frames
+
+
+def reduced(rgb: Tensor, depth: Tensor, valid: Tensor, side: int) -> Frame:
+    """A frame no larger than it need be; its depth is one of the pixels' that it stands for, no mean.
+
+    Args:
+        rgb: [H, W, 3] sRGB.
+        depth: [h, w] of nearly the same shape.
+        valid: [h, w] bool.
+        side: pixels of the longer side.
+    """
+    height, width = rgb.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    height, width = max(1, round(height * scale)), max(1, round(width * scale))
+    picture = rgb.permute(2, 0, 1)
+    if scale < 1:
+        picture = interpolate(picture[None], size=(height, width), mode="bicubic", antialias=True)[0].clamp(0, 1)
+    inverse_depth = torch.where(valid, 1 / depth.clamp_min(1e-6), 0.0)[None, None]
+    inverse_depth = interpolate(inverse_depth, size=(height, width), mode="nearest-exact")[0, 0]
+    return Frame(picture.contiguous(), inverse_depth, inverse_depth > 0)

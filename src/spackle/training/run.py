@@ -1,0 +1,186 @@
+"""`spackle train`: a recipe to weights, whichever method learns."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+from rich.console import Console
+
+from spackle.errors import InputError
+from spackle.output_folder import alone_in, results_folder
+from spackle.machine import hardware, versions, without_nan
+from spackle.progress import Reporter
+from spackle.jobs.report import write_report
+from spackle.signals import asked_to_stop
+from spackle.training.callbacks import Callbacks, Logs, open_logs
+from spackle.training.checkpoint import (
+    BEST,
+    LAST,
+    LOGS,
+    NEWEST,
+    PREVIOUS,
+    RUN,
+    Checkpoint,
+    Progress,
+    check_same_run,
+    load_checkpoint,
+    remove_run,
+)
+from spackle.training.direct_ft import plan_direct_ft
+from spackle.training.method import Method
+from spackle.training.plan import Plan, RunContext, Start
+from spackle.training.ranks import joined_ranks
+from spackle.training.recipe import AnyRecipe, DeviceName, load_recipe, plain
+from spackle.training.residual_method import plan_residual
+from spackle.training.trainer import Trainer
+
+R = TypeVar("R", bound=AnyRecipe)
+MethodName = Literal["residual", "direct-ft"]
+_END = {
+    "steps": "all steps are done",
+    "patience": "no improvement any more",
+    "stopped": "stopped; the same command goes on from here",
+}
+
+
+def train_recipe(
+    path: Path,
+    overrides: Sequence[str],
+    output: Path,
+    reporter: Reporter,
+    *,
+    method: MethodName = "residual",
+    checkpoint: Path | None = None,
+    overwrite: bool = False,
+) -> str:
+    """Train as a recipe says, or go on with a run.
+
+    Args:
+        path: the recipe, a file or a packaged one's name.
+        overrides: `key=value` on top of it.
+        output: a folder for all results.
+        reporter: the first process speaks through it.
+        method: what learns: the residual, or SHARP's own decoder.
+        checkpoint: weights of SHARP, where it is SHARP that learns.
+        overwrite: start anew where `output` holds a run; the samples in it stay.
+
+    Returns:
+        Why the run ended, as `Trainer.run` has it.
+
+    Raises:
+        InputError: a recipe, file or folder that cannot be used, a loss that is no number.
+    """
+    if method != "direct-ft" and checkpoint is not None:
+        raise InputError(f"-c {checkpoint}: --method {method} learns without a base: leave the option out")
+    recipe = load_recipe(path, overrides)
+    if method == "direct-ft":
+        return train(recipe, lambda context: plan_direct_ft(context, checkpoint), output, reporter, overwrite)
+    return train(recipe, plan_residual, output, reporter, overwrite)
+
+
+def train(
+    recipe: R, make_plan: Callable[[RunContext[R]], Plan], output: Path, reporter: Reporter, overwrite: bool = False
+) -> str:
+    """Train by a plan, or go on with a run; one of several processes where torchrun started them.
+
+    Args:
+        recipe: what to do.
+        make_plan: refuses at once what cannot be used, and does no long work yet.
+        output, reporter, overwrite: as for `train_recipe`.
+
+    Returns:
+        Why the run ended: "steps", "patience" or "stopped", as `Trainer.run` has it.
+
+    Raises:
+        InputError: a file or folder that cannot be used, a loss that is no number.
+    """
+    kind = _device_kind(recipe.run.device)
+    with joined_ranks(kind) as ranks, contextlib.ExitStack() as stack:
+        if recipe.optim.batch % ranks.count:
+            raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {ranks.count} processes")
+        device = torch.device(kind, ranks.local) if kind == "cuda" else torch.device(kind)
+        if ranks.first:  # which alone writes
+            stack.enter_context(results_folder(output, (NEWEST, PREVIOUS, BEST, LAST, RUN)))
+            stack.enter_context(alone_in(output, "training"))
+        else:
+            reporter = Reporter(console=Console(quiet=True))
+        context = RunContext(recipe, output, reporter, ranks, device)
+        plan = make_plan(context)
+        found = None if overwrite else _find_checkpoint(context, plan)
+        start = plan.start()
+        ranks.wait()  # nobody looks for checkpoints any more
+        if overwrite and ranks.first:
+            remove_run(output)
+        return _run(context, start, found)
+
+
+def _device_kind(name: DeviceName) -> str:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("run.device=cuda: torch finds no GPU here; use run.device=cpu")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
+def _find_checkpoint(context: RunContext[Any], plan: Plan) -> Checkpoint | None:
+    """The one to go on from; InputError where the folder holds another run."""
+    output, say = context.output, context.reporter.say
+    checkpoint, problem = load_checkpoint(output)
+    if checkpoint is None:
+        return None
+    check_same_run(checkpoint, plan.method, context.recipe, plan.digest, output)
+    if problem:
+        say(f"{problem}: going on from the one before it")
+    say(f"{output}: going on from step {checkpoint.progress.step}")
+    return checkpoint
+
+
+def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) -> str:
+    """The training loop with everything that it talks to: bars, logs, signals and run.json."""
+    recipe, ranks, say, output = context.recipe, context.ranks, context.reporter.say, context.output
+    method, first = start.method, checkpoint.progress.step if checkpoint else 0
+    logs = open_logs(output / LOGS, first, say) if ranks.first else Logs()
+    facts = {
+        "method": method.name,
+        "aim": method.aim,
+        **start.facts,
+        "precision": str(context.precision).removeprefix("torch."),
+        "processes": ranks.count,
+        "recipe": plain(recipe),
+        "versions": versions(),
+        "hardware": hardware(context.device),
+    }
+
+    def write(progress: Progress, ended: str | None = None) -> None:
+        write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), output / RUN)
+
+    def validated(progress: Progress) -> None:
+        say(_summary(progress, method))
+        write(progress)
+
+    with (
+        contextlib.closing(logs),
+        context.reporter.steps("train", first, recipe.optim.steps) as tell,
+        asked_to_stop(alone=ranks.count == 1) as stop,
+    ):
+        callbacks = Callbacks(lambda step, numbers: tell(step, f"loss {numbers['loss']:.4f}"), validated, write, stop)
+        trainer = Trainer(
+            recipe, method, start.network, context.device, output, callbacks, logs, ranks, start.optimizer
+        )
+        if checkpoint:
+            trainer.resume(checkpoint)
+        why = trainer.run()
+    if ranks.first:
+        write(trainer.progress, why)
+        say(f"{_END[why]}, step {trainer.progress.step} -> {output}")
+    return why
+
+
+def _summary(progress: Progress, method: Method) -> str:
+    """The last validation in a line."""
+    found = progress.history[-1]
+    best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
+    return f"step {progress.step}: validation {method.aim} {found[method.aim]:.4f} ({best}){method.describe(found)}"

@@ -1,0 +1,493 @@
+"""The naive decoupled baseline: SHARP's own decoder learns, all else stays, and what comes out predicts."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import hashlib
+import json
+import shutil
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command import Run, names_in, report_of, run
+from photos import metres, picture, read_ply, write_depth, write_photo
+from PIL import Image
+from safetensors import safe_open
+from safetensors.torch import save_file
+from scenes import shifted
+from sharp_weights import MICRO
+from torch import Tensor
+from training_runs import killed_at, started, state
+
+from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.checkpoint import (
+    NOTE,
+    PARTS,
+    Owner,
+    decoder_bytes,
+    deterministic_weights,
+    expected_shapes,
+    link_owner,
+    load_network,
+)
+from spackle.bases.sharp.layers import CONFIGS
+from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.image import Photo
+from spackle.pseudo import PseudoFiles
+from spackle.render import get_renderer
+from spackle.render.reference import ReferenceRenderer
+from spackle.training.callbacks import Callbacks
+from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
+from spackle.training.method import Objective, ViewBatch
+from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
+from spackle.training.trainer import Trainer
+
+pytest.importorskip("yaml")
+
+CPU = torch.device("cpu")
+WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+PHOTOS, VIEWS = 3, 5
+NUDGE = 3e-4  # how far weights are moved to see what becomes of it
+RECIPE = """
+data: {pseudo: %s, validation_views: 5}
+loss: {features: none}
+optim: {steps: 4, batch: 4, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
+run: {validate_every: 4, save_every: 2, log_every: 1}
+"""
+SMALL = """
+from spackle.bases.sharp import layers
+import dataclasses
+layers.CONFIGS["tiny"] = dataclasses.replace(layers.TINY, window=128)
+"""  # for other processes, as the fixture `small` does it in this one
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small() -> Iterator[None]:
+    """SHARP from 512² pixels, which a checkpoint's width cannot tell from the tiny one; and sums in one order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(CONFIGS, "tiny", MICRO)
+        yield
+    torch.set_num_threads(before)
+
+
+def opaque_weights() -> dict[str, Tensor]:
+    """Random ones, but the photo's own view has no holes."""
+    weights = deterministic_weights(expected_shapes(MICRO))
+    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0
+    return weights
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights, a dataset that was built with them, and a recipe."""
+    place = tmp_path_factory.mktemp("direct")
+    save_file(opaque_weights(), place / "sharp.safetensors")
+    (place / "photos").mkdir()
+    for number in range(PHOTOS):
+        Image.fromarray(picture(WIDTH, HEIGHT)).rotate(180 * number).save(place / "photos" / f"{number}.png")
+    Image.fromarray(picture(WIDTH, HEIGHT) // 2).save(place / "photos" / "2.png")  # no two alike
+    done = build(place, place / "data", "--base", "sharp", "-c", place / "sharp.safetensors", "--precision", "fp32")
+    assert done.code == 0, done.err
+    (place / "recipe.yaml").write_text(RECIPE % (place / "data"))
+    return place
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> tuple[Path, Run]:
+    """A run of four steps in one go."""
+    return place / "whole", train(place, place / "whole")
+
+
+@pytest.fixture(scope="module")
+def base(place: Path) -> TunableSharp:
+    """To be read only."""
+    return TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
+
+
+def build(place: Path, output: Path, *more: object) -> Run:
+    options = ("--views", VIEWS, "--threads", 1, "--trajectory", "swipe", "--disparity", 0.4, 0.4)
+    return run("dataset", "build", "--photos", place / "photos", "-o", output, *options, *more)
+
+
+def arguments(place: Path, output: Path, *more: object) -> list[str]:
+    words = ("--recipe", place / "recipe.yaml", "-o", output, "-c", place / "sharp.safetensors", *more)
+    return ["train", "--method", "direct-ft", *map(str, words)]
+
+
+def train(place: Path, output: Path, *more: object) -> Run:
+    return run(*arguments(place, output, *more))
+
+
+def photo() -> Photo:
+    return Photo(torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255, FOCAL, "--focal-px", Path("a.png"))
+
+
+# The way from the decoder's weights to a picture --------------------------------------------------
+
+
+def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSharp) -> None:
+    camera = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+    with torch.no_grad():
+        before = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, camera))
+    after = SharpBase(base.network).predict(photo()).gaussians
+    aside = camera.looking(torch.tensor([0.2, -0.1, 0.1]), torch.tensor([0.0, 0.0, 4.0]))
+    # The second one has pixels that are not square, as after rounding to a working size.
+    for view in (camera, shifted(camera, 0.3).resized(WIDTH, HEIGHT + 6), aside):
+        one = get_renderer().render(before, normalised_camera(view, camera))
+        other = get_renderer().render(after, view)
+        for name, tolerance in (("rgb", 1e-4), ("alpha", 1e-4), ("depth", 1e-3)):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
+def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
+    """Along the gradient itself. Rendering follows below: its cut-offs are steps, which no gradient sees."""
+    decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
+    seen = base.see(photo().rgb, Camera.from_focal(FOCAL, WIDTH, HEIGHT))
+
+    def loss() -> Tensor:
+        random = torch.Generator().manual_seed(0)
+        tensors = base.gaussians(decoder, seen).tensors
+        return torch.stack([(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]).sum()
+
+    loss().backward()
+    named = [(key, weight) for key, weight in decoder.named_parameters() if key.startswith(name)]
+    weights = [weight for _, weight in named if weight.requires_grad]
+    assert all(weight.grad is not None for weight in weights)
+    length = float(torch.stack([weight.grad.norm() for weight in weights]).norm())
+    found = []
+    with torch.no_grad():
+        for step in (NUDGE, -2 * NUDGE):
+            for weight in weights:
+                weight.add_(weight.grad, alpha=step / length)
+            found.append(float(loss()))
+    assert (found[0] - found[1]) / (2 * NUDGE) == pytest.approx(length, rel=0.005)
+
+
+def test_gradients_from_pixels_to_gaussians_are_those_of_the_plain_renderer(base: TunableSharp) -> None:
+    """Through a camera whose matrix is no rotation."""
+    camera = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
+    with torch.no_grad():
+        every = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, camera))
+    some = every.select(slice(None, None, 317))
+    some = dataclasses.replace(some, scales=10 * some.scales, opacities=0.9 * some.opacities)
+    weights = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    found = []
+    for renderer in (get_renderer(), ReferenceRenderer()):
+        asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in some.tensors))
+        drawn = renderer.render(asking, normalised_camera(shifted(camera, 0.2), camera))
+        ((drawn.rgb.mean(-1) + 0.1 * drawn.depth + drawn.alpha) * weights).sum().backward()
+        found.append([tensor.grad for tensor in asking.tensors])
+    for one, other in zip(*found, strict=True):
+        assert float((one - other).norm()) < 0.01 * float(other.norm())
+
+
+def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
+    group = PseudoFiles(place / "data").group(0)
+    views = [group.view(index) for index in range(group.views)]
+    holes = [float(view.mask.float().mean()) for view in views]
+    assert holes[0] < 0.02 < min(holes[1:])
+    with torch.no_grad():
+        batch = render_photo(base.network.gaussian_decoder(), base, views, get_renderer())
+    assert batch.rgb.shape == (VIEWS, HEIGHT, WIDTH, 3)
+    assert float((batch.rgb - batch.base_rgb).abs().max()) < 1.01 / 510  # 8 bits
+    assert torch.equal(batch.alpha < 0.95, batch.hole)
+
+
+def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: object) -> list[float]:
+    """Train in this process; returns the loss of each step."""
+    recipe = Recipe(
+        data=DataRecipe(validation_views=VIEWS),
+        loss=LossRecipe(features="none"),
+        optim=OptimRecipe(warmup=0, steps=steps, batch=VIEWS_AT_ONCE, **optim),  # type: ignore[arg-type]
+        run=RunRecipe(log_every=1, validate_every=1000, save_every=1000),
+    )
+    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, CPU)
+    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
+    photos = PseudoPhotos.of(recipe.data, place / "data", owner.sha256)
+    method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), objective, 4, 0)
+    losses: list[float] = []
+
+    def note(step: int, numbers: dict[str, float]) -> None:
+        losses.append(numbers["loss"])
+
+    def nothing(progress: object) -> None:
+        """Nobody is told."""
+
+    callbacks = Callbacks(note, nothing, nothing, lambda: False)
+    decoder = base.network.gaussian_decoder().let_learn()
+    assert Trainer(recipe, method, decoder, CPU, folder, callbacks).run() == "steps"
+    return losses
+
+
+def digest_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_path: Path) -> None:
+    base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
+    before = {name: tensor.clone() for name, tensor in base.network.state_dict().items()}
+    losses = learn(place, base, tmp_path, 8, lr=2e-3, min_lr=2e-3, ema=0.0)
+    assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
+    unused = "feature_model.decoder.fusions.4.resnet1."
+    for name, tensor in base.network.state_dict().items():
+        stays = not name.startswith(PARTS) or name.startswith(unused)
+        assert torch.equal(tensor, before[name]) == stays, name
+    assert sum(not name.startswith(PARTS) for name in before) > 100
+
+
+def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: Path) -> None:
+    base = TunableSharp.load(place / "sharp.safetensors", torch.bfloat16, CPU)
+    types = {name: weight.dtype for name, weight in base.network.named_parameters()}
+    assert torch.bfloat16 in types.values()
+    assert {kind for name, kind in types.items() if name.startswith(PARTS)} == {torch.float32}
+    before = base.network.prediction_head.texture_prediction_head.bias.detach().clone()
+    first, *_ = learn(place, base, tmp_path, 1, lr=1e-5, min_lr=1e-5)
+    moved = (base.network.prediction_head.texture_prediction_head.bias.detach() - before).abs()
+    assert 0 < float(moved.max()) < 2e-5  # bf16 has no such number beside 6
+    exact, *_ = learn(place, TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU), tmp_path, 1)
+    assert first == pytest.approx(exact, rel=0.02)
+
+
+# Runs ---------------------------------------------------------------------------------------------
+
+
+def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Path, Run]) -> None:
+    folder, done = whole
+    assert done.code == 0, done.err
+    assert "2 photos to learn from, 1 to be judged by" in done.err
+    assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
+    report = json.loads((folder / "run.json").read_text())
+    assert (report["method"], report["ended"], report["step"]) == ("direct-ft", "steps", 4)
+    assert report["checkpoint"]["sha256"] == digest_of(place / "sharp.safetensors")
+    total = sum(tensor.numel() for tensor in load_network(place / "sharp.safetensors", torch.float32).parameters())
+    assert report["parameters"]["learn"] + report["parameters"]["stay"] == total
+    assert report["history"][0].keys() >= {"loss", "color", "preserve", "hole_psnr", "seen_psnr", "har_after"}
+    with Image.open(folder / "pictures" / "0000004.png") as sheet:
+        assert sheet.size == (3 * WIDTH, 2 * HEIGHT)
+    assert state(folder).method == "direct-ft"
+
+
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    process = child(place, tmp_path / "out", killed_at(3))
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert state(tmp_path / "out").progress.step == 2
+    done = train(place, tmp_path / "out")
+    assert f"{tmp_path}/out: going on from step 2" in done.lines
+    one, other = state(tmp_path / "out"), state(whole[0])
+    assert all(torch.equal(one.network[name], other.network[name]) for name in other.network)
+    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
+
+
+def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
+    return started(arguments(place, output, *more), f"{SMALL}\n{code}", **environment)
+
+
+@pytest.mark.slow
+def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
+    """Two photos each: gradients are added up within a process, and then put together."""
+    options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    processes = [child(place, tmp_path / "two", "", *options, RANK=str(rank), **shared) for rank in range(2)]
+    alone = train(place, tmp_path / "one", *options)
+    said = [process.communicate()[1] for process in processes]
+    assert (alone.code, *(process.returncode for process in processes)) == (0, 0, 0), said
+    one, two = (state(tmp_path / name).optimizer["state"] for name in ("one", "two"))
+    assert one.keys() == two.keys()
+    # Weights would not do: the optimiser's first step makes as much of a gradient's noise as of a gradient.
+    mine, yours = (torch.cat([part["exp_avg"].flatten() for part in found.values()]) for found in (one, two))
+    assert float((mine - yours).norm()) < 1e-3 * float(mine.norm())
+
+
+def test_photos_that_make_a_loss_that_is_no_number_are_named(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    complete = DirectFt.complete
+
+    def broken(self: DirectFt, network: torch.nn.Module, step: int, items: list[int]) -> ViewBatch:
+        batch = complete(self, network, step, items)
+        return dataclasses.replace(batch, rgb=batch.rgb * float("nan"))
+
+    monkeypatch.setattr(DirectFt, "complete", broken)
+    done = train(place, tmp_path / "out")
+    assert done.code == 2
+    assert "out/bad_batch: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
+    (named,) = (tmp_path / "out" / "bad_batch").glob("*.json")
+    facts = json.loads(named.read_text())
+    assert (facts["step"], facts["views"][0], len(facts["views"])) == (0, 0, VIEWS_AT_ONCE)
+    assert facts["photo"] in names_in(place / "photos")
+
+
+def test_each_step_has_the_photos_own_view_and_others_in_turn(place: Path) -> None:
+    photos = PseudoPhotos.of(DataRecipe(validation_views=1), place / "data", digest_of(place / "sharp.safetensors"))
+    assert sorted([*photos.learned, *photos.validation]) == list(range(PHOTOS))
+    drawn = [[view.index for view in photos.drawn(0, np.random.default_rng([0, step]))] for step in range(20)]
+    assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
+    assert {view for views in drawn for view in views} == set(range(VIEWS))
+
+
+# What is refused ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["data.pseudo=null"], "data.pseudo: missing, and --method direct-ft learns from nothing else"),
+        (["data.photos={place}/photos"], "data.photos: its samples have Gaussians that cannot change"),
+        (["data.rgbd=[{{folder: x, focal_px: 1}}]"], "leave it out (data.rgbd=[])"),
+        (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
+        (["data.pseudo={place}/photos"], "manifest.json: not there"),
+        (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
+        (["-c", "{place}/nothing.pt"], "nothing.pt: no such checkpoint"),
+        (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
+        (["optim.batch=6"], "optim.batch=6: with --method direct-ft each process takes 4 views"),
+        (["init=weights.safetensors"], "init=weights.safetensors: --method direct-ft starts from SHARP's checkpoint"),
+    ],
+)
+def test_what_cannot_be_trained_is_said_in_a_line(
+    place: Path, whole: tuple[Path, Run], other_inputs: None, tmp_path: Path, options: list[str], said: str
+) -> None:
+    done = train(place, tmp_path / "out", *(option.format(place=place) for option in options))
+    assert done.code == 2
+    assert said in done.lines[-1]
+    assert len(done.lines) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def other_inputs(place: Path) -> None:
+    """A dataset of another base, and other weights of SHARP."""
+    for number in range(PHOTOS):
+        write_depth(place / "depth" / f"{number}.npy", metres(WIDTH, HEIGHT))
+    assert build(place, place / "rgbd", "--base", "rgbd", "--depth", place / "depth").code == 0
+    save_file(deterministic_weights(expected_shapes(MICRO)), place / "other.safetensors")
+
+
+def test_without_weights_a_line_says_where_they_come_from(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
+    words = ("train", "--method", "direct-ft", "--recipe", place / "recipe.yaml", "-o", tmp_path / "out")
+    done = run(*words)
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "`spackle weights get sharp` downloads them" in done.err
+    (tmp_path / "weights").mkdir()
+    shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")  # its content tells its kind
+    assert run(*words, "optim.steps=1").code == 0
+
+
+def test_a_folder_belongs_to_one_method(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert f"{out}: holds a run of --method direct-ft, not of residual: choose another with -o" in done.err
+    done = train(place, out, "optim.lr=2e-3")
+    assert "another recipe (optim.lr differs)" in done.err
+    done = run("train", "--recipe", place / "recipe.yaml", "-o", tmp_path / "new", "-c", place / "sharp.safetensors")
+    assert "sharp.safetensors: --method residual learns without a base" in done.err
+
+
+def test_a_checkpoint_of_another_network_is_a_line(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    saved = torch.load(out / "checkpoint.pt", weights_only=True)
+    name = "prediction_head.geometry_prediction_head.weight"
+    saved["network"][name] = saved["network"][name][:2].clone()
+    torch.save(saved, out / "checkpoint.pt")
+    done = train(place, out, "optim.steps=5")
+    assert done.code == 2
+    assert f"its checkpoint is of another network (1 tensors differ, e.g. {name})" in done.lines[-1]
+
+
+# What comes out predicts --------------------------------------------------------------------------
+
+
+def gaussians_from(weights: Path) -> Gaussians:
+    return SharpBase.load(weights, precision="fp32", device="cpu").predict(photo()).gaussians
+
+
+def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
+    place: Path, whole: tuple[Path, Run], base: TunableSharp, tmp_path: Path
+) -> None:
+    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
+    (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
+    for _ in range(2):
+        link_owner(owner, tmp_path)
+    same, learned = gaussians_from(tmp_path / "same.safetensors"), gaussians_from(whole[0] / "best.safetensors")
+    before = gaussians_from(owner.path)
+    assert all(map(torch.equal, same.tensors, before.tensors))
+    assert not any(map(torch.equal, learned.tensors, before.tensors))
+    assert len(learned) == len(before)
+    state = load_network(whole[0] / "best.safetensors", torch.float32).state_dict()
+    weights = opaque_weights()
+    assert {name for name in state if not torch.equal(state[name], weights[name])} <= {
+        name for name in state if name.startswith(PARTS)
+    }
+
+
+def test_the_link_to_a_checkpoint_is_renewed_and_counts_more_than_a_name(
+    place: Path, base: TunableSharp, tmp_path: Path
+) -> None:
+    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
+    (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
+    link_owner(Owner(tmp_path / "where it lay once", owner.sha256), tmp_path)
+    link_owner(owner, tmp_path)
+    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")  # another of that name
+    assert len(gaussians_from(tmp_path / "same.safetensors")) > 0
+
+
+def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+    write_photo(tmp_path / "photo.png")
+    options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
+    for name, weights in (("base", place / "sharp.safetensors"), ("tuned", whole[0] / "best.safetensors")):
+        done = run("predict", *options, "-o", tmp_path / name, "-c", weights)
+        assert done.code == 0, done.err
+    assert report_of(tmp_path / "tuned" / "photo")["base"]["weights"] == "best.safetensors"
+    base, tuned = (read_ply(tmp_path / name / "photo" / "base.ply") for name in ("base", "tuned"))
+    assert base.count == tuned.count
+
+
+def test_a_decoder_finds_its_checkpoint_beside_it_and_holds_it_to_its_digest(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    best = tmp_path / "best.safetensors"
+    with safe_open(whole[0] / "best.safetensors", framework="pt") as opened:
+        notes, tensors = opened.metadata(), {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    assert json.loads(notes[NOTE])["checkpoint"] == "sharp.safetensors"  # and not where it lies here
+    moved = {**json.loads(notes[NOTE]), "checkpoint": "/elsewhere/sharp.safetensors"}
+    save_file(tensors, best, {NOTE: json.dumps(moved)})
+    with pytest.raises(InputError, match=r"trained on sharp\.safetensors, which is not beside it: put"):
+        SharpBase.load(best)
+    assert str(place) not in str(notes)
+    (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
+    assert all(map(torch.equal, gaussians_from(best).tensors, gaussians_from(whole[0] / "best.safetensors").tensors))
+    (tmp_path / "sharp.safetensors").unlink()
+    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")
+    with pytest.raises(InputError, match="trained on a checkpoint with the SHA-256"):
+        SharpBase.load(best)
+    (tmp_path / "sharp.safetensors").unlink()
+    (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
+    name = min(tensors)
+    save_file({key: value for key, value in tensors.items() if key != name}, best, notes)
+    with pytest.raises(InputError, match=f"1 names differ, e.g. {name}"):
+        SharpBase.load(best)
+    save_file(tensors, best, {NOTE: "{}"})
+    with pytest.raises(InputError, match="does not say which checkpoint it was trained on"):
+        SharpBase.load(best)

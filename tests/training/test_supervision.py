@@ -1,0 +1,785 @@
+"""Samples: holes where geometry says so, crops that show what the whole does, files that come back as they were."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from photos import metres, picture, write_depth, write_photo
+from PIL import Image
+from scenes import Scene, away, box_before_wall, psnr, shifted, slanted_plane, tensors_of, texture, wall
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.render import TILE, CpuRenderer
+from spackle.render.protocol import Rendering
+from spackle.residual.compose import DELTA_CHANNELS, compose
+from spackle.residual.hole_features import CELL, Cues
+from spackle.training import composites, sources
+from spackle.training.composites import composite
+from spackle.training.data import Cache
+from spackle.training.residual_method import MIN_AUX, training_cells
+from spackle.training.reverse_view import reverse_view, seen_from, with_backing
+from spackle.training.sample import HALVED, HOLE_SHARE, Sample, load_sample, random_crops, save_sample
+from spackle.training.sources import Composites, RgbdFrames, StereoPairs, load_pair
+
+CPU = CpuRenderer()
+PROPERTY = settings(deadline=None, max_examples=40)
+SEEDS = st.integers(0, 2**32 - 1)
+RIM_PX = 2  # blobs are wider than pixels: what stands in front hides so much more than a line says, but not less
+
+
+# Geometry, once more ------------------------------------------------------------------------------
+
+
+def grow(mask: Tensor, pixels: int = 1) -> Tensor:
+    side = 2 * pixels + 1
+    return max_pool2d(mask.float()[None, None], side, stride=1, padding=pixels)[0, 0] > 0
+
+
+def outline(scene: Scene) -> Tensor:
+    """[H, W] bool: the pixels within the rim of the photo's depth edges, where blobs of both sides mix."""
+    edge = torch.zeros_like(scene.depth, dtype=torch.bool)
+    across, down = (scene.depth.diff(dim=axis).abs() > 0.5 for axis in (1, 0))
+    for side in (edge[:, 1:], edge[:, :-1]):
+        side |= across
+    for side in (edge[1:], edge[:-1]):
+        side |= down
+    return grow(edge, RIM_PX - 1)
+
+
+def looking(camera: Camera, *eye: float) -> Camera:
+    return camera.looking(torch.tensor(eye), torch.tensor([0.0, 0.0, 4.0]))
+
+
+def layers(seed: int, width: int = 96, height: int = 72) -> Scene:
+    """Three panels at different depths before a wall, all of them facing the camera."""
+    rng = np.random.default_rng(seed)
+    depth, rgb = torch.full((height, width), 7.0), texture(height, width, (0.2, 0.4, 0.7))
+    for near, hue in ((5.0, (0.4, 0.7, 0.3)), (3.2, (0.8, 0.3, 0.2)), (2.0, (0.7, 0.7, 0.2))):
+        top, left = rng.integers(8, height // 2), rng.integers(8, width // 2)
+        panel = (slice(top, top + rng.integers(12, 30)), slice(left, left + rng.integers(12, 40)))
+        depth[panel], rgb[panel] = near, texture(height, width, hue)[panel]
+    return Scene(rgb, depth, Camera.from_focal(80, width, height))
+
+
+def surface(scene: Scene) -> tuple[Any, float, float, float]:
+    """The points [H, W, 3] that a photo's pixels show, its focal length and principal point, by hand."""
+    height, width = scene.depth.shape
+    focal, cx, cy = float(scene.camera.K[0, 0]), float(scene.camera.K[0, 2]), float(scene.camera.K[1, 2])
+    v, u = np.mgrid[:height, :width] + 0.5
+    z = scene.depth.numpy().astype(np.float64)
+    return np.stack([(u - cx) / focal * z, (v - cy) / focal * z, z], axis=-1), focal, cx, cy
+
+
+def seen_at(scene: Scene, viewer: Camera) -> tuple[Any, Any]:
+    """Pixel coordinates [H, W, 2] and depth [H, W] of the photo's surface in another camera, by hand."""
+    points, focal, cx, cy = surface(scene)
+    pose = viewer.world_to_camera.double().numpy()
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return focal * local[..., :2] / local[..., 2:] + (cx, cy), local[..., 2]
+
+
+def outside(scene: Scene, viewer: Camera, margin: float = 0.0) -> Tensor:
+    """[H, W] bool: the photo's pixels more than `margin` pixels outside another camera's frame."""
+    uv, z = seen_at(scene, viewer)
+    height, width = scene.depth.shape
+    beyond = (uv < -margin).any(-1) | (uv[..., 0] > width + margin) | (uv[..., 1] > height + margin) | (z <= 0)
+    return torch.from_numpy(beyond)
+
+
+def hidden(scene: Scene, viewer: Camera) -> Tensor:
+    """[H, W] bool: the pixels of a photo of facing layers whose line to a camera's eye meets another layer.
+
+    Only what the photo shows can stand in the way, so the line's point at each layer's depth must fall
+    on a pixel of that layer.
+    """
+    points, focal, cx, cy = surface(scene)
+    depth, (height, width) = scene.depth.numpy(), scene.depth.shape
+    pose = viewer.world_to_camera.double().numpy()
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    covered = np.zeros((height, width), np.bool_)
+    for z in np.unique(depth):
+        share = (z - eye[2]) / (points[..., 2] - eye[2])  # of the way from the eye to the point
+        x, y, _ = np.moveaxis(eye + share[..., None] * (points - eye), -1, 0)
+        column, row = np.floor(focal * x / z + cx).astype(int), np.floor(focal * y / z + cy).astype(int)
+        there = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (share > 0) & (share < 0.999)
+        covered |= there & (depth[row.clip(0, height - 1), column.clip(0, width - 1)] == z)
+    return torch.from_numpy(covered)
+
+
+def reverse(scene: Scene, viewer: Camera) -> Sample:
+    base = scene.lift()
+    seen = seen_from(base.gaussians, viewer, CPU)
+    seen = with_backing(seen, base.gaussians.means[:, 2], scene.camera.height, scene.camera.width)
+    return reverse_view(base, seen, scene.rgb, viewer, CPU)
+
+
+EYES = [(0.35, 0.0, 0.0), (-0.35, 0.0, 0.0), (0.0, 0.3, 0.0), (0.25, -0.2, 0.15), (-0.2, 0.2, -0.3)]
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("seed", [None, 0, 1, 2])
+def test_holes_are_what_a_line_to_the_eye_says(seed: int | None, eye: tuple[float, float, float]) -> None:
+    scene = box_before_wall() if seed is None else layers(seed)
+    viewer = looking(scene.camera, *eye)
+    behind, beside = hidden(scene, viewer), outside(scene, viewer)
+    hole = reverse(scene, viewer).hole
+    expected = behind | beside
+    assert int(behind.sum()) > 100
+    assert not (hole & ~grow(expected, RIM_PX) & ~outline(scene)).any()  # what the virtual camera sees is no hole
+    assert not (~hole & ~grow(~expected)).any()  # what it does not see is one
+    assert not (~hole & outside(scene, viewer, margin=1)).any()
+
+
+def test_holes_are_what_a_depth_buffer_says() -> None:
+    """The surface's points drawn into the virtual camera one by one; the nearest of a pixel is seen."""
+    scene = box_before_wall()
+    viewer = looking(scene.camera, 0.3, 0.1, 0.0)
+    uv, z = seen_at(scene, viewer)
+    height, width = scene.depth.shape
+    buffer = np.full((height, width), np.inf)
+    column, row = np.floor(uv).astype(int)[..., 0], np.floor(uv).astype(int)[..., 1]
+    there = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    for v, u in np.argwhere(there).tolist():
+        buffer[row[v, u], column[v, u]] = min(buffer[row[v, u], column[v, u]], z[v, u])
+    nearest = buffer[row.clip(0, height - 1), column.clip(0, width - 1)]
+    expected = torch.from_numpy(~there | (z > 1.1 * nearest))
+    hole = reverse(scene, viewer).hole
+    assert int(expected.sum()) > 500
+    assert not (hole & ~grow(expected, RIM_PX) & ~outline(scene)).any()
+    assert not (~hole & ~grow(~expected)).any()
+    assert (hole == expected).float().mean() > 0.95
+
+
+def test_a_viewer_in_the_photos_place_leaves_no_hole_and_one_turned_away_nothing_else() -> None:
+    assert not reverse(wall(), wall().camera).hole.any()
+    assert reverse(wall(), away(wall().camera)).hole.all()
+    box = box_before_wall()
+    assert not (reverse(box, box.camera).hole & ~outline(box)).any()
+    assert reverse(box, away(box.camera)).hole.all()
+
+
+def test_the_truth_is_the_photo_and_nothing_wants_gradients() -> None:
+    scene = box_before_wall()
+    viewer = shifted(scene.camera, 0.3)
+    base = scene.lift()
+    wanting = Gaussians(*(t.clone().requires_grad_() for t in base.gaussians.tensors))
+    seen = seen_from(wanting, viewer, CPU)
+    sample = reverse_view(BasePrediction(wanting, scene.camera, {}), seen, scene.rgb, viewer, CPU)
+    assert torch.equal(sample.target, scene.rgb)
+    assert sample.valid.all()
+    assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
+    assert 0 < len(sample.base) < len(wanting)
+    found = list(tensors_of(sample)) + list(tensors_of(sample.crop(0, 0, 16, 16)))
+    assert len(found) > 40
+    assert not any(tensor.requires_grad for tensor in found)
+
+
+def named_tensors(value: object, prefix: str = "") -> dict[str, Tensor]:
+    if isinstance(value, Tensor):
+        return {prefix: value}
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    parts = (named_tensors(getattr(value, f.name), f"{prefix}.{f.name}".strip(".")) for f in fields)
+    return {name: tensor for part in parts for name, tensor in part.items()}
+
+
+# What is seen -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("height", "width"), [(4, 6), (7, 9), (6, 5), (1, 4), (2, 2)])
+def test_a_backing_is_seen_with_the_farthest_pixel_of_its_cell(height: int, width: int) -> None:
+    generator = torch.Generator().manual_seed(height * width)
+    rows, columns = height // 2, width // 2
+    count = height * width + rows * columns
+    z = 1 + torch.rand(count, generator=generator)
+    seen = torch.rand(count, generator=generator) < 0.5
+    expected = seen[: height * width].tolist()
+    for row, column in itertools.product(range(rows), range(columns)):
+        cell = [(2 * row + dy) * width + 2 * column + dx for dy in (0, 1) for dx in (0, 1)]
+        expected.append(bool(seen[max(cell, key=lambda pixel: float(z[pixel]))]))
+    assert with_backing(seen, z, height, width).tolist() == expected
+
+
+def test_a_backing_lies_where_the_pixel_it_goes_with_lies() -> None:
+    """The order of a base's Gaussians is as `with_backing` takes it to be."""
+    scene = box_before_wall(width=95, height=71)  # odd, so that cells straddle the box's outline
+    means = scene.base().means
+    marked = torch.zeros(len(means), dtype=torch.bool)
+    marked[: 71 * 95] = means[: 71 * 95, 2] > 4  # the wall's pixels
+    backing = with_backing(marked, means[:, 2], 71, 95)[71 * 95 :]
+    assert torch.equal(backing, means[71 * 95 :, 2] > 4)
+    assert 0 < int(backing.sum()) < len(backing)
+
+
+PLANES = [(3.0, 3.001, 1), (2.0, 6.0, 1), (2.0, 5.0, 0), (1.5, 5.0, 0)]
+
+
+@pytest.mark.parametrize(("near", "far", "axis"), PLANES)
+@pytest.mark.parametrize("eye", [(0.6, 0.0, 0.0), (-0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.4, -0.3, 0.3)])
+def test_a_plane_seen_from_the_side_stays_closed(
+    near: float, far: float, axis: int, eye: tuple[float, float, float]
+) -> None:
+    """Up to the steepest slope that counts as a surface: three percent of the depth for each pixel."""
+    scene = slanted_plane(near, far, axis)
+    viewer = looking(scene.camera, *eye)
+    beside = outside(scene, viewer)
+    sample = reverse(scene, viewer)
+    assert int((~beside).sum()) > 10_000
+    assert not (sample.hole & ~grow(beside)).any()
+    assert not (~sample.hole & outside(scene, viewer, margin=1)).any()
+
+
+# Crops --------------------------------------------------------------------------------------------
+
+CROP = 24  # cells
+VIEW = (144, 112)  # width, height
+PLACES = [(0, 0), (0, 48), (32, 0), (32, 48), (13, 27), (7, 20)]  # corners, and off the tiles' grid
+
+
+def whole_view(name: str) -> Sample:
+    width, height = VIEW
+    if name == "box from aside":
+        scene = box_before_wall(width=width, height=height, focal=120)
+        view = shifted(scene.camera, 0.4)
+        base = scene.base()
+        valid = torch.ones(height, width, dtype=torch.bool)
+        return Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb, valid)
+    ground = slanted_plane(1.5, 4.5, 0, width, height, 120)
+    stone = torch.zeros(height, width, dtype=torch.bool)
+    stone[40:80, 50:90] = True
+    scene = dataclasses.replace(ground, depth=torch.where(stone, 1.2, ground.depth))
+    return reverse(scene, looking(scene.camera, -0.4, 0.1, 0.1))
+
+
+@pytest.fixture(scope="module", params=["box from aside", "ground in reverse"])
+def whole(request: pytest.FixtureRequest) -> Sample:
+    return whole_view(request.param)
+
+
+def pixels_of(tiles: Tensor, height: int, width: int) -> Tensor:
+    return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
+
+
+def window(row: int, column: int, cells: int = CROP) -> tuple[slice, slice]:
+    return slice(CELL * row, CELL * (row + cells)), slice(CELL * column, CELL * (column + cells))
+
+
+@pytest.mark.parametrize(("row", "column"), PLACES)
+def test_a_completed_crop_is_the_crop_of_the_completed_view(whole: Sample, row: int, column: int) -> None:
+    crop = whole.crop(row, column, CROP, CROP)
+    chosen = training_cells(crop.cues)
+    cells = torch.zeros_like(whole.cues.mask)
+    cells[row : row + CROP, column : column + CROP] = chosen
+    deltas = 0.5 * torch.randn(int(chosen.sum()), DELTA_CHANNELS, generator=torch.Generator().manual_seed(row))
+    aux = compose(whole.seeds.select(cells), deltas, whole.camera)
+    crop_aux = compose(crop.seeds.select(chosen), deltas, crop.camera)
+    assert torch.allclose(aux.means, crop_aux.means, rtol=1e-5, atol=1e-5)
+    base = whole.base
+    expected = CPU.render([base, aux], whole.camera)
+    found = CPU.render([crop.base, crop_aux], crop.camera, tiles=crop.tiles, onto=crop.rendering)
+    inside = pixels_of(crop.tiles, CELL * CROP, CELL * CROP)
+    part = window(row, column)
+    assert crop.hole.any()
+    assert (found.rgb - whole.rendering.rgb[part]).abs()[crop.hole].max() > 0.05  # aux does something
+    assert (found.rgb - expected.rgb[part]).abs()[inside].max() < 1e-5
+    assert (found.alpha - expected.alpha[part]).abs()[inside].max() < 1e-5
+    assert torch.equal(found.rgb[~inside], whole.rendering.rgb[part][~inside])
+
+
+@pytest.mark.parametrize(("row", "column"), PLACES)
+def test_a_crops_parts_are_those_of_the_view(whole: Sample, row: int, column: int) -> None:
+    crop = whole.crop(row, column, CROP, CROP)
+    part, cells = window(row, column), (slice(row, row + CROP), slice(column, column + CROP))
+    for name, tensor in named_tensors(crop.cues).items():
+        assert torch.equal(tensor, getattr(whole.cues, name)[cells])
+    for name, tensor in named_tensors(crop.rim).items():
+        assert torch.equal(tensor, getattr(whole.rim, name)[cells])
+    for name in ("inverse_depth", "slope", "rgb"):
+        assert torch.equal(getattr(crop.seeds, name), getattr(whole.seeds, name)[cells])
+    assert crop.seeds.unit == whole.seeds.unit
+    for name, tensor in named_tensors(crop.rendering).items():
+        assert torch.equal(tensor, getattr(whole.rendering, name)[part])
+    for name in ("target", "valid", "hole"):
+        assert torch.equal(getattr(crop, name), getattr(whole, name)[part])
+    # A seed keeps its place in the world, and cells of the crop's own picture are 2×2 of its pixels.
+    depth = 1 / crop.seeds.inverse_depth
+    world = whole.camera.unproject(whole.seeds.uv[cells], depth)
+    assert torch.allclose(crop.camera.unproject(crop.seeds.uv, depth), world, atol=1e-5)
+    assert torch.equal(crop.seeds.uv[0, 0], torch.tensor([1.0, 1.0]))
+    assert torch.equal(crop.seeds.uv[-1, -1], torch.tensor([2.0 * CROP - 1, 2.0 * CROP - 1]))
+    assert (crop.camera.width, crop.camera.height) == (2 * CROP, 2 * CROP)
+
+
+@pytest.mark.parametrize(("row", "column"), PLACES)
+def test_a_crop_needs_fewer_gaussians_for_the_same_picture(whole: Sample, row: int, column: int) -> None:
+    crop = whole.crop(row, column, CROP, CROP)
+    assert len(crop.base) < 0.7 * len(whole.base)
+    inside = pixels_of(crop.tiles, CELL * CROP, CELL * CROP)
+    again = CPU.render(crop.base, crop.camera, tiles=crop.tiles)
+    for name, tensor in named_tensors(again).items():
+        truth = getattr(whole.rendering, name)[window(row, column)]
+        assert (tensor - truth).abs()[inside].max() < (1e-4 if name == "depth" else 1e-5)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_blob_that_a_tile_shows_is_left_out(seed: int) -> None:
+    """Blobs of all sizes and shapes under a wide lens, where a projection stretches them."""
+    generator = torch.Generator().manual_seed(seed)
+    width, height, focal, count = 160, 112, 60.0, 400
+    camera = Camera.from_focal(focal, width, height)
+    uv = (1.4 * torch.rand(count, 2, generator=generator) - 0.2) * torch.tensor([width, height])
+    z = 0.5 + 4 * torch.rand(count, generator=generator)
+    scales = z[:, None] / focal * torch.exp(3.5 * torch.rand(count, 3, generator=generator) - 1)
+    opacities = 0.2 + 0.79 * torch.rand(count, generator=generator)
+    quats, colors = torch.randn(count, 4, generator=generator), torch.rand(count, 3, generator=generator)
+    base = Gaussians(camera.unproject(uv, z), quats, scales, opacities, colors)
+    view = CPU.render(base, camera)
+    alpha = torch.ones(height, width)
+    for row, column in ((20, 10), (60, 100)):
+        alpha[row : row + 3, column : column + 3] = 0
+    marked = Rendering(view.rgb, view.depth.clamp_min(0.1), alpha)
+    valid = torch.ones(height, width, dtype=torch.bool)
+    sample = Sample.of(base, marked, camera, shifted(camera, 0.2), view.rgb, valid)
+    for row, column in ((0, 0), (6, 2), (24, 48), (20, 40), (19, 33)):
+        crop = sample.crop(row, column, 32, 32)
+        fewer = CPU.render(crop.base, crop.camera, tiles=crop.tiles)
+        every = CPU.render(base, crop.camera, tiles=crop.tiles)
+        assert crop.tiles.any()
+        assert len(crop.base) < count
+        assert (fewer.rgb - every.rgb).abs().max() < 1e-6
+
+
+# Cells --------------------------------------------------------------------------------------------
+
+
+@PROPERTY
+@given(seed=SEEDS, size=st.tuples(st.integers(1, 14), st.integers(1, 14)), share=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
+def test_enough_cells_and_masked_ones_first(seed: int, size: tuple[int, int], share: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    mask = torch.rand(size, generator=generator) < share
+    alpha = (4 * torch.rand(size, generator=generator)).round() / 4  # many alike
+    zeros = torch.zeros(*size)
+    cells = training_cells(Cues(zeros[..., None].expand(*size, 3), zeros, alpha, mask))
+    assert cells.shape == mask.shape
+    assert (cells | ~mask).all()
+    assert int(cells.sum()) == max(int(mask.sum()), min(MIN_AUX, mask.numel()))
+    if (cells & ~mask).any() and not cells.all():
+        assert alpha[cells & ~mask].max() <= alpha[~cells].min()
+
+
+# Composites ---------------------------------------------------------------------------------------
+
+PALETTE = torch.tensor(
+    [[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9, 0.9, 0.1], [0.1, 0.9, 0.9], [0.8, 0.2, 0.9]]
+)
+
+
+def plain_photos() -> Callable[[np.random.Generator], Tensor]:
+    """Photos of one colour each, every one another."""
+    colors = itertools.cycle(PALETTE)
+    return lambda rng: next(colors).expand(150, 200, 3)
+
+
+def plain_composite(seed: int, objects: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, Tensor]:
+    """A composite of so many cut-outs; with one more, those before it stay the same."""
+    monkeypatch.setattr(composites, "OBJECTS", (objects, objects))
+    return composite(np.random.default_rng(seed), plain_photos(), 120, 160)
+
+
+def test_the_same_state_gives_the_same_composite() -> None:
+    generator = torch.Generator().manual_seed(0)
+    pictures = [torch.rand(90, 130, 3, generator=generator), torch.rand(200, 150, 3, generator=generator)]
+
+    def photos(rng: np.random.Generator) -> Tensor:
+        return pictures[int(rng.integers(2))]
+
+    one, two, other = (composite(np.random.default_rng(seed), photos, 96, 128) for seed in (3, 3, 4))
+    assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
+    assert not torch.equal(one[0], other[0])
+    assert not torch.equal(one[1], other[1])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_pixel_of_a_composite_comes_from_one_photo_at_a_sound_depth(seed: int) -> None:
+    rgb, inverse = composite(np.random.default_rng(seed), plain_photos(), 120, 160)
+    assert rgb.shape == (120, 160, 3)
+    assert rgb.min() >= 0
+    assert rgb.max() <= 1
+    assert inverse.isfinite().all()
+    assert inverse.min() > 0.5 / 8.0 * 0.99
+    assert inverse.max() < 1.2 / 0.7
+    distance = (rgb[:, :, None] - PALETTE).abs().amax(-1)
+    label = distance.argmin(-1)
+    mixed = distance.amin(-1) > 1e-4
+    edge = torch.zeros_like(mixed)
+    edge[:, 1:] |= label[:, 1:] != label[:, :-1]
+    edge[1:] |= label[1:] != label[:-1]
+    # Where colours mix, an outline is near; threads thinner than a pixel have none.
+    assert (mixed & ~grow(edge, 2)).float().mean() < 2e-3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_cut_out_stands_before_what_it_covers_and_has_its_outline(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [plain_composite(seed, count, monkeypatch) for count in range(5)]
+    for count, ((rgb, inverse), (next_rgb, next_inverse)) in enumerate(itertools.pairwise(steps)):
+        moved = next_inverse != inverse
+        painted = (next_rgb - rgb).abs().amax(-1) > 1e-4
+        if not painted.any():  # too small, too large or too near: left out
+            assert not moved.any()
+            continue
+        assert (next_inverse > 1.03 * inverse)[moved].all()
+        assert composites.AREA[0] < float(moved.float().mean()) < composites.AREA[1]
+        mixed = (next_rgb - PALETTE[count + 1]).abs().amax(-1) > 1e-4
+        assert (mixed & ~grow(~moved)).float().mean() < 2e-3
+        assert not (moved & ~painted).any()
+        assert (painted & ~grow(moved)).float().mean() < 2e-3
+    assert any((b[1] != a[1]).any() for a, b in itertools.pairwise(steps))
+
+
+@pytest.mark.parametrize("size", [(40, 300), (300, 40), (96, 128), (33, 35)])
+def test_a_random_crop_fills_the_frame_whatever_the_photos_shape(size: tuple[int, int]) -> None:
+    ramp = torch.linspace(0, 1, size[1])[None, :, None].expand(*size, 3)
+    for seed in range(8):
+        part = composites.random_crop(np.random.default_rng(seed), ramp, 96, 128)
+        assert part.shape == (96, 128, 3)
+        assert part.is_contiguous()
+        across = part[48, :, 0].diff()
+        assert (across > -1e-4).all() or (across < 1e-4).all()  # upright, by chance mirrored
+        assert (part - part[:1]).abs().max() < 1e-4
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+def test_a_sample_comes_back_from_its_file(tmp_path: Path) -> None:
+    scene = box_before_wall()
+    scene = dataclasses.replace(scene, rgb=(255 * scene.rgb).round() / 255)
+    sample = reverse(scene, shifted(scene.camera, 0.3)).crop(4, 6, 24, 32)
+    save_sample(sample, tmp_path / "0.safetensors")
+    found = load_sample(tmp_path / "0.safetensors")
+    before, after = named_tensors(sample), named_tensors(found)
+    assert before.keys() == after.keys()
+    assert len(before) == 23
+    for name, tensor in before.items():
+        assert after[name].dtype == tensor.dtype
+        if name in HALVED:
+            assert torch.allclose(after[name], tensor, rtol=2**-11, atol=2**-25), name
+        else:
+            assert torch.equal(after[name], tensor), name
+    assert {"base.means", "seeds.uv", "seeds.inverse_depth", "cues.mask", "target", "valid"}.isdisjoint(HALVED)
+    assert found.seeds.unit == sample.seeds.unit
+    assert (found.camera.width, found.camera.height) == (64, 48)
+    rewritten = tmp_path / "1.safetensors"
+    save_sample(found, rewritten)
+    assert rewritten.read_bytes() == (tmp_path / "0.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize("keep", [0, 5, 200, -1])
+def test_a_truncated_sample_is_said_in_a_line(tmp_path: Path, keep: int) -> None:
+    path = tmp_path / "0.safetensors"
+    scene = box_before_wall()
+    save_sample(reverse(scene, shifted(scene.camera, 0.3)).crop(0, 0, 36, 48), path)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match="no training sample, or damaged: delete it") as caught:
+        load_sample(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Views of a box from a random place, quickly made; some of them have no hole."""
+
+    asked: list[float]
+    name: str = "boxes"
+
+    def view(self, rng: np.random.Generator) -> Sample:
+        right = float(rng.uniform(-0.4, 0.4))
+        self.asked.append(right)
+        scene = box_before_wall()
+        return reverse(scene, shifted(scene.camera, right))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def fill(folder: Path, views: int) -> tuple[list[Path], list[float]]:
+    asked: list[float] = []
+    steps: list[tuple[int, int]] = []
+    warnings: list[str] = []
+    cache = Cache(folder, [Boxes(asked)], [1.0], seed=7, crops=2, cells=16)
+    files = cache.fill(views, lambda done, total: steps.append((done, total)), warnings.append)
+    assert steps == [(number + 1, views) for number in range(views)]
+    assert not warnings
+    return files, asked
+
+
+def test_an_interrupted_fill_goes_on_to_the_same_files(tmp_path: Path) -> None:
+    files, asked = fill(tmp_path / "whole", 5)
+    expected = contents(tmp_path / "whole")
+    assert len(asked) == len(set(asked)) == 5
+    assert len(files) == len(set(files)) > 5
+    assert {file.name for file in files} | {f"{n:06d}.done" for n in range(5)} == expected.keys()
+
+    part = tmp_path / "part"
+    fill(part, 3)
+    assert contents(part) == {name: data for name, data in expected.items() if name < "000003"}
+    (part / "000001.done").unlink()  # killed before its marker was written
+    (part / files[0].name).unlink()  # lost since then
+    (part / "000002.done").write_text("")  # a power cut
+    found, again = fill(part, 5)
+    assert [file.name for file in found] == [file.name for file in files]
+    assert again == asked
+    assert contents(part) == expected
+    assert fill(part, 5)[1] == []  # nothing is made twice
+
+    first = part / files[0].name
+    first.write_bytes(first.read_bytes()[:1000])
+    with pytest.raises(InputError, match="delete it, and it is made anew"):
+        load_sample(first)
+    first.unlink()
+    assert fill(part, 5)[1] == asked[:1]
+    assert contents(part) == expected
+
+
+def test_a_killed_fill_leaves_whole_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path / "whole", 2)
+    view, calls = Boxes.view, itertools.count()
+
+    def killed(self: Boxes, rng: np.random.Generator) -> Sample:
+        if next(calls) == 1:
+            raise KeyboardInterrupt
+        return view(self, rng)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Boxes, "view", killed)
+        with pytest.raises(KeyboardInterrupt):
+            fill(tmp_path / "part", 2)
+    kept = contents(tmp_path / "part")
+    assert kept.items() < contents(tmp_path / "whole").items()
+    fill(tmp_path / "part", 2)
+    assert contents(tmp_path / "part") == contents(tmp_path / "whole")
+
+
+def test_a_photo_that_cannot_be_read_is_passed_over_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources, "COMPOSITE_SIZE", (72, 96))
+    good, bad = write_photo(tmp_path / "good.png", 96, 72), tmp_path / "bad.jpg"
+    bad.write_bytes(b"\xff\xd8 no more")
+    warnings: list[str] = []
+    # A view asks for two photos at least, and often one of them is the bad one.
+    cache = Cache(tmp_path / "cache", [Composites([*[good] * 5, bad], CPU, (0.3, 0.6))], [1.0], 0, 1, 12)
+    files = cache.fill(8, lambda done, total: None, warnings.append)
+    assert files
+    assert warnings
+    assert len(warnings) + len({file.name[:6] for file in files}) <= 8
+    for line in warnings:
+        assert str(bad) in line
+        assert "passed over" in line
+        assert "\n" not in line
+    again: list[str] = []
+    assert cache.fill(8, lambda done, total: None, again.append) == files
+    assert not again  # and not tried again
+
+
+# Random crops -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 72), (97, 71), (63, 95), (33, 33)])
+def test_random_crops_have_holes_and_lie_within_the_picture(width: int, height: int) -> None:
+    scene = box_before_wall(width=width, height=height)
+    sample = reverse(scene, shifted(scene.camera, 0.35))
+    found: list[Sample] = []
+    for seed in range(6):
+        crops = random_crops(sample, np.random.default_rng(seed), 4, 16)
+        assert len(crops) <= 4
+        found += crops
+    assert found
+    for crop in found:
+        left, top = (round(float(k)) for k in (sample.camera.K[:2, 2] - crop.camera.K[:2, 2]))
+        assert left % CELL == top % CELL == 0
+        assert 0 <= left <= width - 32
+        assert 0 <= top <= height - 32
+        assert crop.target.shape == (32, 32, 3)
+        assert crop.cues.mask.shape == (16, 16)
+        assert torch.equal(crop.target, scene.rgb[top : top + 32, left : left + 32])
+        share = float((crop.rendering.alpha < 0.95).float().mean())
+        assert HOLE_SHARE[0] < share < HOLE_SHARE[1]
+    again = random_crops(sample, np.random.default_rng(0), 4, 16)
+    assert all(torch.equal(a.target, b.target) for a, b in zip(again, found, strict=False))
+
+
+@pytest.mark.parametrize(("width", "height"), [(31, 64), (64, 31), (20, 20)])
+def test_a_view_smaller_than_a_crop_gives_none(width: int, height: int) -> None:
+    scene = box_before_wall(width=width, height=height)
+    assert random_crops(reverse(scene, shifted(scene.camera, 0.35)), np.random.default_rng(0), 3, 16) == []
+
+
+def test_a_view_with_no_hole_or_nothing_else_gives_no_crop() -> None:
+    scene = wall()
+    for viewer in (scene.camera, away(scene.camera)):
+        assert random_crops(reverse(scene, viewer), np.random.default_rng(0), 3, 16) == []
+
+
+# Sources ------------------------------------------------------------------------------------------
+
+
+def write_frame(folder: Path, unit_m: float, focal: float, width: int = 96, height: int = 72) -> Path:
+    """A depth camera's two files, with some depth unknown."""
+    stored = np.round(metres(width, height) / unit_m).astype(np.uint16)
+    stored[2:5, 2:5], stored[60:63, 80:83] = 0, 65535
+    Image.fromarray(stored).save(folder / "frame-0.depth.png")
+    color = folder / "frame-0.color.jpg"
+    Image.fromarray(picture(width, height)).save(color, quality=95)
+    return color
+
+
+@pytest.mark.parametrize("unit_m", [0.001, 0.0002])
+def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float) -> None:
+    color = write_frame(tmp_path, unit_m, 80.0)
+    source = RgbdFrames([color], CPU, (0.3, 0.6), 80.0, unit_m)
+    sample, again = (source.view(np.random.default_rng(1)) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(tensors_of(sample), tensors_of(again), strict=True))
+    with Image.open(color) as image:
+        photo = torch.from_numpy(np.array(image)).float() / 255
+    assert torch.equal(sample.target, photo)
+    assert sample.camera.focal == (80.0, 80.0)
+    depth = torch.from_numpy(metres(96, 72))
+    seen, flat = ~grow(sample.hole, 2), depth == depth.median()
+    assert int(seen.sum()) > 1000
+    flat &= ~grow(depth < 3, 3)  # the wall, away from the box
+    assert torch.allclose(sample.rendering.depth[seen & flat], depth[seen & flat], rtol=0.02)
+    box = seen & ~grow(depth > 3, 3)
+    assert torch.allclose(sample.rendering.depth[box], depth[box], rtol=0.02)
+    assert sample.hole.any()
+
+
+def test_a_depth_frame_of_another_shape_is_said_in_a_line(tmp_path: Path) -> None:
+    color = write_frame(tmp_path, 0.001, 80.0)
+    write_depth(tmp_path / "frame-0.depth.png", metres(40, 72))
+    with pytest.raises(InputError, match=r"is 40×72 but photo .* is 96×72"):
+        RgbdFrames([color], CPU, (0.3, 0.6), 80.0, 0.001).view(np.random.default_rng(0))
+    (tmp_path / "frame-0.depth.png").unlink()
+    with pytest.raises(InputError, match=r"frame-0\.depth\.png: no such depth map"):
+        RgbdFrames([color], CPU, (0.3, 0.6), 80.0, 0.001).view(np.random.default_rng(0))
+
+
+WALL_PX, BOX_PX, DOFFS = 4, 12, 3.0  # disparities; what the file says is less by `doffs`
+
+
+def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any) -> Path:
+    """A box before a wall in two photos: in the right one each lies its disparity further to the left."""
+
+    def paint(shift: int, hue: tuple[float, float, float]) -> Tensor:
+        return texture(height, width + 16, hue)[:, shift : shift + width]
+
+    def photo(right: bool) -> tuple[Tensor, Tensor]:
+        wall, box = (int(right) * (d - int(DOFFS)) for d in (WALL_PX, BOX_PX))
+        there = torch.zeros(height, width, dtype=torch.bool)
+        there[24:48, 40 - box : 64 - box] = True
+        front, back = paint(box, (0.8, 0.3, 0.2)), paint(wall, (0.2, 0.4, 0.7))
+        return torch.where(there[..., None], front, back), there
+
+    folder.mkdir(parents=True, exist_ok=True)
+    left, there = photo(False)
+    for name, image in (("left", left), ("right", photo(True)[0])):
+        Image.fromarray((255 * image).round().byte().numpy()).save(folder / f"{name}.png")
+    np.save(folder / "disparity.npy", np.where(there.numpy(), BOX_PX - DOFFS, WALL_PX - DOFFS).astype(np.float32))
+    facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
+    facts |= {"focal_px": 80.0, "cx": 47.0, "cy": 36.5, "doffs_px": DOFFS, "baseline_m": 0.3, **changes}
+    (folder / "scene.json").write_text(json.dumps(facts))
+    return folder
+
+
+def test_the_right_view_of_a_pair_is_what_the_right_camera_saw(tmp_path: Path) -> None:
+    folder = write_stereo(tmp_path)
+    sample = StereoPairs([folder], CPU, (0.3, 0.6), reverse=False).view(np.random.default_rng(0))
+    with Image.open(folder / "right.png") as image:
+        right = torch.from_numpy(np.array(image)).float() / 255
+    assert torch.equal(sample.target, right)
+    covered = ~grow(sample.hole)
+    assert psnr(sample.rendering.rgb[covered], right[covered]) > 30
+    # The two planes lie where the disparities say: depth = focal · baseline / disparity.
+    depth = sample.rendering.depth
+    assert torch.allclose(depth[10:20, 10:80], torch.tensor(80 * 0.3 / WALL_PX), rtol=0.01)
+    assert torch.allclose(depth[30:42, 36:50], torch.tensor(80 * 0.3 / BOX_PX), rtol=0.01)
+    # The wall beside the box's right side was hidden, and its last column lay outside the left photo.
+    expected = torch.zeros_like(sample.hole)
+    expected[24:48, 64 - 9 : 64 - 1] = True
+    expected[:, 95:] = True
+    assert not (sample.hole & ~grow(expected)).any()
+    assert not (~sample.hole & ~grow(~expected)).any()
+    assert sample.hole[26:46, 57:61].all()
+
+
+def test_a_pair_in_reverse_has_the_left_photo_for_its_truth(tmp_path: Path) -> None:
+    folder = write_stereo(tmp_path)
+    sample = StereoPairs([folder], CPU, (0.3, 0.6), reverse=True).view(np.random.default_rng(0))
+    with Image.open(folder / "left.png") as image:
+        assert torch.equal(sample.target, torch.from_numpy(np.array(image)).float() / 255)
+    assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
+    covered = ~grow(sample.hole)
+    covered[21:51, 37:67] = False  # the box's outline is where a base is not sharp
+    assert psnr(sample.rendering.rgb[covered], sample.target[covered]) > 30
+    assert sample.hole.any()
+
+
+def test_a_disparity_map_may_lie_in_another_folder_than_its_description(tmp_path: Path) -> None:
+    folder = write_stereo(tmp_path, disparity="maps/left.npy")
+    (folder / "maps").mkdir()
+    (folder / "disparity.npy").rename(folder / "maps" / "left.npy")
+    depth = load_pair(folder)[2].depth
+    assert float(depth[0, 0]) == pytest.approx(80 * 0.3 / WALL_PX)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"left": None}, "no stereo pair"),
+        ({"focal_px": "wide"}, "no stereo pair"),
+        ({"focal_px": 10**400}, "no stereo pair"),
+        ({"focal_px": 0}, "focal_px must be a positive number"),
+        ({"baseline_m": -0.3}, "baseline_m must be a positive number"),
+        ({"cx": math.nan}, "must be finite numbers"),
+        ({"right": "nowhere.png"}, "nowhere.png: no such photo"),
+        ({"right": "small.png"}, "the two photos differ in size"),
+        ({"right": "scene.json"}, "not an image"),
+        ({"disparity": "nowhere.npy"}, "nowhere.npy: no such depth map"),
+        ({"disparity": "narrow.npy"}, "narrow.npy is 20×72 but photo"),
+    ],
+)
+def test_what_is_wrong_with_a_pair_is_said_in_a_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    folder = write_stereo(tmp_path, **changes)
+    write_photo(folder / "small.png", 32, 24)
+    np.save(folder / "narrow.npy", np.full((72, 20), 4, np.float32))
+    with pytest.raises(InputError) as caught:
+        load_pair(folder)
+    assert said in str(caught.value)
+    assert str(folder) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [b"", b"[]", b"null", b'{"left": ', b"[" * 100_000, b"\xff\xfe\x00", None])
+def test_a_description_that_is_none_is_said_in_a_line(tmp_path: Path, text: bytes | None) -> None:
+    folder = write_stereo(tmp_path)
+    (folder / "scene.json").unlink()
+    if text is not None:
+        (folder / "scene.json").write_bytes(text)
+    with pytest.raises(InputError, match=r"no stereo pair: needs a scene\.json") as caught:
+        load_pair(folder)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,380 @@
+"""Training: a run that is cut off ends as one that is not, processes that share a batch learn the same, and so on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from command import Run, names_in, run
+from photos import picture
+from PIL import Image
+from scenes import box_before_wall, shifted, tensors_of
+from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
+
+from spackle.downloads.fetch import hold
+from spackle.gaussians import Gaussians
+from spackle.render import get_renderer
+from spackle.residual.network import ResidualNet
+from spackle.residual.network import load_residual
+from spackle.training.callbacks import Callbacks
+from spackle.training.data import SampleFiles
+from spackle.training.method import Objective
+from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
+from spackle.training.residual_method import MIN_AUX, ResidualMethod, aux_of, complete_samples, training_cells
+from spackle.training.sample import Sample, load_sample, save_sample
+from spackle.training.trainer import Trainer
+
+pytest.importorskip("yaml")
+
+RECIPE = """
+data: {photos: %s, views: 5, validation_views: 2, crops: 2, cells: 16}
+loss: {features: none}
+optim: {steps: 6, batch: 2, warmup: 2, lr: 1.0e-3, ema: 0.9, precision: fp32}
+run: {validate_every: 6, save_every: 3, log_every: 1}
+"""
+
+
+one_thread = pytest.fixture(autouse=True)(one_thread_at_a_time)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recipe, its photos and, from the first run on, its samples."""
+    place = tmp_path_factory.mktemp("training")
+    (place / "photos").mkdir()
+    for number in range(3):
+        image = Image.fromarray(picture(400, 360)).rotate(90 * number, expand=True)
+        image.save(place / "photos" / f"{number}.png")
+    (place / "photos" / "broken.jpg").write_bytes(b"\xff\xd8 no more")
+    (place / "recipe.yaml").write_text(RECIPE % (place / "photos"))
+    return place
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> tuple[Path, Run]:
+    """A run of six steps, in one go."""
+    torch.set_num_threads(1)
+    return place / "whole", train(place, place / "whole")
+
+
+@pytest.fixture
+def cache(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> Path:
+    """A copy of the samples, to be damaged."""
+    return shutil.copytree(place / "cache", tmp_path / "cache")
+
+
+def arguments(place: Path, output: Path, *more: str) -> list[str]:
+    return ["train", "--recipe", f"{place}/recipe.yaml", "-o", str(output), f"data.cache={place}/cache", *more]
+
+
+def train(place: Path, output: Path, *more: str) -> Run:
+    return run(*arguments(place, output, *more))
+
+
+def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
+    return started(arguments(place, output, *more), code, **environment)
+
+
+# A run and what comes out -------------------------------------------------------------------------
+
+
+def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> None:
+    folder, done = whole
+    assert done.code == 0, done.err
+    assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
+    report = json.loads((folder / "run.json").read_text())
+    assert (report["ended"], report["step"], report["features"]) == ("steps", 6, "none")
+    assert report["recipe"]["optim"]["batch"] == 2
+    assert report["history"][0].keys() >= {"loss", "color", "alpha", "preserve", "hole_psnr", "har_before", "har_after"}
+    with Image.open(folder / "pictures" / "0000006.png") as sheet:
+        assert sheet.width == 4 * 32
+    average = state(folder).average
+    for name in ("best", "last"):
+        weights = load_residual(folder / f"{name}.safetensors").state_dict()
+        assert all(torch.equal(weights[key], average[key].half().float()) for key in average)
+
+
+def test_a_broken_photo_is_passed_over_and_named_once(whole: tuple[Path, Run]) -> None:
+    lines = [line for line in whole[1].lines if "broken.jpg" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("passed over: ")
+    assert "views were passed over" in whole[1].err
+
+
+def test_curves_and_pictures_are_in_the_logs(whole: tuple[Path, Run]) -> None:
+    pytest.importorskip("tensorboard")
+    (events,) = (whole[0] / "logs").iterdir()
+    content = events.read_bytes()
+    for name in (b"train/color", b"train/lr", b"train/gradient", b"validation/har_after", b"validation/hole_psnr"):
+        assert name in content
+
+
+def test_without_tensorboard_a_line_is_said(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    done = train(place, tmp_path / "out", "optim.steps=1")
+    assert done.code == 0
+    assert "no TensorBoard logs: pip install 'spackle-nvs[train]'" in done.lines
+
+
+# Going on -----------------------------------------------------------------------------------------
+
+
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    process = child(place, tmp_path / "out", killed_at(4))
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert state(tmp_path / "out").progress.step == 3
+    done = train(place, tmp_path / "out")
+    assert f"{tmp_path}/out: going on from step 3" in done.lines
+    assert_same_weights(tmp_path / "out", whole[0])
+    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_the_run_goes_on_from_there(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = Trainer.step
+
+    def interrupted(self: Trainer, number: int) -> dict[str, float]:
+        if number == 1:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", interrupted)
+        done = train(place, tmp_path / "out")
+    assert done.code == 130
+    assert state(tmp_path / "out").progress.step == 2
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["ended"] == "stopped"
+    assert train(place, tmp_path / "out").code == 0
+    assert_same_weights(tmp_path / "out", whole[0])
+
+
+def test_where_the_newest_checkpoint_is_damaged_the_one_before_it_counts(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    (out / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
+    done = train(place, out)
+    assert done.code == 0
+    assert "going on from the one before it" in done.err
+    assert_same_weights(out, whole[0])
+    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
+        (out / name).write_bytes(b"nothing")
+    done = train(place, out)
+    assert done.code == 2
+    assert len(done.lines) == 1
+
+
+def test_a_folder_belongs_to_one_recipe(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    done = train(place, out, "optim.lr=2e-3")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "another recipe (optim.lr differs)" in done.err
+    assert train(place, out, "run.validate_every=2", "optim.steps=7").code == 0
+    assert state(out).progress.step == 7
+    assert train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite").code == 0
+    assert state(out).progress.step == 1
+    assert names_in(out / "pictures") == {"0000001.png"}
+
+
+def test_a_run_without_improvement_ends(place: Path, tmp_path: Path) -> None:
+    options = ["run.validate_every=1", "run.patience=2", "run.min_delta=100"]
+    done = train(place, tmp_path / "out", *options)
+    assert done.code == 0
+    assert "no improvement any more, step 3" in done.err
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (report["ended"], report["best_step"], report["stale"]) == ("patience", 1, 2)
+
+
+def test_a_full_disk_is_a_line_and_the_last_checkpoint_stays(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path
+) -> None:
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))
+    try:
+        done = train(place, out, "optim.steps=7", "run.validate_every=100", "run.save_every=1")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert done.code == 2
+    assert "cannot write" in done.lines[-1]
+    assert_same_weights(out, whole[0])
+    assert not [name for name in names_in(out) if name.startswith(".")]
+
+
+def test_two_runs_do_not_share_a_folder(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with hold(tmp_path / "out" / ".lock"):
+        done = train(place, tmp_path / "out", "optim.steps=1")
+    assert (done.code, len(done.lines)) == (2, 1)
+    assert "another training is at work" in done.err
+    assert not names_in(tmp_path / "out")
+
+
+# Several processes --------------------------------------------------------------------------------
+
+
+def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
+    options = ["optim.steps=2", "optim.batch=4", "run.validate_every=2"]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    processes = [child(place, tmp_path / "two", "", *options, RANK=str(rank), **shared) for rank in range(2)]
+    alone = train(place, tmp_path / "one", *options)
+    said = [process.communicate()[1] for process in processes]
+    assert (alone.code, *(process.returncode for process in processes)) == (0, 0, 0), said
+    assert_same_weights(tmp_path / "two", tmp_path / "one", 1e-5)
+    one, two = (state(tmp_path / name).progress.history[0] for name in ("one", "two"))
+    assert two == pytest.approx(one, rel=1e-5)
+    assert losses(said[0]) == pytest.approx(losses(alone.err), abs=1e-4)
+    assert not losses(said[1])  # one speaks for both
+
+
+def losses(text: str) -> list[float]:
+    return [float(line.split("loss ")[1].split(",")[0]) for line in text.splitlines() if line.startswith("train: ")]
+
+
+# Bad input ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["data.photos=null"], "the recipe has no data"),
+        (["data.photos=/nowhere"], "/nowhere: no such folder, but data.photos names it"),
+        (["data.photos={empty}"], "there is nothing in it: looked for photos"),
+        (["data.photos={broken}", "data.views=1"], "none of 2 views gave a sample"),
+        (["data.stereo={empty}"], "looked for scene.json"),
+        (
+            ["loss.features=squeezenet", "loss.features_path=/nowhere", "loss.feature_size=64"],
+            "/nowhere: no such weight",
+        ),
+        (["init=/nowhere"], "/nowhere"),
+        (["run.device=cuda"], "run.device=cuda"),
+        (["optim.steps=0"], "optim.steps"),
+    ],
+)
+def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
+    if options == ["run.device=cuda"] and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken").mkdir()
+    shutil.copy(place / "photos" / "broken.jpg", tmp_path / "broken")
+    filled = [option.format(empty=tmp_path / "empty", broken=tmp_path / "broken") for option in options]
+    done = run(*arguments(place, tmp_path / "out", *filled), f"data.cache={tmp_path}/cache")
+    assert done.code == 2
+    assert said in done.lines[-1]
+    assert len([line for line in done.lines if line.startswith("error: ")]) == 1
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "out" / "checkpoint.pt").exists()
+
+
+@pytest.mark.parametrize(("part", "said"), [("rendering", "(loss, "), ("seeds", "(gradient)")])
+def test_a_loss_that_is_no_number_keeps_what_made_it(
+    place: Path, cache: Path, tmp_path: Path, part: str, said: str
+) -> None:
+    for path in cache.glob("*/train/*.safetensors"):
+        sample = load_sample(path)
+        whole = getattr(sample, part)
+        broken = dataclasses.replace(whole, rgb=torch.full_like(whole.rgb, math.nan))
+        save_sample(dataclasses.replace(sample, **{part: broken}), path)
+    done = train(place, tmp_path / "out", f"data.cache={cache}")
+    assert done.code == 2
+    assert f"out/bad_batch: step 0 gave numbers that are not finite {said}" in done.lines[-1]
+    kept = names_in(tmp_path / "out" / "bad_batch")
+    assert len([name for name in kept if name.endswith(".safetensors")]) == 2
+    assert state(tmp_path / "out" / "bad_batch").progress.step == 0
+    assert not (tmp_path / "out" / "checkpoint.pt").exists()
+
+
+def test_a_damaged_sample_is_named_and_made_anew_once_it_is_gone(place: Path, cache: Path, tmp_path: Path) -> None:
+    (bad, *_) = sorted(cache.glob("*/validation/*.safetensors"))
+    good = bad.read_bytes()
+    bad.write_bytes(good[:99])
+    done = train(place, tmp_path / "out", f"data.cache={cache}", "optim.steps=1")
+    assert done.code == 2
+    assert f"{bad}: no training sample, or damaged" in done.lines[-1]
+    bad.unlink()
+    assert train(place, tmp_path / "out", f"data.cache={cache}", "optim.steps=1").code == 0
+    assert bad.read_bytes() == good
+
+
+# What learns, and what does not -------------------------------------------------------------------
+
+
+def sample_of(base: Gaussians) -> Sample:
+    scene = box_before_wall(width=96, height=80)
+    view = shifted(scene.camera, 0.3)
+    rendering = get_renderer().render(base, view)
+    truth = torch.full_like(rendering.rgb, 0.5).detach()
+    return Sample.of(base, rendering, view, scene.camera, truth, torch.ones(view.height, view.width, dtype=torch.bool))
+
+
+def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
+    base = Gaussians(*(t.clone().requires_grad_() for t in box_before_wall(width=96, height=80).base().tensors))
+    sample = sample_of(base)
+    assert not any(tensor.requires_grad for tensor in tensors_of(sample))
+    assert not any(tensor.requires_grad for tensor in tensors_of(sample.crop(2, 3, 24, 24)))
+    network = ResidualNet()
+    objective = Objective(LossRecipe(features="none"), None, get_renderer(), torch.float32, torch.device("cpu"))
+    batch = complete_samples(network, [sample], get_renderer())
+    objective.total(batch)[0].backward()
+    assert all(tensor.grad is None for tensor in base.tensors)
+    assert network.geometry[-1].weight.grad.abs().sum() > 0
+    assert network.texture[-1].weight.grad.abs().sum() > 0
+    assert all(p.grad is not None for p in network.parameters())
+
+
+def test_a_view_with_hardly_a_hole_still_has_enough_to_learn_from() -> None:
+    sample = sample_of(box_before_wall(width=96, height=80).base())
+    few = dataclasses.replace(sample.cues, mask=torch.zeros_like(sample.cues.mask))
+    few.mask[3, 4] = True
+    cells = training_cells(few)
+    assert cells[3, 4]
+    assert int(cells.sum()) == MIN_AUX
+    chosen = sample.cues.alpha[cells & ~few.mask]
+    assert chosen.max() <= sample.cues.alpha[~cells].min()
+    assert len(aux_of(dataclasses.replace(sample, cues=few), torch.zeros(14, *few.mask.shape))) == MIN_AUX
+
+
+def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path) -> None:
+    save_sample(sample_of(box_before_wall(width=96, height=80).base()), tmp_path / "0.safetensors")
+    files = SampleFiles([tmp_path / "0.safetensors"], [tmp_path / "0.safetensors"], "one")
+    recipe = Recipe(
+        loss=LossRecipe(features="none"),
+        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=12, batch=1, ema=0.5),
+        run=RunRecipe(log_every=1, validate_every=6, save_every=100),
+    )
+    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
+    found: list[float] = []
+
+    def note(step: int, numbers: dict[str, float]) -> None:
+        found.append(numbers["loss"])
+
+    def nothing(progress: object) -> None:
+        """Nobody is told."""
+
+    torch.manual_seed(0)
+    callbacks = Callbacks(note, nothing, nothing, lambda: False)
+    method = ResidualMethod(files, objective, recipe.optim.batch)
+    trainer = Trainer(recipe, method, ResidualNet(), objective.device, tmp_path, callbacks)
+    assert trainer.run() == "steps"
+    assert len(found) == 12
+    assert found[-1] < 0.5 * found[0]
+    first, last = trainer.progress.history
+    assert last["loss"] < first["loss"]
+    assert last["hole_psnr"] > first["hole_psnr"]
