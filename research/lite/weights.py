@@ -12,8 +12,7 @@ from recipe import RANDOM, LiteRecipe
 from safetensors.torch import save
 from torch import Tensor
 
-from spackle.bases.lite.network import STAGES, Block, Encoder, LiteNet, Size
-from spackle.bases.lite.network import SCALE, load_networks
+from spackle.bases.lite.network import SCALE, STAGES, Block, Encoder, LiteNet, Size, load_networks
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 

@@ -24,8 +24,7 @@ from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, 
 from spackle.downloads.fetch import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
-from spackle.residual.network import ResidualNet
-from spackle.residual.network import load_residual
+from spackle.residual.network import ResidualNet, load_residual
 from spackle.training.callbacks import Callbacks
 from spackle.training.data import SampleFiles
 from spackle.training.method import Objective

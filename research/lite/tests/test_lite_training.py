@@ -23,8 +23,7 @@ from train import main
 from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
 from weights import EVEN, balanced, save_networks
 
-from spackle.bases.lite.network import LiteNet
-from spackle.bases.lite.network import load_networks
+from spackle.bases.lite.network import LiteNet, load_networks
 from spackle.training.recipe import load_recipe_as
 
 pytest.importorskip("yaml")

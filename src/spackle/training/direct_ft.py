@@ -18,14 +18,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.device import enough_memory
-from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of
-from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
+from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
+from spackle.device import enough_memory
+from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.jobs.dataset.options import weights_digest
 from spackle.pseudo import PseudoFiles, PseudoSample
 from spackle.render import Renderer
 from spackle.training.data import digest_of

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from spackle.progress import Reporter
 from spackle.device import pick_dtype
+from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.training.features import load_features
 from spackle.training.method import Method, Objective

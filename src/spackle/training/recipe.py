@@ -14,12 +14,12 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Protocol, TypeVar, Union
 
+from spackle.camera_path import MAX_DISPARITY
+from spackle.device import Precision
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
-from spackle.device import Precision
 from spackle.residual.hole_features import CELL
 from spackle.training.losses import LossWeights
-from spackle.camera_path import MAX_DISPARITY
 
 PACKAGED = Path(__file__).parent / "recipes"
 POSITIVE = 1e-12

@@ -16,8 +16,7 @@ from spackle.progress import Reporter
 from spackle.render import Renderer
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import Cues
-from spackle.residual.network import ResidualNet, network_input
-from spackle.residual.network import load_residual
+from spackle.residual.network import ResidualNet, load_residual, network_input
 from spackle.training.checkpoint import export_weights
 from spackle.training.data import SampleFiles, Supply
 from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod

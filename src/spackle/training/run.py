@@ -12,10 +12,10 @@ import torch
 from rich.console import Console
 
 from spackle.errors import InputError
-from spackle.output_folder import alone_in, results_folder
-from spackle.machine import hardware, versions, without_nan
-from spackle.progress import Reporter
 from spackle.jobs.report import write_report
+from spackle.machine import hardware, versions, without_nan
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 from spackle.training.callbacks import Callbacks, Logs, open_logs
 from spackle.training.checkpoint import (

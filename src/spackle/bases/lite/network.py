@@ -185,7 +185,7 @@ def load_networks(path: str | os.PathLike[str], otherwise: str = "a .safetensors
     """The networks of a file, ready to be asked, with weights in single precision.
 
     Args:
-        path: a file of `spackle.training.depth.export`, or the plain tensors of one network.
+        path: a file of `save_networks` (research/lite), or the plain tensors of one network.
         otherwise: for messages: what to give in place of a file that is missing.
 
     Raises:
