@@ -38,7 +38,7 @@ def main(folder: Path) -> None:
     camera, renderer = pair.right_camera, spackle.get_renderer()
     base = lift(pair.left, pair.depth, pair.left_camera).gaussians
     completer = spackle.Completer(base, pair.left_camera, renderer)
-    aux = completer.complete_view(camera, [completer.photo_shield()])
+    aux = completer.complete_view(camera, [completer.photo_guard()])
 
     before = renderer.render(base, camera)
     hole = spackle.hole_mask(before.alpha)

@@ -1,4 +1,7 @@
-"""Completing views: one at a time, as the paper does (section 3.4), or a whole scene at once."""
+"""Completion (paper, section 3.4): 𝒢̃_aug of the masked cells (eq. 7), one view at a time or one set for a whole path.
+
+The union 𝒢_final = 𝒢_base ∪ 𝒢̃_aug (eq. 8) is `Gaussians.cat([base, aux])`; rendering it is eq. 9.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.device import Precision
@@ -18,7 +20,7 @@ from spackle.residual.hole_features import MASK_THRESHOLD, Cues, hole_area_ratio
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
 from spackle.residual.rim_underlay import rim_underlay
-from spackle.residual.seeds import Rim, Seeds, make_seeds
+from spackle.residual.seeds import Rim, make_seeds
 from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first, reach_of
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
@@ -46,7 +48,6 @@ class Completer:
         rendering = self.renderer.render(self.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
-    @torch.no_grad()
     def complete_view(
         self,
         camera: Camera,
@@ -54,10 +55,7 @@ class Completer:
         aux: Gaussians | None = None,
         rendering: Rendering | None = None,
     ) -> Gaussians:
-        """New aux Gaussians for one view, 𝒢̃_aug of eq. 6: one for each masked cell that needs one.
-
-        The arguments are those of `completed_view`.
-        """
+        """New aux Gaussians for one view, 𝒢̃_aug of eq. 7; the arguments are those of `completed_view`."""
         return self.completed_view(camera, guards, aux, rendering)[0]
 
     @torch.no_grad()
@@ -68,7 +66,7 @@ class Completer:
         aux: Gaussians | None = None,
         rendering: Rendering | None = None,
     ) -> tuple[Gaussians, Rendering]:
-        """What `complete_view` adds, and the view with it: as if all were drawn at once, at the cost of what changes.
+        """New aux Gaussians, and the view with them: as if all were drawn at once, at the cost of what changes.
 
         Args:
             camera: the view to complete.
@@ -76,8 +74,7 @@ class Completer:
             aux: aux Gaussians that are there already.
             rendering: base and aux from this view, where that is at hand.
         """
-        if guards is None:
-            guards = [self.photo_guard()]
+        guards = [self.photo_guard()] if guards is None else guards
         there = [self.base] if aux is None else [self.base, aux]
         return self._fill(camera, guards, there, rendering or self.renderer.render(there, camera))
 
@@ -100,10 +97,12 @@ class Completer:
         if not cameras:
             return Gaussians.empty()
         order = farthest_first(cameras, self.photo_camera)
-        guards, view = self._first_guards(cameras, order)
-        settled = SettledFrames(len(cameras))
+        guards = {-1: self.photo_guard()}
+        for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
+            view = self.renderer.render(self.base, cameras[index])
+            guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
+        settled, aux = SettledFrames(len(cameras)), Gaussians.empty()
         enough = CLOSED_HAR if exact else QUIET_HAR
-        aux = Gaussians.empty()
         for count, index in enumerate(order):
             if exact or not settled.known(index):
                 camera = cameras[index]
@@ -121,20 +120,6 @@ class Completer:
             if progress:
                 progress(count + 1, len(order))
         return aux
-
-    def _first_guards(
-        self, cameras: Sequence[Camera], order: Sequence[int]
-    ) -> tuple[dict[int, OcclusionGuard], Rendering]:
-        """What stays in front from the first: the photo (-1), and what the base shows from the widest views.
-
-        Returns:
-            These, and the base from the widest view of all.
-        """
-        guards = {-1: self.photo_guard()}
-        for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
-            view = self.renderer.render(self.base, cameras[index])
-            guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
-        return guards, view
 
     def _fill(
         self,
@@ -161,16 +146,13 @@ class Completer:
         return Gaussians.cat(added), rendering
 
     def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None, underlay: bool) -> Gaussians:
-        """One Gaussian for each masked cell of a rendering, and those beneath the holes' rims."""
+        """Masked selection (eq. 7): one Gaussian for each masked cell of a rendering; and those beneath the rims."""
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return Gaussians.empty()
-        seeds = make_seeds(cues, camera, self.photo_camera)
-        deltas = None if network is None else self._deltas(network, cues, seeds, camera)
+        seeds, deltas = make_seeds(cues, camera, self.photo_camera), None
+        if network is not None:
+            rim = Rim.of(cues, seeds, camera, self.photo_camera)
+            deltas = predict_deltas(network, cues, seeds, rim, self.precision)[cues.mask]
         new = compose(seeds.select(cues.mask), deltas, camera)
         return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new
-
-    def _deltas(self, network: ResidualNet, cues: Cues, seeds: Seeds, camera: Camera) -> Tensor:
-        """[n, 14] for the masked cells."""
-        rim = Rim.of(cues, seeds, camera, self.photo_camera)
-        return predict_deltas(network, cues, seeds, rim, self.precision)[cues.mask]

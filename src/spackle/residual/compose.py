@@ -1,4 +1,7 @@
-"""Deltas applied to seeds: aux Gaussians, composed as SHARP composes its own."""
+"""Composition (paper, sections 3.3 and 3.4): seeds and the deltas of f_res make aux Gaussians (eq. 5), as in SHARP.
+
+Of seeds that are selected by the mask it gives 𝒢̃_aug (eq. 7).
+"""
 
 from __future__ import annotations
 
@@ -22,52 +25,35 @@ XY, INVERSE_DEPTH, SCALE, QUAT, COLOR, ALPHA = (
 GEOMETRY_CHANNELS = 3
 TEXTURE_CHANNELS = 11
 DELTA_CHANNELS = GEOMETRY_CHANNELS + TEXTURE_CHANNELS
+
+# A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain.
+INVERSE_DEPTH_GAIN = 0.1  # in units of the view's median inverse depth
+QUAT_GAIN = 0.1
+MIN_SCALE, MAX_SCALE = 0.25, 4.0  # bounds of the scale factor, which is 1, with slope 1, at zero
 COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
 
 
-@dataclasses.dataclass(frozen=True)
-class DeltaGains:
-    """How much a delta of one moves each attribute, at zero."""
-
-    xy_px: float = 1.0
-    inverse_depth: float = 0.1  # in units of the view's median inverse depth
-    scale: float = 1.0
-    quat: float = 0.1
-    color: float = 1.0  # in the sigmoid's domain
-    opacity: float = 1.0  # likewise
-    min_scale: float = 0.25  # bounds of the scale factor, which is 1 at zero
-    max_scale: float = 4.0
-
-
-def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, gains: DeltaGains | None = None) -> Gaussians:
+def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera) -> Gaussians:
     """Aux Gaussians [n] of flat seeds; deltas of None or zero give the seeds themselves.
 
     Args:
         seeds: flat, as `Seeds.select` gives them: fields [n, ...].
         deltas: [n, 14], or None. Gradients flow through them.
         camera: the view that the seeds belong to.
-        gains: weights of the deltas.
     """
-    opacities = torch.full_like(seeds.inverse_depth, OPACITY)
+    uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
+    opacities = torch.full_like(inverse_depth, OPACITY)
+    if deltas is not None:
+        uv = uv + deltas[:, XY]
+        shift = INVERSE_DEPTH_GAIN * deltas[:, INVERSE_DEPTH].squeeze(1)
+        inverse_depth = _shift_positive(inverse_depth, shift, seeds.unit)
+        rgb = torch.sigmoid(color_logit(rgb) + deltas[:, COLOR])
+        opacities = torch.sigmoid(color_logit(opacities) + deltas[:, ALPHA].squeeze(1))
+    surfels = surface_gaussians(camera, uv, inverse_depth, seeds.slope, SPREAD_PX, srgb_to_linear(rgb), opacities)
     if deltas is None:
-        return _lift(seeds.uv, seeds.inverse_depth, seeds, seeds.rgb, opacities, camera)
-    gains = gains or DeltaGains()
-    uv = seeds.uv + gains.xy_px * deltas[:, XY]
-    inverse_depth = _shift_positive(
-        seeds.inverse_depth, gains.inverse_depth * deltas[:, INVERSE_DEPTH].squeeze(1), seeds.unit
-    )
-    rgb = _shift_sigmoid(seeds.rgb, gains.color * deltas[:, COLOR])
-    opacities = _shift_sigmoid(opacities, gains.opacity * deltas[:, ALPHA].squeeze(1))
-    surfels = _lift(uv, inverse_depth, seeds, rgb, opacities, camera)
-    return dataclasses.replace(
-        surfels,
-        quats=surfels.quats + gains.quat * deltas[:, QUAT],
-        scales=surfels.scales * _scale_factor(gains.scale * deltas[:, SCALE], gains.min_scale, gains.max_scale),
-    )
-
-
-def _lift(uv: Tensor, inverse_depth: Tensor, seeds: Seeds, rgb: Tensor, opacities: Tensor, camera: Camera) -> Gaussians:
-    return surface_gaussians(camera, uv, inverse_depth, seeds.slope, SPREAD_PX, srgb_to_linear(rgb), opacities)
+        return surfels
+    quats = surfels.quats + QUAT_GAIN * deltas[:, QUAT]
+    return dataclasses.replace(surfels, quats=quats, scales=surfels.scales * _scale_factor(deltas[:, SCALE]))
 
 
 def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
@@ -76,18 +62,14 @@ def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
     return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta)
 
 
-def _shift_sigmoid(base: Tensor, delta: Tensor) -> Tensor:
-    """sigmoid(sigmoid⁻¹(base) + delta), the base kept off 0 and 1."""
-    return torch.sigmoid(color_logit(base) + delta)
-
-
 def color_logit(value: Tensor) -> Tensor:
     """sigmoid⁻¹ of colours or opacities, kept off 0 and 1."""
     return torch.logit(value.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN / 2))
 
 
-def _scale_factor(delta: Tensor, low: float, high: float) -> Tensor:
-    """A sigmoid between low and high that is 1, with slope 1, at zero."""
+def _scale_factor(delta: Tensor) -> Tensor:
+    """A sigmoid between the bounds."""
+    low, high = MIN_SCALE, MAX_SCALE
     center = math.log((1 - low) / (high - 1))
     steepness = (high - low) / ((1 - low) * (high - 1))
     return low + (high - low) * torch.sigmoid(steepness * delta + center)

@@ -1,4 +1,7 @@
-"""What the residual looks at: a rendered view on a grid with one cell for each 2×2 pixels."""
+"""The mask M_v of a rendered view (paper, section 3.2, eq. 4), and what the residual looks at, cell by cell.
+
+The grid has one cell for each 2×2 pixels.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +21,16 @@ CELL = 2  # pixels along a cell's side
 CHANNELS = 3
 CLOSEST, FAINTEST = np.float32(1e-6), np.float32(1e-6)  # depth and summed opacity that are divided by, at least
 GRAIN = 16  # rows of cells that a thread takes at a time
-MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (paper, eq. 3)
+MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (paper, eq. 4)
 
 
 def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
-    """M_v(p) = 1[A_v(p) < τ_α] (paper, eq. 3): [H, W] bool, true where nothing was seen."""
+    """M_v(p) = 1[A_v(p) < τ_α] (paper, eq. 4): [H, W] bool, true where nothing was seen."""
     return alpha < threshold
 
 
 def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
-    """HAR = 1 − coverage (paper, section 4.2): the share of hole pixels."""
+    """HAR = 1 − coverage (paper, section 4.2, eqs. 10 and 11): the share of hole pixels."""
     hole = hole_mask(alpha, threshold)
     # Of what counts bits, numpy is the fastest by far.
     count = int(np.count_nonzero(hole.numpy()) if hole.device.type == "cpu" else hole.count_nonzero())

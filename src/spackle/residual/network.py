@@ -1,7 +1,4 @@
-"""The residual network f_res (paper, eq. 4): cues of a view in, a delta for every cell out.
-
-Weights of the residual network, as safetensors.
-"""
+"""The residual network f_res (paper, section 3.3, eq. 5): features of a view's holes in, a delta for every cell out."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ STRIDE = 2 ** (len(WIDTHS) - 1)
 REACH = 2  # how many cells around its own a block looks at, and so a head
 FEW = 0.45  # of a level's cells: where more are wanted, the convolution of all is faster than that of those
 STEM_GAIN = 3.0  # the features are of order 0.3
-
+SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 
 Grids = TypeVar("Grids", Cues, Seeds, Rim)
 
@@ -96,15 +93,7 @@ class ResidualNet(nn.Module):
         return self._deltas(x, features)
 
     def deltas_at(self, features: Tensor, mask: Tensor) -> Tensor:
-        """`forward` at some cells; what only the others need is not computed.
-
-        Args:
-            features: [1, 17, h, w] of `network_input`.
-            mask: [h, w] bool, the cells.
-
-        Returns:
-            [n, 14], in the mask's order.
-        """
+        """`forward` at the cells of a mask [h, w], in its order: [n, 14]; what only the others need is not computed."""
         x, skips = self._encoded(features)
         masked = Cells(pad(mask, _completion(mask)))
         wanted = [masked.grown(REACH)]  # of each level's decoder, the finest first
@@ -124,7 +113,9 @@ class ResidualNet(nn.Module):
             fine += _rows(skips[level]).index_select(0, seen[level].flat)
             decode = cast(ResidualBlock, self.decode[level])
             table, there = decode.at(fine, seen[level], wanted[level]), wanted[level]
-        heads = [_head_at(head, table, there, masked) for head in (self.geometry, self.texture)]
+        heads = []
+        for block, _, last in cast(list[tuple[ResidualBlock, nn.Module, nn.Conv2d]], [self.geometry, self.texture]):
+            heads.append(point_rows(last, block.at(table, there, masked).relu_()))
         return _with_copies(torch.cat(heads, dim=1), _rows(features)[mask.view(-1)])
 
     def _encoded(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -189,7 +180,7 @@ def predict_deltas(
         there = outer.slices
         features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
         own = torch.zeros_like(chosen[there])
-        own[inner.within(outer).slices] = chosen[inner.slices]
+        own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
         with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
         field[there][own] = found.float()
@@ -214,8 +205,7 @@ def compile_network(network: ResidualNet, backend: str = "inductor") -> Residual
 
 def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
     """The same of some rows and columns."""
-    fields = {field.name: getattr(grids, field.name) for field in dataclasses.fields(grids)}
-    parts: dict[str, Any] = {name: value[where] for name, value in fields.items() if isinstance(value, Tensor)}
+    parts: dict[str, Any] = {name: field[where] for name, field in vars(grids).items() if isinstance(field, Tensor)}
     return dataclasses.replace(grids, **parts)
 
 
@@ -240,13 +230,6 @@ def _rows(x: Tensor) -> Tensor:
     return x[0].permute(1, 2, 0).flatten(0, 1)
 
 
-def _head_at(head: nn.Sequential, table: Tensor, there: Cells, wanted: Cells) -> Tensor:
-    block, _, last = head
-    assert isinstance(block, ResidualBlock)
-    assert isinstance(last, nn.Conv2d)
-    return point_rows(last, block.at(table, there, wanted).relu_())
-
-
 def _head(width: int, channels: int) -> nn.Sequential:
     return nn.Sequential(ResidualBlock(width), nn.ReLU(), nn.Conv2d(width, channels, 1))
 
@@ -260,9 +243,6 @@ def _initialise(network: ResidualNet) -> None:
         gain = 0.0 if zero else STEM_GAIN if name == "stem" else math.sqrt(2) if name.endswith("first") else 1.0
         nn.init.normal_(module.weight, std=gain / math.sqrt(module.weight[0].numel()))
         nn.init.zeros_(module.bias)  # type: ignore[arg-type]
-
-
-SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 
 
 @functools.cache

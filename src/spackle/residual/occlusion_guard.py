@@ -1,4 +1,7 @@
-"""Keeping aux Gaussians behind what other views already show."""
+"""Keeping aux Gaussians behind what the photo and other views already show.
+
+The paper composes a view's aux Gaussians with the base alone (eq. 8); one scene for many views needs this.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +83,10 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
     eye = eye.to(aux.means)
     rays = (aux.means - eye).detach().cpu().double().numpy()
     quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
-    lenses = np.stack([_lens(guard.camera) for guard in guards])
+    lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
+    for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
+        lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        lens[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
     depths = np.concatenate([guard.depth.detach().cpu().float().numpy().ravel() for guard in guards])
     sizes = np.array([[guard.camera.height, guard.camera.width] for guard in guards])
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
@@ -93,12 +99,6 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
     free = factor[:, 0] > 0
     return moved if bool(free.all()) else moved.select(free)
-
-
-def _lens(camera: Camera) -> Any:
-    """fx, fy, cx, cy and the 3×4 extrinsics, [16] float64."""
-    K, matrix = camera.K.detach().cpu().double(), camera.world_to_camera.detach().cpu().double()
-    return torch.cat([torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), matrix[:3].reshape(-1)]).numpy()
 
 
 @kernel

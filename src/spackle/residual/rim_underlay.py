@@ -1,10 +1,11 @@
-"""Gaussians beneath the rim of a hole: hidden from the view that they are made for, seen by its neighbours."""
+"""Gaussians beneath the rim of a hole: hidden from the view that they are made for, seen by its neighbours.
+
+The paper completes one view at a time and has none of these; they are for one scene along a path.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-
-from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.fill import far_fill
@@ -25,26 +26,17 @@ def rim_underlay(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
 
     From beside, the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This closes
     most such slits before they open: on a path fewer views are left to complete, and they show the same.
-
-    Args:
-        cues: the view's cells.
-        seeds: of all cells; those of the masked ones are what goes on.
-        camera: the view.
     """
     rim = (Cells(cues.mask).grown(REACH_CELLS).grid & ~cues.mask)[EVERY]
     known, rgb = ~rim, seeds.rgb[EVERY].permute(2, 0, 1)
     if not bool(rim.any()) or not bool(known.any()):
         return Gaussians.empty()
-    depth, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
-    placed = _behind(depth, rim, cues, seeds)
+    coarse, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
+    # At the rim, behind all that is seen as far around as a blob reaches.
+    depth, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
+    depth[EVERY], chosen[EVERY] = coarse, rim
+    placed = placed_behind(depth, chosen, cues, COARSE * BLOB_CELLS)[EVERY]
     slope = surface_slope(placed) / (COARSE * CELL)
     there = Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
     fine = compose(there, None, camera)
     return dataclasses.replace(fine, scales=COARSE * fine.scales)
-
-
-def _behind(coarse: Tensor, rim: Tensor, cues: Cues, seeds: Seeds) -> Tensor:
-    """The inverse depth of every COARSE-th cell, at the rim behind all that is seen as far around as a blob reaches."""
-    field, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
-    field[EVERY], chosen[EVERY] = coarse, rim
-    return placed_behind(field, chosen, cues, COARSE * BLOB_CELLS)[EVERY]

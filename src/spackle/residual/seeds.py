@@ -1,6 +1,7 @@
-"""Where aux Gaussians start: colour and depth carried from a hole's rim into it.
+"""Base values of the aux Gaussians (paper, section 3.3): f_res predicts deltas over them, as SHARP does over its own.
 
-What stands at a hole's far rim, along the line on which the hole opened.
+Colour and depth are carried from a hole's rim into it, biased to the far side. `Rim` adds what stands at the far rim
+along the line on which the hole opened.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaus
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
+SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
+SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,26 +42,22 @@ class Seeds:
         """The chosen cells, flat: a boolean grid [h, w] gives fields [n, ...]."""
         index = cells.flatten().nonzero()[:, 0]  # once for all fields
 
-        def pick(field: Tensor) -> Tensor:
-            return field.flatten(0, cells.ndim - 1)[index.to(field.device)]
-
-        return Seeds(pick(self.uv), pick(self.inverse_depth), pick(self.slope), pick(self.rgb), self.unit)
+        fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
+        uv, inverse_depth, slope, rgb = (field.flatten(0, cells.ndim - 1)[index.to(field.device)] for field in fields)
+        return Seeds(uv, inverse_depth, slope, rgb, self.unit)
 
 
 def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     """Seeds for every cell of a view (covered cells keep what they show).
 
-    What a hole reveals depends on why it is there. Behind a surface of the photo the far side of the
-    rim continues; beyond the photo's border nothing was in front, and near and far go on alike.
-
-    Args:
-        cues: the view's cells.
-        camera: the view.
-        photo_camera: the photo's camera, whose frame tells the two kinds of hole apart.
+    What a hole reveals depends on why it is there. Behind a surface of the photo the far side of the rim continues;
+    beyond the frame of the photo's camera nothing was in front, and near and far go on alike.
     """
     known = _sources(cues)
     if not bool(known.any()):
-        return _empty_view(cues, camera)
+        # Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any.
+        uv = cell_centers(camera).to(cues.rgb)
+        return Seeds(uv, torch.full_like(cues.alpha, 0.1), torch.zeros_like(uv), torch.full_like(cues.rgb, 0.5), 0.1)
     colors = cues.rgb.permute(2, 0, 1)
     across, _ = far_fill(cues.inverse_depth, colors[:0], known, far_bias=0.0)
     bias = FAR_BIAS * _inside(across, camera, photo_camera)
@@ -124,14 +123,7 @@ def _look(
 
 
 def placed_behind(filled: Tensor, chosen: Tensor, cues: Cues, radius: int) -> Tensor:
-    """Inverse depth [h, w] that fills some cells, there behind everything that is seen close by.
-
-    Args:
-        filled: [h, w]; stays as it is elsewhere.
-        chosen: [h, w] bool, the cells.
-        cues: what is seen.
-        radius: cells to all sides that are close by.
-    """
+    """Filled inverse depth [h, w]; in the chosen cells ([h, w] bool) behind everything seen within `radius` cells."""
     seen, cells = (image.cpu().contiguous().numpy() for image in (cues.inverse_depth, chosen))
     placed = filled.cpu().clone(memory_format=torch.contiguous_format)
     share = np.float32(1.0 - BEHIND)
@@ -157,20 +149,8 @@ def _place(start: int, stop: int, seen: Any, chosen: Any, radius: int, share: An
 
 def cell_centers(camera: Camera) -> Tensor:
     """[ceil(H/2), ceil(W/2), 2] in pixels."""
-    even = dataclasses.replace(
-        camera, width=camera.width + camera.width % CELL, height=camera.height + camera.height % CELL
-    )
-    return even.pixel_centers(stride=CELL)
-
-
-def _empty_view(cues: Cues, camera: Camera) -> Seeds:
-    """Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any."""
-    uv = cell_centers(camera).to(cues.rgb)
-    return Seeds(uv, torch.full_like(cues.alpha, 0.1), torch.zeros_like(uv), torch.full_like(cues.rgb, 0.5), 0.1)
-
-
-SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
-SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
+    width, height = (size + size % CELL for size in (camera.width, camera.height))
+    return dataclasses.replace(camera, width=width, height=height).pixel_centers(stride=CELL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,29 +167,19 @@ class Rim:
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
         photo's eye. So that line leads from a hole to the surface that goes on behind, and structure
-        at the rim goes on along it more often than not.
-
-        Args:
-            cues: the view's cells.
-            seeds: what fills them at first: it stays where no line meets anything.
-            camera: the view.
-            photo_camera: the camera of the photo.
+        at the rim goes on along it more often than not. Where no line meets anything, the seeds stay.
         """
         fields = (seeds.uv, seeds.rgb, seeds.inverse_depth, cues.mask)
         uv, rgb, depths, mask = (image.detach().cpu().contiguous().numpy() for image in fields)
-        epipole = _epipole(camera, photo_camera)
+        eye = photo_camera.position.double()
+        # Where the view sees the photo's eye: homogeneous, for it may lie at infinity.
+        epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
         found, mirrored, distance = rgb.copy(), rgb.copy(), np.zeros(mask.shape, np.float32)
         cells = (found, mirrored, distance)
         run_chunks(
             lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *cells), len(mask), GRAIN
         )
         return Rim(*(torch.from_numpy(image).to(seeds.rgb) for image in cells))
-
-
-def _epipole(camera: Camera, photo_camera: Camera) -> Any:
-    """[3] float64, homogeneous, for it may lie at infinity: where the view sees the photo's eye."""
-    eye = photo_camera.position.double()
-    return (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
 
 
 @kernel

@@ -1,9 +1,8 @@
-"""The fine end of the network at chosen cells alone: gathered rows and matrix products in place of convolutions.
+"""f_res where it is needed: rectangles around the masked cells, and its fine layers at those cells alone.
 
-Holes are thin, and the network's last, finest convolutions are half of its cost. Its encoder has to see everything,
-but its decoder and heads need to be right only around the masked cells: see `ResidualNet.deltas_at`.
-
-Where the network has to look: rectangles around the masked cells, so that a small hole costs little.
+Holes are thin, and the network's last, finest convolutions are half of its cost. Its encoder has to see everything in
+a rectangle, but its decoder and heads need to be right only around the masked cells: gathered rows and matrix products
+take the place of convolutions there, see `ResidualNet.deltas_at`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad
 
+Mask = NDArray[np.bool_]
+
 CHUNK = 8192  # cells whose surroundings are gathered at once: they should stay in the cache
+# What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
+# changes it by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
+# See tests/residual/test_sparse.py.
+MARGIN = 64
+WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
+NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much
+CALL_BLOCKS = 8  # what a crop costs by itself, in blocks of 16×16 cells
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,15 +90,9 @@ class Cells:
 
 
 def conv_rows(conv: nn.Conv2d, table: Tensor, around: Tensor) -> Tensor:
-    """A 3×3 convolution with zeros around the grid, at some cells.
+    """A 3×3 convolution with zeros around the grid, at some cells: [m, D].
 
-    Args:
-        conv: its weights.
-        table: [n + 1, C]; the last row is zero, for what lies outside.
-        around: [m, 9] rows of the table, see `Cells.around`.
-
-    Returns:
-        [m, D].
+    Its input is a table [n + 1, C], whose last row is zero for what lies outside; `around` is [m, 9], see `Cells`.
     """
     weight = conv.weight.permute(0, 2, 3, 1).flatten(1).to(table.dtype)  # once, not for each chunk
     out = []
@@ -128,18 +130,6 @@ def _corners(cells: Cells) -> list[tuple[Tensor, Tensor, Tensor]]:
     return [(row, column, wr * wc) for row, wr in sides[0] for column, wc in sides[1]]
 
 
-Mask = NDArray[np.bool_]
-Edges = NDArray[np.int64]
-
-# What a cell's delta depends on reaches 205 cells far, but fades. With the shipped weights, what lies beyond 64 cells
-# changes it by a tenth of what bfloat16 rounds away; beyond 48, by half; beyond 32, by four times that.
-# See tests/residual/test_sparse.py.
-MARGIN = 64
-WHOLE = 0.8  # crops that cover more than this share are not worth the trouble
-NEARLY = 1.1  # of what has to be looked at in any case: no cut saves much
-CALL_BLOCKS = 8  # what a crop costs by itself, in blocks of 16×16 cells
-
-
 @dataclasses.dataclass(frozen=True)
 class Crop:
     """A rectangle of cells; the last row and column are exclusive."""
@@ -163,20 +153,11 @@ class Crop:
         """The same rectangle elsewhere."""
         return Crop(self.top + down, self.left + right, self.bottom + down, self.right + right)
 
-    def within(self, other: Crop) -> Crop:
-        """The same rectangle, counted from another one's corner."""
-        return self.moved(-other.top, -other.left)
-
     def grown(self, margin: int, step: int, height: int, width: int) -> Crop:
         """With a margin, outwards to multiples of `step`, as far as the grid goes."""
-
-        def down(place: int) -> int:
-            return max(place - margin, 0) // step * step
-
-        def up(place: int, end: int) -> int:
-            return min(-(-(place + margin) // step) * step, end)
-
-        return Crop(down(self.top), down(self.left), up(self.bottom, height), up(self.right, width))
+        top, left = (max(place - margin, 0) // step * step for place in (self.top, self.left))
+        far = ((self.bottom, height), (self.right, width))
+        return Crop(top, left, *(min(-(-(place + margin) // step) * step, end) for place, end in far))
 
 
 def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
@@ -221,10 +202,13 @@ def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
     own = crop.grown(reach, 1, *blocks.shape).area
     if own <= NEARLY * _least(blocks, crop, reach):
         return [crop]
-    halves = _halves(blocks[crop.slices]) + (crop.top, crop.left) * 2
+    inside = blocks[crop.slices]
+    halves = np.concatenate([_row_halves(inside), _row_halves(inside.T)[..., [1, 0, 3, 2]]])
+    halves += (crop.top, crop.left) * 2
     if not len(halves):
         return [crop]
-    best = halves[_looked_at(halves, reach, blocks.shape).sum(1).argmin()]
+    low, high = np.maximum(halves[..., :2] - reach, 0), np.minimum(halves[..., 2:] + reach, blocks.shape)
+    best = halves[(high - low).prod(-1).sum(1).argmin()]
     parts = [part for half in best for part in _cut(blocks, Crop(*map(int, half)), reach)]
     cost = sum(part.grown(reach, 1, *blocks.shape).area + CALL_BLOCKS for part in parts)
     return parts if cost < own + CALL_BLOCKS else [crop]
@@ -237,21 +221,8 @@ def _least(blocks: Mask, crop: Crop, reach: int) -> int:
     return int(Cells(torch.from_numpy(near)).grown(reach).grid.sum())
 
 
-def _looked_at(edges: Edges, reach: int, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Blocks in each rectangle with its surroundings: [..., 4] to [...]."""
-    low, high = np.maximum(edges[..., :2] - reach, 0), np.minimum(edges[..., 2:] + reach, shape)
-    area: NDArray[np.int64] = (high - low).prod(-1)
-    return area
-
-
-def _halves(inside: Mask) -> Edges:
-    """All ways to cut a rectangle in two: [cuts, 2, 4], each half shrunk to its masked blocks."""
-    across = _row_halves(inside.T)[..., [1, 0, 3, 2]]
-    return np.concatenate([_row_halves(inside), across])
-
-
-def _row_halves(inside: Mask) -> Edges:
-    """Top, left, bottom and right of the masked blocks above and below each cut, [cuts, 2, 4]."""
+def _row_halves(inside: Mask) -> NDArray[np.int64]:
+    """Top, left, bottom and right of the masked blocks above and below each cut between rows, [cuts, 2, 4]."""
     height, width = inside.shape
     row, filled = np.arange(height), inside.any(1)
     left = np.where(filled, inside.argmax(1), width)

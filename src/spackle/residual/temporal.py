@@ -1,12 +1,8 @@
-"""How a picture came about from the one before it: flow where it can be seen, and a guess of it in the holes.
+"""Frames of a clip that do not flicker: flow from frame to frame, colours that are carried along it, aligned depth.
 
-Carrying what fills the holes from one frame of a clip into the next, so that it does not flicker.
-
-Each frame's completion knows nothing of the others. Here its aux Gaussians keep their places but take on the colours
-that stood there a frame ago, followed back by the motion of what is behind. Where an earlier frame has seen what is
-hidden now, that is the truth, and it is carried as such. All blending is of linear light.
-
-Depth that a network says anew for each frame of a clip, held to that of the frames before.
+The paper has no clips. Each frame's completion knows nothing of the others. Here its aux Gaussians keep their places
+but take on the colours that stood there a frame ago, followed back by the motion of what is behind. Where an earlier
+frame has seen what is hidden now, that is the truth, and it is carried as such. All blending is of linear light.
 """
 
 from __future__ import annotations
@@ -36,6 +32,21 @@ SAME_SHOT = 0.3  # share of a picture that must be found again in the one before
 THINNING = 4  # every fourth pixel each way is enough for six numbers
 ROUNDS = 8  # of reweighting
 FIT_PX = 0.5  # how far a pixel may be off the camera's motion and count half
+
+KEEP = 0.98  # of the trust in a colour, from frame to frame: what was seen outlives fifty frames
+GUESS = 0.9  # trust in what a completion made up; what was seen has 1
+NEARER = 0.1  # a past that stood this much nearer, relatively, is something else
+CARRIED = 0.5  # more weight than this on the past, and the pixel counts as carried
+THIN = 0.05  # least share of a pixel's light that is divided by
+FAINT = 0.25  # what has a smaller share of a pixel is too uncertain to be remembered
+MAX_GAIN = 2.0  # of the exposure, between two frames
+
+LEAK = 0.95  # of the correction, from frame to frame: flicker goes, what changes slowly stays as the base has it
+FEWEST = 64  # followed pixels that a fit needs
+OFF = 0.02  # of the median inverse depth: a pixel that is off by this much counts half
+NO_SHIFT = 0.01  # weight of the wish for no shift, against all pixels: where depths are alike, scale explains all
+MAX_SCALE = 2.0  # between two frames
+LEAST = 0.25  # a shift takes at most this away from the farthest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,16 +91,13 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 
 
 def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
-    """The flow with a guess of it where nothing was seen: as the camera moved, and as the far rim differs from that.
+    """The flow [H, W, 2], guessed where nothing was seen: as the camera moved, and as the far rim differs from that.
 
     Args:
-        found: what could be followed.
+        found: what could be followed; it stays as found wherever it is known and sure.
         inverse_depth: [H, W] positive everywhere, in the holes that of what is to stand there.
         known: [H, W] bool, where the flow is one of the scene's content.
         camera: whose picture it is.
-
-    Returns:
-        [H, W, 2]; as found wherever it is known and sure.
     """
     trusted = known & found.sure
     if not bool(trusted.any()):
@@ -133,15 +141,6 @@ def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
         weights = 1 / (1 + (off / scale) ** 2)
     found: Tensor = motion / size
     return found.to(flow.dtype)
-
-
-KEEP = 0.98  # of the trust in a colour, from frame to frame: what was seen outlives fifty frames
-GUESS = 0.9  # trust in what a completion made up; what was seen has 1
-NEARER = 0.1  # a past that stood this much nearer, relatively, is something else
-CARRIED = 0.5  # more weight than this on the past, and the pixel counts as carried
-THIN = 0.05  # least share of a pixel's light that is divided by
-FAINT = 0.25  # what has a smaller share of a pixel is too uncertain to be remembered
-MAX_GAIN = 2.0  # of the exposure, between two frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +195,11 @@ def propagate_colors(
     if not bool(hole.any()):
         return CompletedFrame(aux, own, start, motion)
     recalled, weight = _recall(past, pixel_grid(motion) + motion, inverse_depth)
-    recalled = recalled * _exposure(made_up, past, found, hole)
+    # How much brighter the frame is than the one before, where both show the same.
+    same = found.sure & ~hole
+    was = sample(past.light, pixel_grid(made_up) + found.flow)[same]
+    gain = made_up[same].mean(0) / was.mean(0).clamp_min(1e-4)
+    recalled = recalled * torch.nan_to_num(gain, nan=1.0).clamp(1 / MAX_GAIN, MAX_GAIN)
     weight = torch.where(hole, KEEP * weight, 0.0)
     fresh = made_up + _beside(recalled - made_up, hole, weight, inverse_depth)
     blended = (fresh + weight[..., None] * (recalled - fresh)).clamp(0, 1)
@@ -251,14 +254,6 @@ def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tenso
     return light / mass.clamp_min(1e-6)[..., None], torch.where(there, trust, 0.0)
 
 
-def _exposure(light: Tensor, past: FrameMemory, found: Track, hole: Tensor) -> Tensor:
-    """[3] how much brighter the frame is than the one before, where both show the same."""
-    same = found.sure & ~hole
-    was = sample(past.light, pixel_grid(light) + found.flow)[same]
-    gain = light[same].mean(0) / was.mean(0).clamp_min(1e-4)
-    return torch.nan_to_num(gain, nan=1.0).clamp(1 / MAX_GAIN, MAX_GAIN)
-
-
 def _beside(change: Tensor, hole: Tensor, weight: Tensor, inverse_depth: Tensor) -> Tensor:
     """The change [H, W, 3] of what is carried, spread over what is new, down to nothing at the rim: no seams."""
     carried = weight > CARRIED
@@ -283,30 +278,18 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
 
 
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
-    """Mean absolute difference of a view [H, W, 3] from an earlier one that is warped by a flow [H, W, 2].
+    """Mean absolute difference of a view [H, W, 3] from an earlier one, both sRGB, that is warped by a flow [H, W, 2].
 
     Args:
-        view: sRGB.
-        earlier: sRGB, of the same size.
+        view, earlier: of the same size.
         flow: from the view's pixels to the earlier one's.
-        chosen: [H, W] bool, the pixels that count.
-
-    Returns:
-        In sRGB of 0..1; None where no pixel counts.
+        chosen: [H, W] bool, the pixels that count; None is returned where there are none.
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)
     if not bool(chosen.any()):
         return None
     return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean())
-
-
-LEAK = 0.95  # of the correction, from frame to frame: flicker goes, what changes slowly stays as the base has it
-FEWEST = 64  # followed pixels that a fit needs
-OFF = 0.02  # of the median inverse depth: a pixel that is off by this much counts half
-NO_SHIFT = 0.01  # weight of the wish for no shift, against all pixels: where depths are alike, scale explains all
-MAX_SCALE = 2.0  # between two frames
-LEAST = 0.25  # a shift takes at most this away from the farthest
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ SPECK_PX = 4  # a square of holes as wide as this is seen, however little else i
 
 
 def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
-    """An order that settled the widest view first and then always the one farthest from all visited.
+    """An order that visits the widest view first and then always the one farthest from all visited.
 
     Any beginning of it is spread evenly over the path.
     """
@@ -38,10 +38,7 @@ def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]
 def reach_of(holes: float, alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
     """How much of the way to the next known frames a frame speaks for; 0: complete it.
 
-    Args:
-        holes: their share of the picture.
-        alpha: [H, W], the frame's opacity.
-        threshold: less is a hole.
+    Holes cover the share `holes` of the picture; alpha is its opacity [H, W].
     """
     if holes > QUIET_HAR or has_speck(alpha, threshold):
         return 0.0
