@@ -1,14 +1,8 @@
-"""Where a network runs: on which device, with how much memory, untouched by settings that a caller has for others.
+"""Where arithmetic runs: the device and its memory, the precision, and the threads of compiled kernels.
 
-What networks compute in: float32, or bfloat16 where the hardware multiplies it natively.
-
-Neither type repeats bit for bit with another number of threads: sums run in another order. With the same
-number they do.
-
-Loops shared between threads, each step a kernel that runs without the GIL.
-
-Numba's own parallel loops depend on a threading layer that is either unsafe to enter from two Python
-threads or unsafe after a fork; a plain thread pool is neither, and its kernels compile faster.
+Numba's own parallel loops need a threading layer that is unsafe to enter from two Python threads or after a fork; a
+plain thread pool is neither, and its kernels compile faster. The last bits of a network's output depend on the number
+of threads, because sums run in another order.
 """
 
 from __future__ import annotations
@@ -41,8 +35,7 @@ class MemoryShort(InputError):
 def pick_device(device: torch.device | str | None) -> torch.device:
     """The device that a caller means: for None a CUDA device where there is one, else the processor.
 
-    Raises:
-        InputError: a device that is not there, or one of a kind that networks do not run on here.
+    InputError for a device that is not there, or of a kind that networks do not run on here.
     """
     present = torch.cuda.is_available()
     if device is None:
@@ -69,14 +62,7 @@ def memory_is_short(error: BaseException) -> bool:
 
 @contextmanager
 def enough_memory(*advice: str) -> Iterator[None]:
-    """Turn a shortage of memory, which torch reports in many ways, into one line.
-
-    Args:
-        advice: what to do about it; closing other programs is always named.
-
-    Raises:
-        MemoryShort: memory was short.
-    """
+    """Turn a shortage of memory, which torch reports in many ways, into one `MemoryShort` line with advice."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -90,9 +76,8 @@ def enough_memory(*advice: str) -> Iterator[None]:
 def own_arithmetic(device: torch.device) -> Iterator[None]:
     """Compute in the types that the tensors have, whatever the caller has set for networks of their own.
 
-    Autocast would round to sixteen bits what is to stay exact. TF32, which torch uses for a GPU's convolutions
-    unless told otherwise, drops thirteen bits of each float32. Its switches hold for the whole process, so
-    other threads see them too until they are set back.
+    Autocast would round to sixteen bits, TF32 drops thirteen bits of each float32 in a GPU's convolutions. Its switches
+    hold for the whole process, so other threads see them too until they are set back.
     """
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         if device.type != "cuda":
@@ -115,11 +100,7 @@ PRECISIONS = ("auto", "fp32", "bf16")
 
 
 def pick_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """The type that --precision means on a device: `auto` is bfloat16 where the hardware multiplies it natively.
-
-    Raises:
-        ValueError: an unknown precision.
-    """
+    """The type that --precision means on a device; ValueError for an unknown precision."""
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
     if precision == "auto":
@@ -147,10 +128,9 @@ def thread_count() -> int:
 
 
 def run_chunks(function: Callable[[int, int], object], total: int, grain: int) -> None:
-    """Call `function(start, stop)` for consecutive chunks of at most `grain` of 0..total.
+    """Call `function(start, stop)` for chunks of at most `grain` of 0..total, in any order: writes must not overlap.
 
-    A thread takes the next chunk when it is done with its last, so uneven chunks balance. The order of
-    the calls is free: what they write must not overlap.
+    A thread takes the next chunk when it is done with its last, so uneven chunks balance.
     """
     chunks = -(-total // grain)
     helpers = min(thread_count(), chunks) - 1

@@ -1,9 +1,4 @@
-"""From a depth map as measured to a surface that can be seen from the side.
-
-Evening out what a sensor's noise does to a surface.
-
-Filling the gaps of a depth map along what the photo shows.
-"""
+"""From a depth map as measured to a surface that can be seen from the side: steps, noise, hanging pixels, gaps."""
 
 from __future__ import annotations
 
@@ -23,15 +18,10 @@ SWEEPS = 200  # enough for steps about 30 pixels apart
 
 
 def attach_flying_pixels(inverse_depth: Tensor, edge: float = EDGE) -> Tensor:
-    """Move pixels that hang between foreground and background to the side they are closer to.
+    """Move pixels of inverse depth [H, W] > 0 that hang between two surfaces to the one they are closer to.
 
-    A pixel hangs when it lies strictly between its left and right (or upper and lower) neighbours with
-    a depth edge to both, while the depth beyond those neighbours goes on much more smoothly: on a steep
-    plane it does not.
-
-    Args:
-        inverse_depth: [H, W], positive everywhere.
-        edge: relative jump that makes a depth edge.
+    A pixel hangs when it lies strictly between its left and right (or upper and lower) neighbours with a depth edge (a
+    relative jump of `edge`) to both, while the depth beyond goes on much more smoothly: on a steep plane it does not.
     """
     for axis in (1, 0):
         before, after = _shifted(inverse_depth, axis, -1), _shifted(inverse_depth, axis, 1)
@@ -55,13 +45,8 @@ def _shifted(image: Tensor, axis: int, by: int) -> Tensor:
 def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) -> Tensor:
     """Give a background pixel that a depth edge touches to the foreground, where its colour says so.
 
-    A lens blurs a silhouette over a pixel or two, so the first background pixel often has the
-    foreground's colour. Left where it is, it draws a ghost outline as soon as the camera moves.
-
-    Args:
-        inverse_depth: [H, W], positive everywhere.
-        rgb: [H, W, 3] sRGB.
-        edge: relative jump that makes a depth edge.
+    A lens blurs a silhouette over a pixel or two, so the first background pixel often has the foreground's colour, and
+    draws a ghost outline as soon as the camera moves. Takes inverse depth [H, W] > 0 and sRGB [H, W, 3].
     """
     result = inverse_depth
     for axis in (1, 0):
@@ -76,16 +61,11 @@ def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) 
 
 
 def undo_quantisation(inverse_depth: Tensor, valid: Tensor, quantum: float, sweeps: int = SWEEPS) -> Tensor:
-    """The smoothest surface that would round to the stored steps.
+    """The smoothest inverse depth [H, W] that would round to the stored one, of pixels valid [H, W]; others stay out.
 
-    Integer disparities turn a slanted plane into a staircase with a gap at every step. Each stored value
-    is an interval, ±quantum/2; relaxing towards the mean of the neighbours within the interval removes
-    the stairs. Neighbours more than 1.5 steps away belong to another surface.
-
-    Args:
-        inverse_depth: [H, W], multiples of `quantum` plus a constant.
-        valid: [H, W] bool; other pixels neither move nor pull.
-        quantum: step of the stored values in units of the inverse depth.
+    Integer disparities turn a slanted plane into a staircase with a gap at every step. A stored value stands for the
+    interval of ±quantum/2 (in units of the inverse depth); relaxing towards the mean of the neighbours within it
+    removes the stairs. Neighbours more than 1.5 steps away belong to another surface.
     """
     low, high = inverse_depth - quantum / 2, inverse_depth + quantum / 2
     weights = []
@@ -112,8 +92,7 @@ ENOUGH = 6  # pixels that say where a plane is
 def noise_level(inverse_depth: Floats, known: Bools) -> float:
     """Standard deviation of the noise of most pixels, relative to the inverse depth.
 
-    The second difference by both x and y is nought on every plane and along every crease and edge that is
-    straight, and little on what is curved; the median leaves out the rest.
+    By both x and y the second difference is zero on planes and straight edges; the median leaves out the rest.
     """
     if min(inverse_depth.shape) < 3:
         return 0.0
@@ -131,15 +110,10 @@ def _second_difference(image: Floats) -> Floats:
 
 
 def smooth_noise(inverse_depth: Floats, known: Bools) -> Floats:
-    """Put every pixel on the plane that its neighbourhood lies on, where the map is noisy; else leave the map as it is.
+    """Put every known pixel on the plane of its neighbourhood, where the inverse depth [h, w] is noisy; else return it.
 
-    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through.
-    Pixels further from the plane than noise would explain are on another surface: they neither count
-    nor move.
-
-    Args:
-        inverse_depth: [h, w], positive where known.
-        known: [h, w] bool; others neither count nor move.
+    Noise of 0.3 % makes each Gaussian of a slanted surface face another way, and light shines through. Pixels further
+    from the plane than noise explains are on another surface: they neither count nor move.
     """
     noise = noise_level(inverse_depth, known)
     if not LEAST_NOISE <= noise <= MOST_NOISE:
@@ -196,20 +170,12 @@ MEDIAN = 5  # window that removes specks from what was filled
 
 
 def fill_missing(inverse_depth: Tensor, rgb: Tensor, valid: Tensor) -> Tensor:
-    """Give every pixel without depth the depth of the measured pixel that it is best connected to.
+    """Give every pixel without inverse depth [H, W] that of the valid pixel that it is best connected to.
 
-    Stereo misses the strips beside silhouettes and whatever shines. A path over the image costs its
-    length plus the colour change along it, so depth spreads within things and stops at their outlines;
-    starting from a surface nearer than the far side of the gap costs extra, because most gaps are
-    background that the second camera could not see.
-
-    Args:
-        inverse_depth: [H, W], positive where valid.
-        rgb: [H, W, 3] sRGB.
-        valid: [H, W] bool.
-
-    Returns:
-        [H, W], positive; valid pixels as they were.
+    Stereo misses the strips beside silhouettes and whatever shines. A path over the image costs its length plus the
+    change of sRGB [H, W, 3] along it, so depth spreads within things and stops at their outlines; a start nearer than
+    the far side of the gap costs extra, because most gaps are background that the second camera could not see. Valid
+    pixels stay as they are.
 
     Raises:
         ValueError: where nothing is valid.

@@ -1,9 +1,4 @@
-"""Where a depth map has edges, and where an edge is smeared over several pixels.
-
-A depth map of any size on the photo's grid, without mixing what stands in front with what stands behind.
-
-Deciding on which side of a depth edge a pixel stands, by what the photo shows.
-"""
+"""Depth edges: where a map has them, and where the photo says that they run on the photo's grid."""
 
 from __future__ import annotations
 
@@ -36,18 +31,13 @@ class Edges:
 
 
 def find_edges(inverse_depth: Floats, known: Bools, focal: tuple[float, float]) -> Edges:
-    """Depth edges along the rows and the columns, sharp ones and smeared ones.
+    """Depth edges along the rows and the columns of inverse depth [h, w], sharp ones and smeared ones.
 
-    The inverse depth of a plane is linear in the pixel, however steep; a crease bends it, a sphere
-    curves it. A smeared edge alone rises from one slope to a peak and falls back to another, so it is
-    sought as a peak of the slope: one that stands out from the slopes on both sides, that would be
-    steeper than any surface one sees much of, and that raises the depth by more than `EDGE` beyond
-    what those slopes explain. The pixels from foot to foot of the peak hang in the edge.
-
-    Args:
-        inverse_depth: [h, w], positive where known.
-        known: [h, w] bool; no edge is seen beside other pixels.
-        focal: focal length in pixels of the map, horizontally and vertically.
+    The inverse depth of a plane is linear in the pixel, a crease bends it, a sphere curves it. Only a smeared edge
+    rises from one slope to a peak and falls back to another: a peak that stands out from the slopes on both sides, that
+    is steeper than any surface one sees much of (by the focal length, horizontal and vertical, in pixels of the map),
+    and that raises the depth by more than `EDGE` beyond what those slopes explain. The pixels from foot to foot of the
+    peak hang in the edge. Beside pixels that are not known [h, w] no edge is seen.
     """
     step, across = _rows(inverse_depth, known, STEEPEST / focal[0])
     columns, below = _rows(np.ascontiguousarray(inverse_depth.T), np.ascontiguousarray(known.T), STEEPEST / focal[1])
@@ -131,18 +121,12 @@ class Sampled:
 
 
 def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width: int) -> Sampled:
-    """Resample a map to height×width.
+    """Resample a map's inverse depth [h, w], where known [h, w], to height×width.
 
-    Between four pixels of one surface the inverse depth is bilinear, so a plane stays the plane it is.
-    Where an edge runs between them, or one hangs in an edge, the photo's pixel stays open unless a
-    sound pixel of the map is right there; what that one says is continued along its surface. Unknown
-    pixels never count; where they have more than half of the weight, the photo's pixel is a hole, unless it
-    covers one that is known.
-
-    Args:
-        inverse_depth: [h, w], positive where known.
-        known: [h, w] bool.
-        edges: of this map.
+    Between four pixels of one surface the inverse depth is bilinear, so a plane stays a plane. Where an edge runs
+    between them, or one hangs in an edge, the photo's pixel stays open unless a sound pixel of the map is right there;
+    what that one says is continued along its surface. Where unknown pixels have more than half of the weight, the
+    photo's pixel is a hole, unless it covers one that is known.
     """
     sound = known & (edges.step == 0)
     across = _flattest(inverse_depth, sound, edges.across)
@@ -160,10 +144,7 @@ def sample(inverse_depth: Floats, known: Bools, edges: Edges, height: int, width
 
 @kernel
 def _flattest(inverse_depth: Any, sound: Any, edge: Any) -> Any:
-    """The flattest slope along its row that each pixel's surface has within reach.
-
-    The flattest, because what a smeared edge leaves beside its foot is always steeper than the surface.
-    """
+    """The flattest slope within reach along the row: what a smeared edge leaves beside its foot is steeper."""
     height, width = inverse_depth.shape
     slope = np.zeros((height, width), np.float32)
     for y in range(height):
@@ -245,16 +226,12 @@ SAME_SURFACE = EDGE / 2
 
 
 def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
-    """Give every open pixel the depth of the side that it is best connected to.
+    """Give every open pixel the depth of the side that it is best connected to in the photo, sRGB [H, W, 3].
 
-    A path over the image costs its length, the colour change along it and the change of the smeared
-    depth: so a side's depth, continued along its surface, spreads to the colour edge, and where there
-    is none to the middle of what was smeared. Then neighbours of a like colour outvote the few that
-    stand alone, and what came from several places of one surface is evened out.
-
-    Args:
-        sampled: the map on the photo's grid.
-        rgb: [H, W, 3] sRGB.
+    A path over the image costs its length, the colour change along it and the change of the smeared depth: so a side's
+    depth, continued along its surface, spreads to the colour edge, and where there is none to the middle of what was
+    smeared. Then neighbours of a like colour outvote the few that stand alone, and steps within one surface are evened
+    out.
 
     Returns:
         Inverse depth [H, W] and where it is known; settled pixels as they were.

@@ -1,9 +1,6 @@
 """The hf base: a depth model of transformers looks at the photo, and its depth is lifted as a measured one is.
 
-Depth models by way of transformers (optional: pip install 'spackle-nvs[hf]').
-
-Where a model's files are: in a folder, in the hub's cache on this machine, or on the hub, from where they are copied
-into the cache (optional: pip install 'spackle-nvs[hf]').
+Optional: pip install 'spackle-nvs[hf]'.
 """
 
 from __future__ import annotations
@@ -14,8 +11,9 @@ import logging
 import math
 import os
 import re
+import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,6 +41,37 @@ from spackle.errors import InputError, reason_in_a_line
 from spackle.image import LENSES, Photo, resize_photo
 
 LENS_SOURCE = "Depth Pro"  # the only kind of model that gives a lens
+SETTINGS = ["config.json", "preprocessor_config.json", "processor_config.json"]
+WEIGHTS = ["model.safetensors", "model-*.safetensors", "model.safetensors.index.json"]
+NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
+FIT = "give the weights that belong to its config.json"
+_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
+_PROBE = (64, 64)  # height and width of a picture that only has to reach every weight
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthModel:
+    """A depth network in evaluation mode, with all that is needed to ask it."""
+
+    network: nn.Module
+    prepare: Prepare
+    meaning: Meaning
+
+    @torch.no_grad()
+    def __call__(self, rgb: Tensor) -> tuple[Tensor, float | None, Window]:
+        """Ask for the depth of a photo, [H, W, 3] sRGB in 0..1.
+
+        Returns:
+            the network's numbers [h, w] float32 on the processor, the horizontal field of view in degrees where it
+            gives one, and the part of the numbers that is the photo.
+        """
+        pixels, window = self.prepare(rgb)
+        with quiet():
+            output = self.network(pixel_values=pixels.to(next(self.network.parameters()).device))
+        raw, fov = output.predicted_depth.float().cpu(), getattr(output, "field_of_view", None)
+        if raw.ndim != 3 or len(raw) != 1:
+            raise ValueError(f"an output of shape {tuple(raw.shape)}")
+        return raw[0], None if fov is None else float(fov), window
 
 
 class HfBase:
@@ -72,10 +101,10 @@ class HfBase:
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
         name = f"hf:{model}"
-        return cls(name, load_model(model, name, target, dtype), "bf16" if dtype.itemsize == 2 else "fp32")
+        return cls(name, _load_model(model, name, target, dtype), "bf16" if dtype.itemsize == 2 else "fp32")
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `rgbd.lift` makes them.
+        """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
         A model that sees the lens gives it where neither the photo's file nor a person does.
 
@@ -88,7 +117,7 @@ class HfBase:
         """
         photo = resize_photo(photo)
         device = next(self.model.network.parameters()).device
-        with one_line(f"{photo.path}: {self.name}", "fails", "give another photo or model"), own_arithmetic(device):
+        with _one_line(f"{photo.path}: {self.name}", "fails", "give another photo or model"), own_arithmetic(device):
             raw, fov, window = self.model(photo.rgb)
         camera, lens_source = photo.camera, ""
         if fov is not None and photo.focal_source.startswith("default"):
@@ -117,53 +146,14 @@ class HfBase:
         return Camera.from_focal(focal, photo.width, photo.height)
 
 
-FIT = "give the weights that belong to its config.json"
-_PROBE = (64, 64)  # height and width of a picture that only has to reach every weight
-
-
-@dataclasses.dataclass(frozen=True)
-class DepthModel:
-    """A depth network in evaluation mode, with all that is needed to ask it."""
-
-    network: nn.Module
-    prepare: Prepare
-    meaning: Meaning
-
-    @torch.no_grad()
-    def __call__(self, rgb: Tensor) -> tuple[Tensor, float | None, Window]:
-        """What the network says about a photo, [H, W, 3] sRGB in 0..1.
-
-        Returns:
-            its numbers [h, w] float32 on the processor, the horizontal field of view in degrees where it gives one,
-            and the part of them that is the photo.
-        """
-        pixels, window = self.prepare(rgb)
-        with quiet():
-            output = self.network(pixel_values=pixels.to(next(self.network.parameters()).device))
-        raw, fov = output.predicted_depth.float().cpu(), getattr(output, "field_of_view", None)
-        if raw.ndim != 3 or len(raw) != 1:
-            raise ValueError(f"an output of shape {tuple(raw.shape)}")
-        return raw[0], None if fov is None else float(fov), window
-
-
-def load_model(model: str, name: str, device: torch.device, dtype: torch.dtype) -> DepthModel:
-    """Read a depth model from safetensors; nothing of its own code is run.
-
-    Args:
-        model: a folder, or owner/name on the hub.
-        name: what messages call it.
-        device: where it runs.
-        dtype: of the products of matrices, which are most of the work; all else stays in float32.
-
-    Raises:
-        InputError: a package or file is missing, or the model is broken, not a depth model, or too large.
-    """
-    meaning_of(read_settings(settings_folder(model), "config.json", name), name)  # before the weights come
-    folder = weights_folder(model)
-    settings = read_settings(folder, "config.json", name)
+def _load_model(model: str, name: str, device: torch.device, dtype: torch.dtype) -> DepthModel:
+    """Read a depth model from safetensors; only its linear layers compute in `dtype`. No code of its own runs."""
+    meaning_of(_read_settings(_find(model, SETTINGS), "config.json", name), name)  # before the weights come
+    folder = _find(model, [*SETTINGS, *WEIGHTS])
+    settings = _read_settings(folder, "config.json", name)
     meaning, kind = meaning_of(settings, name), str(settings["model_type"])
     transformers = _transformers()
-    with one_line(name, "cannot be loaded", "give its files again, or another model"), _silent(transformers):
+    with _one_line(name, "cannot be loaded", "give its files again, or another model"), quiet():
         prepare = _prepare(transformers, folder, kind, name)
         # Anything but float32 on disk is widened: what is not a product of matrices is cheap, and coarse in 16 bits.
         network, info = transformers.AutoModelForDepthEstimation.from_pretrained(
@@ -184,43 +174,21 @@ def load_model(model: str, name: str, device: torch.device, dtype: torch.dtype) 
         if missing and _matters(found, missing):
             lacks = missing[0] if len(missing) == 1 else f"{missing[0]} and {len(missing) - 1} more"
             raise InputError(f"{name}: its weights lack {lacks}: {FIT}")
-        lower_linear(network, dtype)
+        _lower_linear(network, dtype)
         network.to(device)
     return found
 
 
-@contextmanager
-def one_line(who: str, what: str, advice: str) -> Iterator[None]:
-    """Turn whatever transformers and torch raise over a stranger's files into one line.
-
-    Raises:
-        InputError: `who`, `what` went wrong, why, and the advice.
-        MemoryShort: memory was short.
-    """
+def _transformers() -> Any:
     try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        reason = reason_in_a_line(error)
-        if memory_is_short(error):
-            raise MemoryShort(f"{who}: not enough memory: give a smaller model, or close other programs") from error
-        raise InputError(f"{who} {what} ({reason}): {advice}") from error
-
-
-def lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
-    """Let the linear layers, where a transformer spends its time, multiply in `dtype`, in place.
-
-    What they take and give stays float32. The last layers of all these models are convolutions, which stay
-    float32 too: eight bits would turn slanted surfaces into stairs.
-    """
-    if dtype == torch.float32:
-        return
-    for module in network.modules():
-        if type(module) is nn.Linear:
-            module.to(dtype)
-            module.register_forward_pre_hook(lambda _, args: tuple(x.to(dtype) for x in args))
-            module.register_forward_hook(lambda _module, _args, output: output.float())
+        with quiet():
+            import transformers
+            import transformers.utils.logging
+    except Exception as error:  # a torchvision of another build raises RuntimeError
+        if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
+            raise InputError(NOT_INSTALLED) from error
+        raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
+    return transformers
 
 
 def _prepare(transformers: Any, folder: Path, kind: str, name: str) -> Prepare:
@@ -243,7 +211,7 @@ def _prepare(transformers: Any, folder: Path, kind: str, name: str) -> Prepare:
 
 
 def _matters(model: DepthModel, missing: list[str]) -> bool:
-    """Whether the output depends on tensors that the file lacks: DPT has some, in its code, that are never used.
+    """Whether the output depends on tensors that the file lacks: DPT has some that it never uses.
 
     They have random numbers now. With NaN in their place the answer is NaN if one of them is used.
     """
@@ -255,58 +223,70 @@ def _matters(model: DepthModel, missing: list[str]) -> bool:
     return not bool(torch.isfinite(raw).all()) or (fov is not None and fov != fov)
 
 
-def _transformers() -> Any:
-    try:
-        with quiet():
-            import transformers
-            import transformers.utils.logging
-    except Exception as error:  # a torchvision of another build raises RuntimeError
-        if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
-            raise InputError(NOT_INSTALLED) from error
-        raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
-    return transformers
+def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
+    """Let the linear layers, where a transformer spends its time, multiply in `dtype`; they take and give float32.
+
+    The last layers of all these models are convolutions and stay float32: eight bits would turn slanted surfaces into
+    stairs.
+    """
+    if dtype == torch.float32:
+        return
+    for module in network.modules():
+        if type(module) is nn.Linear:
+            module.to(dtype)
+            module.register_forward_pre_hook(lambda _, args: tuple(x.to(dtype) for x in args))
+            module.register_forward_hook(lambda _module, _args, output: output.float())
 
 
 @contextmanager
-def _silent(transformers: Any) -> Iterator[None]:
-    """`quiet`, and transformers' own progress bars with it."""
-    bars = transformers.utils.logging
-    enabled = bars.is_progress_bar_enabled()
+def _one_line(who: str, what: str, advice: str) -> Iterator[None]:
+    """Turn whatever transformers and torch raise over a stranger's files into one line.
+
+    Raises:
+        InputError: `who`, `what` went wrong, why, and the advice.
+        MemoryShort: memory was short.
+    """
     try:
-        with quiet():
-            bars.disable_progress_bar()
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = reason_in_a_line(error)
+        if memory_is_short(error):
+            raise MemoryShort(f"{who}: not enough memory: give a smaller model, or close other programs") from error
+        raise InputError(f"{who} {what} ({reason}): {advice}") from error
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep the packages from printing warnings, logs and progress bars; what matters is raised."""
+    from huggingface_hub import utils
+
+    own = getattr(sys.modules.get("transformers"), "utils", None)  # transformers has progress bars beside the hub's
+    bars: list[tuple[Any, Any]] = []
+    if not utils.are_progress_bars_disabled():
+        bars.append((utils.disable_progress_bars, utils.enable_progress_bars))
+    if own is not None and own.logging.is_progress_bar_enabled():
+        bars.append((own.logging.disable_progress_bar, own.logging.enable_progress_bar))
+    loggers = [logging.getLogger(name) for name in ("transformers", "huggingface_hub", "httpx")]
+    levels = [logger.level for logger in loggers]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for logger in loggers:
+                logger.setLevel(logging.CRITICAL)
+            for disable, _ in bars:
+                disable()
             yield
     finally:
-        if enabled:
-            bars.enable_progress_bar()
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+        for _, enable in bars:
+            enable()
 
 
-NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
-SETTINGS = ["config.json", "preprocessor_config.json", "processor_config.json"]
-WEIGHTS = ["model.safetensors", "model-*.safetensors", "model.safetensors.index.json"]
-_HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
-
-
-def settings_folder(model: str) -> Path:
-    """The folder with a model's settings, for a look at them before gigabytes are copied.
-
-    Raises:
-        InputError: no such folder, no such model, the hub cannot be reached, or the settings are not there.
-    """
-    return _find(model, SETTINGS, _lacks_settings)
-
-
-def weights_folder(model: str) -> Path:
-    """The folder with a model's settings and weights; raises as `settings_folder` does."""
-    return _find(model, [*SETTINGS, *WEIGHTS], lambda folder: _lacks_settings(folder) or _lacks_weights(folder))
-
-
-def read_settings(folder: Path, file: str, name: str) -> dict[str, Any]:
-    """What a JSON file of a model says.
-
-    Raises:
-        InputError: not a JSON object; `name` is the model's.
-    """
+def _read_settings(folder: Path, file: str, name: str) -> dict[str, Any]:
+    """The JSON object in a file of the model `name`."""
     try:
         settings = json.loads((folder / file).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -318,61 +298,36 @@ def read_settings(folder: Path, file: str, name: str) -> dict[str, Any]:
     return settings
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep the packages from printing warnings, logs and progress bars; what matters is raised."""
-    from huggingface_hub import utils
-
-    loggers = [logging.getLogger(name) for name in ("transformers", "huggingface_hub", "httpx")]
-    levels, bars = [logger.level for logger in loggers], not utils.are_progress_bars_disabled()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            for logger in loggers:
-                logger.setLevel(logging.CRITICAL)
-            utils.disable_progress_bars()
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-        if bars:
-            utils.enable_progress_bars()
-
-
-def _find(model: str, files: list[str], lacks: Callable[[Path], str]) -> Path:
-    """A folder that lacks nothing; what is in the cache is taken from there without asking the hub."""
+def _find(model: str, files: list[str]) -> Path:
+    """The folder with these files of a model; what is in the cache is taken from there without asking the hub."""
     if os.path.isdir(model) or model.startswith(("./", "../", "/", "~")):
         folder = Path(model).expanduser()
         if not folder.is_dir():
             raise InputError(f"hf:{model}: no such folder: check the name")
     elif _HUB_NAME.fullmatch(model):
         cached = _from_cache(model, files)
-        folder = cached if cached is not None and not lacks(cached) else _from_hub(model, files)
+        folder = cached if cached is not None and not _lacks(cached, files) else _from_hub(model, files)
     else:
         raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
-    if problem := lacks(folder):
+    if problem := _lacks(folder, files):
         raise InputError(f"hf:{model}: {problem}")
     return folder
 
 
-def _lacks_settings(folder: Path) -> str:
+def _lacks(folder: Path, files: list[str]) -> str:
+    """What a folder lacks of a model's settings, and of its weights where they are among the files; "" for nothing."""
     if not (folder / "config.json").is_file():
         return "has no config.json, so it is no model of transformers: give another"
     if not any((folder / name).is_file() for name in SETTINGS[1:]):
         return f"has no {SETTINGS[1]}, which says how to prepare a photo: give it, or another model"
-    return ""
-
-
-def _lacks_weights(folder: Path) -> str:
     index = folder / WEIGHTS[-1]
-    if index.is_file():
-        parts = read_settings(folder, index.name, str(folder)).get("weight_map")
+    if WEIGHTS[0] in files and index.is_file():
+        parts = _read_settings(folder, index.name, str(folder)).get("weight_map")
         names = {str(name) for name in parts.values()} if isinstance(parts, dict) else set()
         absent = sorted(name for name in names if not (folder / name).is_file())
         if absent or not names:
             return f"{index.name} names weights that are not there ({', '.join(absent)[:80]}): give its files again"
-        return ""
-    if not (folder / WEIGHTS[0]).is_file():
+    elif WEIGHTS[0] in files and not (folder / WEIGHTS[0]).is_file():
         return f"has no {WEIGHTS[0]}, the only kind of weights that runs no code when it is read: give another model"
     return ""
 

@@ -1,7 +1,4 @@
-"""What the numbers of each depth model mean, and how they become metres.
-
-A photo as each depth model wants to see it, and where the photo lies in what it saw.
-"""
+"""Each kind of depth model: how it wants to see a photo, what its numbers mean, and how they become metres."""
 
 from __future__ import annotations
 
@@ -48,10 +45,9 @@ FLAT = 1e-5  # relative spread below which all pixels say the same
 
 
 def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
-    """What a model's output is, by what its config.json says.
+    """What a model's output is, by its config.json.
 
-    Raises:
-        InputError: a model whose output is no depth, or is not known here: a guess would turn scenes inside out.
+    InputError for one whose output is no depth, or is not known here: a guess would turn scenes inside out.
     """
     kind = str(settings.get("model_type"))
     if kind in UNFIT:
@@ -79,14 +75,9 @@ def scale_note(meaning: Meaning) -> str:
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
-    """A model's output in metres, at its own size; pixels without a positive finite depth are not valid.
+    """A model's output [h, w] float32 in metres; pixels without a positive finite depth are not valid.
 
-    Args:
-        raw: [h, w] float32.
-        meaning: of its numbers.
-        focal: of the photo, in its widths; canonical disparity depends on it.
-        name: of the model, for messages.
-        photo: for messages, and the map's `path`.
+    Canonical disparity depends on `focal`, the photo's in its widths; `name` and `photo` are for messages.
 
     Raises:
         InputError: no finite numbers, or the same one everywhere.
@@ -164,8 +155,7 @@ def by_processor(processor: Any, model_type: str) -> Prepare:
 def by_settings(settings: Mapping[str, Any], antialias: bool) -> Prepare:
     """The input that preprocessor_config.json asks for: the photo stretched to one size, bilinear, and normalised.
 
-    Raises:
-        ValueError: settings that ask for something else.
+    ValueError for settings that ask for something else.
     """
     size = settings["size"]
     height, width = int(size["height"]), int(size["width"])

@@ -47,11 +47,7 @@ class RgbdBase:
         self.depth = depth
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size; missing depth is filled and its share reported.
-
-        Raises:
-            InputError: where photo and depth map differ in aspect ratio.
-        """
+        """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
         self.depth.check_shape(photo.height, photo.width, photo.path)
         photo = resize_photo(photo)
         prediction = lift(photo.rgb, self.depth, self._camera(photo))
@@ -71,7 +67,7 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
         depth: any size of the same aspect ratio.
-        camera: the photo's camera, at the world's origin.
+        camera: the photo's, at the world's origin.
 
     Raises:
         InputError: not one pixel has a depth.
@@ -105,11 +101,7 @@ def _sound(depth: DepthMap) -> DepthMap:
 
 
 def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Inverse depth on the photo's grid and where it is known, [H, W] each.
-
-    Noise is evened out in the map as it came; then every smeared or resampled edge is moved to where
-    the photo has it. A clean map of the photo's size stays as it is.
-    """
+    """Inverse depth on the photo's grid and where it is known, [H, W] each; a clean map of that size stays as it is."""
     inverse = torch.where(depth.valid, 1.0 / depth.depth, torch.zeros_like(depth.depth))
     if depth.quantity == "disparity" and depth.quantum is not None:
         inverse = undo_quantisation(inverse, depth.valid, depth.quantum)

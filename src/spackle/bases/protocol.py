@@ -1,7 +1,4 @@
-"""What every base promises.
-
-Inverse depth of unknown scale: where it is put in the world.
-"""
+"""What every base promises."""
 
 from __future__ import annotations
 

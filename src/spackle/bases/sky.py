@@ -43,14 +43,9 @@ class Sky:
 def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> Sky:
     """Find the sky and put it at one distance, behind everything else; leave the photo as it is where none is found.
 
-    A sky begins at the photo's upper border, spreads without sharp changes, is bright or blue, and its
-    depth is unknown or among the farthest: what is as near as the rest is a wall or a ceiling, whatever
-    its colour. One distance, because a sky whose depth varies swims as the camera moves.
-
-    Args:
-        inverse_depth: [H, W], positive where known.
-        rgb: [H, W, 3] sRGB.
-        known: [H, W] bool.
+    A sky begins at the upper border of the photo (sRGB [H, W, 3]), spreads without sharp changes, is bright or blue,
+    and its inverse depth [H, W] is unknown or among the farthest: what is as near as the rest is a wall or a ceiling,
+    whatever its colour. One distance, because a sky whose depth varies swims as the camera moves.
     """
     nothing = Sky(inverse_depth, known, 0.0)
     near = _quantile(inverse_depth, known, NEAR_QUANTILE)

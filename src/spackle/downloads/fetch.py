@@ -1,9 +1,4 @@
-"""Big files from the web: gone on with after a break, whole under their name or not there, and recorded.
-
-Weights that others publish and Spackle can use: where from, and under what terms.
-
-One at a time: a lock file that is free again when its holder ends, however it ends.
-"""
+"""Big files from the web: continued after a break, whole under their name or not there, and recorded."""
 
 from __future__ import annotations
 
@@ -25,8 +20,7 @@ AGAIN = "run `spackle weights get` again"
 class Record:
     """What was downloaded; lies beside the file as NAME.json.
 
-    Nobody tells us what the digest ought to be: it is that of the first download. So it shows damage
-    and later change, not a download that was bad from the start.
+    The digest is that of the first download: it shows damage and later change, not a download that was bad at once.
     """
 
     url: str
@@ -37,8 +31,7 @@ class Record:
 def weights_folder() -> Path:
     """Where downloaded weights lie: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
 
-    Raises:
-        InputError: none is set, and there is no home.
+    InputError where none is set, and there is no home.
     """
     try:
         if chosen := os.environ.get("SPACKLE_WEIGHTS"):
@@ -50,15 +43,11 @@ def weights_folder() -> Path:
 
 
 def download(url: str, path: str | os.PathLike[str], progress: Progress | None = None) -> Record:
-    """Fetch `url` to `path` and write its record; a file that is there is replaced at the end.
+    """Fetch `url` (http or https, without a password) to `path` in a folder that exists, and write its record.
 
-    What has come lies in NAME.part until it is whole. After a break, a kill or Ctrl-C the next call asks
-    for the rest only, unless the remote file has changed or the server cannot do that.
-
-    Args:
-        url: http:// or https://, without a password; proxies are those of the environment.
-        path: the file's name here, in a folder that exists.
-        progress: called before the first block (what came in an earlier call is done) and after each.
+    A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
+    Ctrl-C the next call asks for the rest only, unless the remote file has changed or the server cannot do that.
+    `progress` gets the bytes done, those of earlier calls among them, and their number.
 
     Raises:
         InputError: the file cannot be had or not be written, or another process is at it.
@@ -84,11 +73,7 @@ def download(url: str, path: str | os.PathLike[str], progress: Progress | None =
 
 
 def read_record(path: str | os.PathLike[str]) -> Record | None:
-    """The record beside a file; None where none lies there.
-
-    Raises:
-        InputError: a record that makes no sense.
-    """
+    """The record beside a file; None where none lies there, InputError for one that makes no sense."""
     place = _beside(_real(path), ".json")
     try:
         fields = read_json(place)
@@ -102,8 +87,7 @@ def read_record(path: str | os.PathLike[str]) -> Record | None:
 def check_recorded(path: str | os.PathLike[str]) -> Record | None:
     """Hold a file against its record: size first, then every byte. None where it has none.
 
-    Raises:
-        InputError: they differ, or one of them cannot be read.
+    InputError where they differ, or one of them cannot be read.
     """
     record = read_record(path)
     if record is None:
@@ -163,22 +147,14 @@ WEIGHTS = {
 
 
 def known_weights(name: str) -> KnownWeights:
-    """The entry of that name.
-
-    Raises:
-        InputError: no such name.
-    """
+    """The entry of that name; InputError where there is none."""
     if name not in WEIGHTS:
         raise InputError(f"{name}: no weights of that name are known: choose from {', '.join(WEIGHTS)}")
     return WEIGHTS[name]
 
 
 def installed(name: str) -> Path | None:
-    """The file of known weights in the folder of weights; None where it is not there.
-
-    Raises:
-        InputError: no such name.
-    """
+    """The file of known weights in the folder of weights; None where it is not there."""
     path = weights_folder() / known_weights(name).file
     return path if os.path.isfile(path) else None
 
@@ -200,9 +176,7 @@ else:
 
 @contextlib.contextmanager
 def hold(path: Path) -> Iterator[None]:
-    """Hold the lock file `path` during the block.
-
-    The system keeps the lock, not the file's being there: one that a killed process left is free.
+    """Hold the lock file `path` during the block; a killed process's lock is free.
 
     Raises:
         BlockingIOError: somebody else holds it.

@@ -1,9 +1,4 @@
-"""A connection to a web server, or one line that says why there is none.
-
-One request for a file on a web server: from its start, or from where an earlier one broke off.
-
-A download as far as it got: NAME.part, and beside it what remote file that is the beginning of.
-"""
+"""One file's bytes from a web server into NAME.part, from the start or from where an earlier try broke off."""
 
 from __future__ import annotations
 
@@ -68,12 +63,10 @@ def _shown(url: str) -> str:
 
 
 def connect(url: str, headers: dict[str, str]) -> HTTPResponse:
-    """Send a request, through the proxies of the environment (https_proxy, no_proxy), and follow redirects.
+    """Send a request through the environment's proxies (https_proxy, no_proxy), and follow redirects.
 
-    Raises:
-        Dropped: the server cannot be reached, or not now.
-        Changed: it has no bytes in the Range that the headers name.
-        InputError: it does not give the file.
+    Raises Dropped where the server cannot be reached, Changed where it lacks the Range of the headers, and InputError
+    where it does not give the file.
     """
     request = Request(url, headers={"User-Agent": "spackle", "Accept-Encoding": "identity", **headers})
     try:
@@ -155,13 +148,7 @@ class Answer:
 
 @contextlib.contextmanager
 def ask(url: str, begun: Version | None = None, offset: int = 0) -> Iterator[Answer]:
-    """Ask for a file, or for its bytes from `offset` on if it is still the version `begun`.
-
-    Raises:
-        Dropped: the server cannot be reached, or (from the blocks) the connection broke.
-        Changed: the rest of `begun` cannot be had.
-        InputError: the server does not give the file.
-    """
+    """Ask for a file, or its bytes from `offset` on if it is still the version `begun`; raises as `connect` does."""
     headers = {}
     if begun is not None and begun.validator is not None:
         headers = {"Range": f"bytes={offset}-", "If-Range": begun.validator}
@@ -316,12 +303,7 @@ def digest(file: BinaryIO) -> hashlib._Hash:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """The fields in a file; None where there is no file, or something else in it.
-
-    Raises:
-        ValueError: this is no JSON, or none that we can read.
-        OSError: it cannot be read.
-    """
+    """The JSON object in a file, None where there is none; ValueError for what is no JSON that we can read."""
     try:
         fields = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -56,11 +56,10 @@ class LiteBase:
 
     @classmethod
     def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
-        """Read the networks' weights.
+        """Read the networks in a file that lite's training wrote, the package's own by default.
 
         Args:
-            path: a file that `spackle train --method lite` wrote; None takes the weights of the package. Of several
-                networks in it those are asked that `LOOKS` counts.
+            path: the file; those of its networks are asked that `LOOKS` counts.
             device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:
@@ -84,13 +83,9 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """What the networks say of a photo in all of `LOOKS`, in the mean of the logarithms.
+        """What the networks say of a photo [H, W, 3], sRGB in 0..1, in all of `LOOKS`: the mean of the logarithms.
 
-        Args:
-            rgb: [H, W, 3] sRGB in 0..1, of any size.
-
-        Returns:
-            [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
+        Returns [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
         """
         looks = [look for look in LOOKS if look.network < len(self.networks)]
         return merged(self.looks(rgb, looks), [look.tilt for look in looks]).exp()

@@ -1,7 +1,4 @@
-"""The networks of the lite base: an EfficientNet-Lite's features, and a small decoder to inverse depth.
-
-The weights of the lite base in a file: of one network or of several that are asked together.
-"""
+"""The networks of the lite base and their file: an EfficientNet-Lite's features, and a small decoder."""
 
 from __future__ import annotations
 
@@ -47,10 +44,7 @@ MEAN, STD = 127.0 / 255, 128.0 / 255  # the input that the features were learned
 
 
 class SameConv(nn.Conv2d):
-    """A convolution with TensorFlow's "same" padding for sides that the stride divides, and a bias.
-
-    The bias is what is left of the batch normalisation behind it, which is folded in.
-    """
+    """A convolution with TensorFlow's "same" padding for sides that the stride divides; batch norm is in its bias."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
         super().__init__(inputs, outputs, kernel, stride, groups=groups)
@@ -182,14 +176,9 @@ LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length
 
 
 def load_networks(path: str | os.PathLike[str], otherwise: str = "a .safetensors file") -> list[LiteNet]:
-    """The networks of a file, ready to be asked, with weights in single precision.
+    """The networks of a file, or the one whose plain tensors it holds, ready to be asked, in single precision.
 
-    Args:
-        path: a file of `save_networks` (research/lite), or the plain tensors of one network.
-        otherwise: for messages: what to give in place of a file that is missing.
-
-    Raises:
-        InputError: a missing or broken file, or weights of another architecture.
+    InputError for a missing or broken file (`otherwise`: what to give in its place) or weights of another architecture.
     """
     tensors = _unpacked(read_tensors(path, "lite", otherwise))
     if LAST in tensors:

@@ -81,12 +81,7 @@ class Scale:
     highest: float | None = None  # None: the highest that the picture's format has
 
     def decode(self, codes: Array, full: int) -> tuple[Array, float | None]:
-        """Depth in metres, not above zero where unknown, and the step between two neighbouring codes in use.
-
-        Args:
-            codes: [H, W] whole numbers.
-            full: the highest code of the picture's format.
-        """
+        """Depth of codes [H, W] in metres, not above zero where unknown, and the step between codes in use."""
         highest = full if self.highest is None else self.highest
         if not all(map(math.isfinite, (self.first, self.last, self.lowest, highest))) or highest <= self.lowest:
             raise BrokenDepth("does not say what its values mean: a number of its range makes no sense")

@@ -1,9 +1,4 @@
-"""What a JPEG carries beside its picture: XMP, further pictures, and bytes behind its end.
-
-The boxes of a HEIF file, as far as they say which item is a depth map and what it looks like.
-
-XMP of a stranger's file as a small tree: no document types, no entities, bounded in size and depth.
-"""
+"""What a stranger's JPEG, HEIF or XMP holds beside the picture, read within bounds."""
 
 from __future__ import annotations
 
@@ -63,10 +58,7 @@ def xmp_of(data: Bytes, start: int = 0) -> bytes:
 
 
 def extended_xmp_of(data: Bytes, main: bytes) -> tuple[bytes, bool]:
-    """The XMP that did not fit into the main packet, put together as far as it is there, and whether that is all.
-
-    Each part names the whole's digest (which the main packet names too), its length and the part's offset.
-    """
+    """The XMP that did not fit into the main packet, as far as it is there, and whether that is all."""
     named = GUID.search(main)
     if named is None:
         return b"", True
@@ -185,11 +177,7 @@ class _Cursor:
 
 
 def find_depth_item(data: Bytes) -> DepthItem | None:
-    """The depth map of the primary picture; None where there is none.
-
-    Raises:
-        MalformedBoxes: it cannot be said.
-    """
+    """The depth map of the primary picture; None where there is none, MalformedBoxes where it cannot be said."""
     meta = next((span for kind, span in _Cursor(data, (0, len(data))).boxes() if kind == b"meta"), None)
     if meta is None:
         raise MalformedBoxes

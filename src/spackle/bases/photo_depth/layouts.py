@@ -1,9 +1,4 @@
-"""Apple's words for a depth map: the XMP beside the auxiliary image, in HEIC and JPEG alike.
-
-Android's two layouts in a JPEG: GDepth inside the XMP, and Dynamic Depth behind the picture.
-
-The depth map of a HEIC: found by its boxes, decoded by libheif.
-"""
+"""Whose depth map it is: Apple's in JPEG and HEIC, Android's GDepth and Dynamic Depth in JPEG."""
 
 from __future__ import annotations
 

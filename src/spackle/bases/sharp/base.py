@@ -40,11 +40,7 @@ class SharpBase:
         compiled: bool = False,
         weights: str = "",
     ) -> None:
-        """Use a network that is loaded already, on its device; `weights` is what the report calls it.
-
-        Raises:
-            InputError: `windows` that cannot be.
-        """
+        """Use a network that is loaded already, on its device; `weights` is what the report calls it."""
         check_windows("windows", windows, low_memory)
         self.network = network
         self.windows = 1 if low_memory else windows or usual_windows(self.device)
@@ -100,14 +96,9 @@ class SharpBase:
         return "bf16" if self.network.feature_model.fusion.out_conv.weight.dtype == torch.bfloat16 else "fp32"
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Two layers of Gaussians in metres, the nearer one first, each in row-major order.
+        """Two layers of Gaussians in metres, the nearer first, in row-major order; InputError where memory is short.
 
-        Args:
-            photo: at its full size: the network looks at a square picture made from all of its pixels.
-            progress: called with windows done and their number.
-
-        Raises:
-            InputError: too little memory.
+        `progress` is called with windows done and their number.
         """
         advice = [] if self.windows == 1 else ["try --low-memory"]
         with enough_memory(*advice):

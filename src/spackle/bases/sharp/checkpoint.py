@@ -1,19 +1,13 @@
-"""SHARP's network from its checkpoint: strict about names, shapes and numbers.
+"""SHARP's network from its checkpoint, and the checkpoint of a trained Gaussian decoder alone.
 
-A Gaussian decoder by itself: 31 MB that stand for a whole checkpoint, because they say which one the rest is in.
-
-Named tensors from a file that a stranger wrote: its kind told by its content, and nothing in it run.
-
-What SHARP's checkpoint holds and inference never reads: it is checked by name and shape, then dropped.
-
-Weights that anyone can make, so that the whole path runs without Apple's checkpoint.
+Files are a stranger's: their kind is told by their content, nothing in them runs, and names, shapes and numbers have to
+be SHARP's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 import pickle
@@ -32,38 +26,44 @@ from torch import Tensor, nn
 from spackle.bases.sharp.layers import CONFIGS, SharpConfig, set_precision
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.device import enough_memory
+from spackle.downloads.transfer import digest
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 
+Shapes = dict[str, tuple[int, ...]]
+
 NAMED = 3  # how many of the names that differ are spelled out
+NOTE = "spackle.gaussian_decoder"  # in the file's metadata: JSON, for safetensors shuffles several notes
+PARTS = ("feature_model.", "prediction_head.")  # how its tensors' names begin
+MAX_HEADER = 100_000_000  # bytes of a safetensors header; the format allows no more
+ENCRYPTED = 1  # a zip member's flag
 
 
 def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu") -> SharpNetwork:
-    """A frozen network from Apple's .pt file, or from a safetensors file with the same names.
+    """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
 
-    The size, published or tiny, is told from the shapes. A file with a trained Gaussian decoder alone stands
-    for the checkpoint that it names, with that decoder in it.
-
-    Args:
-        path: the checkpoint, or the decoder.
-        dtype: of the heavy arithmetic, float32 or bfloat16.
-        device: where the network is to run.
+    The size, published or tiny, is told from the shapes. A file with a trained Gaussian decoder alone stands for the
+    checkpoint that it names, with that decoder in it. The heavy arithmetic is in `dtype`, float32 or bfloat16.
 
     Raises:
         InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
     tensors = read_checkpoint_tensors(path)
     if (owner := owner_of(path)) is not None:
-        tensors = with_owner(tensors, path, owner)
-    network = _empty_network(_config_of(tensors))
-    check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, _shapes_of(network), path)
+        tensors = _with_owner(tensors, path, owner)
+    token = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.cls_token")
+    width = token.shape[-1] if token is not None and token.ndim else None
+    config = next((config for config in CONFIGS.values() if config.embed == width), CONFIGS["full"])
+    network = _empty_network(config)
+    _check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, _shapes_of(network), path)
     advice = ["try --precision bf16"] if dtype == torch.float32 else []  # it takes half as much
     try:
         with enough_memory(*advice):
             _fill(network, tensors, dtype)
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read to its end: {reason_in_a_line(error)}") from error
-    broken = [name for name, tensor in network.state_dict().items() if not _is_finite(tensor)]
+    # A finite sum proves it at little cost; but a sum of finite numbers can overflow.
+    broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
     if broken:
         raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): download it again")
     with enough_memory(*advice):
@@ -75,12 +75,8 @@ def expected_shapes(config: SharpConfig) -> Shapes:
     return _shapes_of(_empty_network(config))
 
 
-def check_shapes(found: Shapes, expected: Shapes, path: str | os.PathLike[str]) -> None:
-    """Compare what a checkpoint holds with what it should.
-
-    Raises:
-        InputError: something differs; the message lists what.
-    """
+def _check_shapes(found: Shapes, expected: Shapes, path: str | os.PathLike[str]) -> None:
+    """InputError where a checkpoint holds something else than it should; the message lists what."""
     missing, unknown = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     reshaped = [
         f"{name} {list(found[name])} instead of {list(expected[name])}"
@@ -103,11 +99,6 @@ def _fill(network: SharpNetwork, tensors: Mapping[str, Tensor], dtype: torch.dty
             parameter.data = parameter.data.clone()
 
 
-def _is_finite(tensor: Tensor) -> bool:
-    """Whether all numbers are. A finite sum proves it at little cost; but a sum of finite numbers can overflow."""
-    return bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
-
-
 def _empty_network(config: SharpConfig) -> SharpNetwork:
     """Names and shapes without numbers."""
     with torch.device("meta"):
@@ -120,21 +111,9 @@ def _shapes_of(network: SharpNetwork) -> Shapes:
     return used | unused_shapes(network.config)
 
 
-def _config_of(tensors: Mapping[str, Tensor]) -> SharpConfig:
-    """The size whose positions a checkpoint has; the published one where none fits, for the message's sake."""
-    name = "monodepth_model.monodepth_predictor.encoder.patch_encoder.cls_token"
-    width = tensors[name].shape[-1] if name in tensors and tensors[name].ndim else None
-    return next((config for config in CONFIGS.values() if config.embed == width), CONFIGS["full"])
-
-
 def _some(names: list[str]) -> str:
     more = len(names) - NAMED
     return ", ".join(map(plain_text, names[:NAMED])) + (f", and {more} more" if more > 0 else "")
-
-
-NOTE = "spackle.gaussian_decoder"  # in the file's metadata: JSON, for safetensors shuffles several notes
-PARTS = ("feature_model.", "prediction_head.")  # how its tensors' names begin
-BLOCK = 1 << 20  # bytes of a file read at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,12 +130,7 @@ class Owner:
 
 
 def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
-    """A safetensors file in float32: weights that have not changed come back bit for bit.
-
-    Args:
-        decoder: a `GaussianDecoder`.
-        owner: its checkpoint.
-    """
+    """A safetensors file of a `GaussianDecoder` in float32: weights that have not changed come back bit for bit."""
     tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
     return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
 
@@ -172,15 +146,13 @@ def link_owner(owner: Owner, folder: Path) -> None:
 
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
-    """The checkpoint that a decoder's file names; None where a file holds something else.
-
-    Args:
-        path: a file that `read_checkpoint_tensors` has read.
-
-    Raises:
-        InputError: it says that it is a decoder, and not whose.
-    """
-    note = read_notes(path).get(NOTE)
+    """The checkpoint that a readable file with a decoder names; None for other files, InputError if it names none."""
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if not _is_safetensors(head):
+        return None
+    with safe_open(path, framework="pt") as opened:
+        note = (opened.metadata() or {}).get(NOTE)
     if note is None:
         return None
     try:
@@ -190,18 +162,10 @@ def owner_of(path: str | os.PathLike[str]) -> Owner | None:
         raise InputError(f"{path}: does not say which checkpoint it was trained on: train it again") from error
 
 
-def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
-    """A whole checkpoint: the owner's tensors, with the decoder's in place of those of the same names.
+def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
+    """The tensors of the checkpoint beside a decoder's file, with the decoder's in place of its own.
 
-    The owner is looked for beside the decoder.
-
-    Args:
-        decoder: the tensors of the decoder's file.
-        path: that file, for messages.
-        owner: what it names.
-
-    Raises:
-        InputError: the owner is not there, cannot be read or has changed, or the decoder is another network's.
+    InputError: it is not there, cannot be read or has changed, or the decoder is another network's.
     """
     beside = Path(path).absolute().parent
     home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
@@ -210,7 +174,12 @@ def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owne
         raise InputError(
             f"{path}: a decoder trained on {name}, which is not beside it: put that checkpoint, or a link to it, there"
         )
-    if _sha256(home) != owner.sha256:
+    try:
+        with open(home, "rb") as file:
+            found = digest(file).hexdigest()
+    except OSError as error:
+        raise InputError(f"{home}: cannot be read: {reason_in_a_line(error)}") from error
+    if found != owner.sha256:
         raise InputError(
             f"{path}: trained on a checkpoint with the SHA-256 {plain_text(owner.sha256)}, which {home} has not: "
             f"put that {name} beside it"
@@ -225,27 +194,8 @@ def with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owne
     return {**whole, **decoder}
 
 
-def _sha256(path: Path) -> str:
-    """Of a whole file; InputError where it cannot be read."""
-    found = hashlib.sha256()
-    try:
-        with open(path, "rb") as file:
-            while block := file.read(BLOCK):
-                found.update(block)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason_in_a_line(error)}") from error
-    return found.hexdigest()
-
-
-MAX_HEADER = 100_000_000  # bytes of a safetensors header; the format allows no more
-ENCRYPTED = 1  # a zip member's flag
-
-
 def read_checkpoint_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """The tensors of a checkpoint, their numbers read from the disk only when they are used.
-
-    Args:
-        path: what torch.save wrote, or a safetensors file, whatever its name.
+    """The tensors of what torch.save wrote or of a safetensors file; numbers are read from the disk when they are used.
 
     Raises:
         InputError: a missing or broken file, or one that holds anything but named tensors.
@@ -272,20 +222,6 @@ def read_checkpoint_tensors(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         if not _is_plain(value):
             raise InputError(f"{path}: {plain_text(name)} is no plain tensor of floats: give SHARP's weights alone")
     return dict(loaded)
-
-
-def read_notes(path: str | os.PathLike[str]) -> dict[str, str]:
-    """What a safetensors file says about itself; nothing where it says nothing, or is another kind of file.
-
-    Args:
-        path: a file that `read_checkpoint_tensors` has read.
-    """
-    with open(path, "rb") as file:
-        head = file.read(9)
-    if not _is_safetensors(head):
-        return {}
-    with safe_open(path, framework="pt") as opened:
-        return dict(opened.metadata() or {})
 
 
 def plain_text(text: str, longest: int = 120) -> str:
@@ -345,51 +281,36 @@ def _is_plain(value: object) -> bool:
     return dense and value.is_floating_point()
 
 
-Shapes = dict[str, tuple[int, ...]]
-
-_STEPS = 4  # halvings of the U-Net
-_WIDTH = 16  # its channels at full size
-
-
 def unused_shapes(config: SharpConfig) -> Shapes:
-    """Names and shapes of the transformers' classifiers and of the branch that aligns depth in training."""
+    """What a checkpoint holds and inference never reads: it is checked by name and shape, then dropped.
+
+    These are the transformers' classifiers, and the U-Net that maps two depths to a scale in training.
+    """
     shapes: Shapes = {}
     for encoder in ("patch_encoder", "image_encoder"):
         name = f"monodepth_model.monodepth_predictor.encoder.{encoder}.head"
         shapes |= {f"{name}.weight": (config.classes, config.embed), f"{name}.bias": (config.classes,)}
-    return shapes | {f"depth_alignment.scale_map_estimator.{name}": shape for name, shape in _unet().items()}
-
-
-def _unet() -> Shapes:
-    """A U-Net that maps two depths to a scale: a level is two residual blocks."""
-    widths = [_WIDTH << level for level in range(_STEPS + 1)]
-    shapes = _conv("encoder.conv_in.0", 2, _WIDTH, 3) | _norm("encoder.conv_in.1", _WIDTH)
-    for level in range(_STEPS):
-        shapes |= _level(f"encoder.convs_down.{level}", widths[level], widths[level + 1])
-    for level in range(_STEPS):
-        wide, narrow = widths[_STEPS - level], widths[_STEPS - level - 1]
-        shapes |= _level(f"decoder.convs_up.{level}", 2 * wide if level else wide, narrow)
-    shapes |= _norm("decoder.conv_out.0", 2 * _WIDTH) | _conv("decoder.conv_out.2", 2 * _WIDTH, _WIDTH, 1)
-    return shapes | _norm("decoder.conv_out.3", _WIDTH) | _conv("conv_out", _WIDTH, 1, 1)
+    steps, width = 4, 16  # halvings of the U-Net, and its channels at full size
+    widths = [width << level for level in range(steps + 1)]
+    unet = _conv("encoder.conv_in.0", 2, width, 3) | _norm("encoder.conv_in.1", width)
+    for level in range(steps):
+        unet |= _level(f"encoder.convs_down.{level}", widths[level], widths[level + 1])
+    for level in range(steps):
+        wide, narrow = widths[steps - level], widths[steps - level - 1]
+        unet |= _level(f"decoder.convs_up.{level}", 2 * wide if level else wide, narrow)
+    unet |= _norm("decoder.conv_out.0", 2 * width) | _conv("decoder.conv_out.2", 2 * width, width, 1)
+    unet |= _norm("decoder.conv_out.3", width) | _conv("conv_out", width, 1, 1)
+    return shapes | {f"depth_alignment.scale_map_estimator.{name}": shape for name, shape in unet.items()}
 
 
 def _level(name: str, dim_in: int, dim_out: int) -> Shapes:
     """Two residual blocks behind a change of size, which has no parameters."""
-    return (
-        _block(f"{name}.1", dim_in, dim_out)
-        | _conv(f"{name}.1.shortcut", dim_in, dim_out, 1)
-        | _block(f"{name}.2", dim_out, dim_out)
-    )
-
-
-def _block(name: str, dim_in: int, dim_out: int) -> Shapes:
+    shapes = _conv(f"{name}.1.shortcut", dim_in, dim_out, 1)
     hidden = dim_out // 2
-    return (
-        _norm(f"{name}.residual.0", dim_in)
-        | _conv(f"{name}.residual.2", dim_in, hidden, 3)
-        | _norm(f"{name}.residual.3", hidden)
-        | _conv(f"{name}.residual.5", hidden, dim_out, 3)
-    )
+    for block, dim in ((f"{name}.1.residual", dim_in), (f"{name}.2.residual", dim_out)):
+        shapes |= _norm(f"{block}.0", dim) | _conv(f"{block}.2", dim, hidden, 3)
+        shapes |= _norm(f"{block}.3", hidden) | _conv(f"{block}.5", hidden, dim_out, 3)
+    return shapes
 
 
 def _conv(name: str, dim_in: int, dim_out: int, size: int) -> Shapes:
@@ -401,10 +322,9 @@ def _norm(name: str, dim: int) -> Shapes:
 
 
 def deterministic_weights(shapes: Shapes) -> dict[str, Tensor]:
-    """A state dict [name → float32 tensor] that depends on names and shapes alone.
+    """A state dict [name → float32 tensor] that depends on names and shapes alone, and shows no scene.
 
-    The numbers are random, the scale of each kind is such that signals neither die nor explode, and
-    the Gaussians that come out fill the picture. They show no scene.
+    The scale of each kind is such that signals neither die nor explode, and the Gaussians fill the picture.
     """
     return {name: torch.from_numpy(_tensor(name, shape)) for name, shape in shapes.items()}
 

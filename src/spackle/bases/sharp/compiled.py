@@ -26,13 +26,9 @@ class Forward(Protocol):
 def compile_forward(network: SharpNetwork, backend: str = "inductor") -> Forward:
     """The forward of a network, sharing its weights, that `torch.compile` translates when it is first asked.
 
-    It takes a C++ compiler on a processor and Triton on a GPU; a machine that cannot do it says so by a RuntimeError at
-    the first call. All 48 blocks of the two transformers are one translation. Values differ from the network's by
-    rounding.
-
-    Args:
-        network: stays as it is, on its device.
-        backend: one of PyTorch's; "eager" translates nothing.
+    It takes a C++ compiler on a processor and Triton on a GPU; a RuntimeError at the first call says what is missing.
+    All 48 blocks of the two transformers are one translation; values differ from the network's by rounding. The
+    `backend` "eager" translates nothing.
     """
     twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
     depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
@@ -43,10 +39,7 @@ def compile_forward(network: SharpNetwork, backend: str = "inductor") -> Forward
 
 
 class GraphedForward:
-    """A network's forward, captured once and replayed as one CUDA graph: one launch for its thousands of kernels.
-
-    Not for several threads at once: in- and output lie where they lay when it was captured.
-    """
+    """A network's forward, captured once and replayed as one CUDA graph, by one thread at a time."""
 
     def __init__(self, network: SharpNetwork) -> None:
         self.network = network

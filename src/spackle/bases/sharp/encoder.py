@@ -1,7 +1,4 @@
-"""The vision transformer that SHARP runs over windows of the picture; parameters are named as in its checkpoint.
-
-The sliding pyramid: one vision transformer over windows of three sizes of the picture, merged into feature maps.
-"""
+"""SHARP's encoder: a vision transformer over windows of three sizes of the picture; named as in its checkpoint."""
 
 from __future__ import annotations
 
@@ -19,8 +16,7 @@ MLP_RATIO = 4
 class VisionTransformer(nn.Module):
     """ViT with a class token, learned positions and scaled residuals (DINOv2's), without its classifier.
 
-    The stream of tokens stays in float32 whatever the precision of the products: each block adds
-    little to much, which bfloat16 would round away.
+    The stream of tokens stays in float32: each block adds little to much, which bfloat16 would round away.
     """
 
     def __init__(self, config: SharpConfig) -> None:

@@ -1,9 +1,4 @@
-"""Sizes of the SHARP network: the published one, and a tiny one of the same classes.
-
-Which of SHARP's arithmetic runs in bfloat16.
-
-Convolutional decoders over the feature pyramid, after "Vision Transformers for Dense Prediction" (Ranftl 2021).
-"""
+"""SHARP's sizes, its precision, and the blocks that its decoders share (after Ranftl 2021, dense prediction)."""
 
 from __future__ import annotations
 
@@ -76,11 +71,7 @@ def lower(x: Tensor, module: nn.Linear | nn.Conv2d | nn.ConvTranspose2d) -> Tens
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
-    """Convert what costs time to `dtype`, in place; all else stays as it is.
-
-    Kernels go into the channels-last layout, in which the processor's convolutions are up to five
-    times as fast.
-    """
+    """Convert what costs time to `dtype`, in place, and kernels to channels-last, which is fast on a processor."""
     for module in network.modules():
         if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
             module.to(dtype)
@@ -103,10 +94,9 @@ class Residual(nn.Module):
 
 
 class GroupNorm(nn.GroupNorm):
-    """torch's, made exact where it is not.
+    """torch's, exact in float32 on a processor, where torch loses three digits over half a million pixels.
 
-    In float32 on a processor, torch adds up a channels-last map pixel by pixel; over half a million
-    pixels that loses three digits, which the Gaussians show. Sums of rows, then of those, lose none.
+    Sums of rows, then of those in float64, lose none.
     """
 
     def forward(self, x: Tensor) -> Tensor:

@@ -1,9 +1,4 @@
-"""SHARP (Apple, 2025): one picture to the deltas of two layers of Gaussians. Modules are named as in its checkpoint.
-
-SHARP's Gaussian decoder with its two heads: from what the encoder saw to deltas. Named as in the checkpoint.
-
-From SHARP's depth and deltas to Gaussians in its normalised space.
-"""
+"""SHARP (Apple, 2025): one picture to two layers of Gaussians. Modules are named as in its checkpoint."""
 
 from __future__ import annotations
 

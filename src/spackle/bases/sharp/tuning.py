@@ -26,12 +26,7 @@ class TunableSharp:
 
     @staticmethod
     def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
-        """Read a checkpoint; nothing asks for gradients yet.
-
-        Args:
-            path: as for `load_network`.
-            precision: float32 or bfloat16.
-            device: where it runs.
+        """Read a checkpoint (see `load_network`), with the heavy arithmetic in float32 or bfloat16; nothing learns yet.
 
         Raises:
             InputError: a missing, broken or foreign file, or too little memory: 2.8 GB while it is read.
@@ -42,24 +37,14 @@ class TunableSharp:
 
     @torch.no_grad()
     def see(self, rgb: Tensor, photo_camera: Camera) -> Seen:
-        """What the frozen part makes of a photo.
-
-        Args:
-            rgb: [H, W, 3] sRGB in 0..1.
-            photo_camera: its camera, of the same size.
-        """
+        """What the frozen part makes of a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
         device = next(self.network.parameters()).device
         image = to_square(rgb.to(device), self.network.config.side)
         with own_arithmetic(device):
             return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
     def gaussians(self, decoder: nn.Module, seen: Seen) -> Gaussians:
-        """Two layers of Gaussians in SHARP's normalised space, on the processor, with gradients to a decoder.
-
-        Args:
-            decoder: a `GaussianDecoder`, wrapped or not; the network's own or another one.
-            seen: the photo.
-        """
+        """Gaussians in SHARP's normalised space, on the processor, with gradients to a `GaussianDecoder`."""
         device = seen.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
@@ -69,16 +54,12 @@ class TunableSharp:
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera that sees Gaussians of the normalised space as `camera` sees the same ones in metres.
+    """A camera that sees Gaussians of the normalised space as `camera`, in metres, sees the same ones in metres.
 
-    The way to metres, D = diag(W / 2fx, H / 2fy, 1), is not a rotation. On Gaussians it takes an eigendecomposition
-    (`stretch_gaussians`), whose gradient is not defined for round ones, as all of SHARP's are at first. A renderer
-    only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P D draws the same
-    picture, and every gradient exists.
-
-    Args:
-        camera: any view, in metres.
-        photo_camera: of the photo that the Gaussians come from.
+    The way to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. On Gaussians it takes an
+    eigendecomposition (`stretch_gaussians`), whose gradient is not defined for round ones, as SHARP's are at first. A
+    renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P D draws the
+    same picture, and every gradient exists.
     """
     fx, fy = photo_camera.focal
     matrix = camera.world_to_camera.double()  # the product rounded to float32 would move what is seen

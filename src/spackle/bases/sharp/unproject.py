@@ -23,20 +23,15 @@ PAIRS = (0, 1), (0, 2), (1, 2)  # the columns that a sweep turns
 
 
 def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float]) -> Gaussians:
-    """Map Gaussians by diag(stretch), which turns and reshapes each one.
+    """Map N Gaussians by D = diag(stretch), which turns and reshapes each one.
 
-    With D = diag(stretch), a covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right
-    leave that as it is; once they have made M's columns orthogonal (one-sided Jacobi), the columns' lengths
-    are the new scales and their directions the new axes. The covariance itself is never formed: it would
-    square the ratio of the scales, and lose the small ones.
-
-    Args:
-        gaussians: N Gaussians; a zero quaternion counts as no rotation.
-        stretch: along x, y and z.
+    A covariance R S² Rᵀ becomes M Mᵀ with M = D R S. Rotations of M from the right leave that as it is; once they have
+    made M's columns orthogonal (one-sided Jacobi), the columns' lengths are the new scales and their directions the new
+    axes. The covariance itself is never formed: it would square the ratio of the scales, and lose the small ones.
 
     Returns:
-        N Gaussians. Scales descend; quats are unit ones with w ≥ 0; opacities and colors are the same
-        tensors; the rest is cut off from autograd.
+        N Gaussians with descending scales and unit quats with w ≥ 0 (a zero one counts as no rotation); opacities and
+        colors are the same tensors; the rest is cut off from autograd.
     """
     quats, scales = gaussians.quats.detach(), gaussians.scales.detach()
     plain = any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (quats, scales))
@@ -55,10 +50,7 @@ def _fast_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, fl
 
 
 def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """The same sweeps as batched operations, for any device and floating dtype; on a GPU nobody waits for them.
-
-    Takes and returns quats [N, 4] and scales [N, 3], as `stretch_gaussians` describes them.
-    """
+    """The same sweeps as batched operations over quats [N, 4] and scales [N, 3], for any device and floating dtype."""
     dtype = torch.promote_types(scales.dtype, torch.float32)
     # In units of each Gaussian's largest scale no square overflows, and none that matters underflows.
     unit = scales.abs().amax(1, keepdim=True).to(dtype).clamp(min=torch.finfo(dtype).tiny)
@@ -105,11 +97,7 @@ def _plain_frame(a: Tensor, b: Tensor) -> Tensor:
 def stretch_chunk(
     start: int, stop: int, quats: Any, scales: Any, stretch: Any, new_quats: Any, new_scales: Any
 ) -> None:
-    """Stretch Gaussians start..stop, a block at a time, as `stretch_gaussians` describes it.
-
-    Reads quats [N, 4] and scales [N, 3] float32 and three factors, and fills arrays like the first two. Computes in
-    float64, which no float32 overflows.
-    """
+    """Stretch Gaussians start..stop of quats [N, 4], scales [N, 3] in float64, block by block, into two like arrays."""
     columns = np.zeros((9, BLOCK))
     for first in range(start, stop, BLOCK):
         count = min(BLOCK, stop - first)
