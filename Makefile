@@ -39,8 +39,8 @@ types: $(VENV)/.installed
 check: lint types test
 
 bench: $(VENV)/.installed
-	$(BIN)/python benchmarks/render_cpu.py
-	$(BIN)/python benchmarks/ply.py
+	rm -rf bench-suite
+	$(BIN)/spackle bench --suite --only renderer,video -o bench-suite
 
 # The viewer's page: needs node, which nothing else does; what it builds is committed.
 viewer:

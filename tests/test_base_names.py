@@ -25,7 +25,6 @@ from spackle.errors import InputError
 from spackle.evaluation.setup import EvaluateOptions
 from spackle.image import Photo
 from spackle.jobs.bases import base_files, public_name, says_of
-from spackle.jobs.bench.options import BenchOptions
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import shared_digest
 from spackle.pseudo.manifest import load_manifest
@@ -290,6 +289,5 @@ def test_a_dataset_of_rgbd_takes_a_folder_of_depth(tmp_path: Path) -> None:
     refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, lite, hf:NAME_OR_FOLDER need none")
 
 
-def test_evaluations_and_benchmarks_start_from_the_papers_base() -> None:
+def test_evaluations_start_from_the_papers_base() -> None:
     assert EvaluateOptions("middlebury", Path("x")).base.base == "sharp"
-    assert BenchOptions("middlebury", Path("x")).base.base == "sharp"

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.camera_path import DepthRange, extremes
-from spackle.evaluation.suite.flops import counted
+from spackle.evaluation.timing import count_flops
 from spackle.render import CpuRenderer
 from spackle.residual import Cues, ResidualNet, make_seeds
 from spackle.residual import network as residual_network
@@ -97,9 +97,9 @@ def test_few_cells_cost_little_more_than_the_encoder(network: ResidualNet) -> No
     features, mask = torch.randn(1, IN_CHANNELS, 128, 128), torch.zeros(128, 128, dtype=torch.bool)
     mask[60:64, 60:80] = True
     with torch.no_grad():
-        costs = [counted(call) for call in (lambda: network.deltas_at(features, mask), lambda: network(features))]
+        costs = [count_flops(call) for call in (lambda: network.deltas_at(features, mask), lambda: network(features))]
         assert costs[0] < 0.55 * costs[1]
-        assert counted(lambda: network.deltas_at(features, torch.ones_like(mask))) == costs[1]
+        assert count_flops(lambda: network.deltas_at(features, torch.ones_like(mask))) == costs[1]
 
 
 def test_a_view_is_predicted_at_its_masked_cells_alone(network: ResidualNet, monkeypatch: pytest.MonkeyPatch) -> None:

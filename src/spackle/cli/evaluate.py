@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -135,11 +136,10 @@ def bench(
         str | None, typer.Option(metavar="A,B,…", help="Of the suite's sections: an unknown one lists all.")
     ] = None,
     compiled: Annotated[
-        bool, typer.Option("--compile", help="In the suite: time the networks through torch.compile, too.")
+        bool, typer.Option("--compile", help="In the suite: time SHARP through torch.compile.")
     ] = False,
     windows: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,…", help="In the suite: time SHARP with so many windows at once, too; 1 to 35."),
+        int | None, typer.Option(help="In the suite: so many of SHARP's windows at once, 1 to 35.")
     ] = None,
     side: Annotated[
         int | None, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
@@ -172,26 +172,34 @@ def bench(
 ) -> None:
     """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex.
 
-    With --suite: time every stage beside the least it could take, without a dataset: suite.json, suite.md, scaling.svg.
+    With --suite: time every stage on this machine, without a dataset: suite.json, suite.md.
     """
-    from spackle.evaluation.setup import parse_disparities
-    from spackle.jobs.bench.images import bench as run
-    from spackle.jobs.bench.options import BenchOptions
-    from spackle.jobs.bench.suite import bench_suite
-    from spackle.jobs.bench.suite_options import check_choice, suite_options
+    from spackle.evaluation.bench import bench as run
+    from spackle.evaluation.bench import check_choice
+    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
+    from spackle.evaluation.suite import SuiteOptions, run_suite
     from spackle.progress import Reporter
 
-    given = _given(context)
+    given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     check_choice(suite, given)
     disparities = parse_disparities(_with_words(context, disparity))
     bases = _base_options(base, checkpoint, precision, low_memory, residual, device)
     if dataset is None or root is None:
-        asked = suite_options(bases, given, only, runs, base_runs, compiled, windows, side)
-        end = bench_suite(asked, output or Path("bench-suite"), Reporter(verbose, as_json=as_json))
+        asked = SuiteOptions(
+            only=split_words(only or ""),
+            runs=runs,
+            base_runs=base_runs,
+            base=dataclasses.replace(bases.settings, windows=windows, compiled=compiled),
+            sharp=bool({"--base", "--checkpoint"} & given),
+            residual=bases.residual_file,
+            side=side,
+        )
+        end = run_suite(asked, output or Path("bench-suite"), reporter)
     else:
-        options = BenchOptions(dataset, root, disparities, bases, limit, runs, base_runs)
-        folder = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
-        end = run(options, folder, Reporter(verbose, as_json=as_json))
+        options = EvaluateOptions(
+            dataset, root, methods=("spackle",), disparities=disparities, metrics=(), base=bases, limit=limit
+        )
+        end = run(options, runs, base_runs, output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}"), reporter)
     if end == "stopped":
         raise typer.Exit(INTERRUPTED)
 

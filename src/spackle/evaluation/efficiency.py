@@ -4,34 +4,42 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
+import statistics
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import Base, BasePrediction
+from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.checkpoint import unused_shapes
 from spackle.bases.sharp.layers import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
 from spackle.device import Precision
-from spackle.evaluation.efficiency_results import ViewCost
+from spackle.evaluation.timing import MS, Lap, measure, timed
 from spackle.gaussians import Gaussians
-from spackle.image import Photo
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 
-T = TypeVar("T")
-
-COLD_S = 10.0  # a first prediction that takes longer is counted: what it warms up is little of that
+# Stages in the order of the work, as the tables call them.
+STAGES = {
+    "base": "photo to base Gaussians",
+    "view": "render of the view",
+    "photo": "render at the photo's camera",
+    "completion": "mask, seeds, network, placing",
+    "rerender": "re-render of touched tiles, after each pass",
+}
+BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
+EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
+COLD_S = 10.0  # a first prediction that takes longer counts: what it warms up is little of that
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """Of the two networks; not of what the options choose, but of SHARP at its published size and of the residual."""
+    """Of SHARP at its published size and of the residual, whatever the options choose."""
 
     base: int  # as its checkpoint has them
     base_used: int  # by inference, which needs neither the transformers' classifiers nor the alignment of depths
@@ -44,54 +52,100 @@ class Parameters:
 
 
 def count_parameters() -> Parameters:
-    """Count in the networks themselves, which takes no weights: SHARP 702.31 M, the residual 8.02 M."""
+    """Count in the networks themselves, without weights: SHARP 702.31 M, the residual 8.02 M."""
     with torch.device("meta"):
         used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
     return Parameters(used + sum(math.prod(shape) for shape in unused_shapes(FULL).values()), used, residual)
 
 
-@dataclasses.dataclass
-class Clock:
-    """Times calls; on a GPU until its work is done, and not until it has been handed over."""
+@dataclasses.dataclass(frozen=True)
+class ViewCost:
+    """What one view of one photo costs."""
 
-    device: torch.device  # of the base's network
+    setting: str  # the disparity, "0.3"
+    base_gaussians: int
+    added: int
+    seconds: Mapping[str, Sequence[float]]  # of `STAGES`: one for each run
 
-    def time(self, call: Callable[[], T]) -> tuple[T, float]:
-        """What a call gives, and its seconds."""
-        self._wait()
-        start = time.perf_counter()
-        result = call()
-        self._wait()
-        return result, time.perf_counter() - start
+    def figures(self) -> dict[str, float]:
+        """Every figure of the tables: counts, milliseconds (medians of runs), shares (not percent), views a second."""
+        stages = {name: MS * statistics.median(self.seconds[name]) for name in STAGES}
+        before, extra = (sum(stages[name] for name in names) for names in (BASE_PATH, EXTRA))
+        counts = {"added": self.added, "share": self.added / self.base_gaussians}
+        counts |= {"base_gaussians": self.base_gaussians, "merged": self.base_gaussians + self.added}
+        times = {"base_ms": before, "spackle_ms": before + extra, "extra_ms": extra}
+        ratios = {"overhead": extra / before, "overhead_of_view": extra / stages["view"]}
+        rates = {"base_fps": MS / before, "spackle_fps": MS / (before + extra)}
+        return {**counts, **times, **ratios, **rates, **{f"{name}_stage_ms": ms for name, ms in stages.items()}}
 
-    def _wait(self) -> None:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
+
+@dataclasses.dataclass(frozen=True)
+class ImageCost:
+    """One image: its views, or why there are none."""
+
+    name: str
+    facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # sizes, notes of the base, load of the machine
+    views: tuple[ViewCost, ...] = ()
+    problem: str | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """Ready for JSON, the figures beside the seconds they come from."""
+        views = [{**dataclasses.asdict(view), "figures": view.figures()} for view in self.views]
+        return {"name": self.name, "facts": dict(self.facts), "problem": self.problem, "views": views}
+
+    @staticmethod
+    def of(content: Mapping[str, Any]) -> ImageCost:
+        """The image that `plain` wrote; KeyError or TypeError for anything else."""
+        fields = [field.name for field in dataclasses.fields(ViewCost)]
+        views = tuple(ViewCost(**{name: view[name] for name in fields}) for view in content["views"])
+        if any(set(view.seconds) != set(STAGES) for view in views):
+            raise KeyError("stages")
+        return ImageCost(str(content["name"]), dict(content["facts"]), views, content["problem"])
 
 
-@dataclasses.dataclass
-class ClockedRenderer:
-    """A `Renderer` that adds up the seconds of its renders: those within a completion are told apart by it."""
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """Of a figure over images."""
 
-    renderer: Renderer
-    clock: Clock
-    seconds: float = 0.0
+    n: int
+    mean: float
+    q1: float
+    median: float
+    q3: float
 
-    def render(
-        self,
-        gaussians: Gaussians | Sequence[Gaussians],
-        camera: Camera,
-        *,
-        eps2d: float = 0.0,
-        tiles: Tensor | None = None,
-        onto: Rendering | None = None,
-    ) -> Rendering:
-        """See `Renderer.render`."""
-        drawn, seconds = self.clock.time(
-            lambda: self.renderer.render(gaussians, camera, eps2d=eps2d, tiles=tiles, onto=onto)
-        )
-        self.seconds += seconds
-        return drawn
+
+@dataclasses.dataclass(frozen=True)
+class Efficiency:
+    """The costs of a dataset's images."""
+
+    config: Mapping[str, Any]
+    images: tuple[ImageCost, ...]
+
+    @property
+    def measured(self) -> list[ImageCost]:
+        return [image for image in self.images if image.problem is None]
+
+    @property
+    def settings(self) -> list[str]:
+        return [f"{disparity:g}" for disparity in self.config["disparities"]]
+
+    def spread(self, setting: str, figure: str) -> Spread:
+        """Over the measured images, of which there is at least one; each counts once."""
+        found = [view.figures()[figure] for i in self.measured for view in i.views if view.setting == setting]
+        q1, median, q3 = (float(value) for value in np.quantile(found, [0.25, 0.5, 0.75]))
+        return Spread(len(found), float(np.mean(found)), q1, median, q3)
+
+    def plain(self) -> dict[str, Any]:
+        """Ready for JSON: everything, and the medians beside it."""
+        names = list(self.measured[0].views[0].figures())
+        spreads = [
+            {"setting": setting, "figure": name} | dataclasses.asdict(self.spread(setting, name))
+            for setting in self.settings
+            for name in names
+        ]
+        problems = {image.name: image.problem for image in self.images if image.problem is not None}
+        images = [image.plain() for image in self.images]
+        return {"config": dict(self.config), "problems": problems, "spreads": spreads, "images": images}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,48 +157,86 @@ class TimedBase:
     warm: bool  # no run was the first of its process
 
 
-def time_base(base: Base, photo: Photo, runs: int, clock: Clock, warm: bool) -> TimedBase:
+def time_base(predict: Callable[[], BasePrediction], runs: int, device: torch.device, warm: bool) -> TimedBase:
     """Predict a photo so many times.
 
-    Where nothing was predicted before (`warm` is false) the first one compiles kernels and fills caches, and is not
-    counted, but for one that takes more than `COLD_S`: SHARP on a processor.
+    The first prediction of a process (`warm` is false) compiles kernels and fills caches. It does not count, unless it
+    takes more than `COLD_S`, as SHARP's does on a processor.
     """
-    prediction, first = clock.time(lambda: base.predict(photo))
+    prediction, first = timed(predict, device)
     counts = warm or first > COLD_S
     seconds = [first] if counts else []
     while len(seconds) < runs:
-        seconds.append(clock.time(lambda: base.predict(photo))[1])
+        seconds.append(timed(predict, device)[1])
     return TimedBase(prediction, seconds, warm or not counts)
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewBench:
-    """A predicted photo, of which views are to be timed."""
+class _LappedRenderer:
+    """A `Renderer` whose renders are laps, told apart from the completion around them."""
 
-    base: TimedBase
     renderer: Renderer
-    network: ResidualNet | None
-    clock: Clock
-    precision: Precision = "auto"  # of the residual's network
+    lap: Lap
 
-    @torch.no_grad()
-    def time_view(self, setting: str, camera: Camera, runs: int) -> ViewCost:
-        """The cost of one view: `runs` times after one time that is not counted."""
-        laps = [self._lap(camera) for _ in range(runs + 1)][1:]
-        stages = {name: [seconds[name] for seconds, _ in laps] for name in laps[0][0]}
-        added = laps[-1][1]  # the same in all of them
-        count = len(self.base.prediction.gaussians)
-        return ViewCost(setting, count, added, {"base": list(self.base.seconds), **stages})
+    def render(
+        self,
+        gaussians: Gaussians | Sequence[Gaussians],
+        camera: Camera,
+        *,
+        eps2d: float = 0.0,
+        tiles: Tensor | None = None,
+        onto: Rendering | None = None,
+    ) -> Rendering:
+        """See `Renderer.render`."""
+        self.lap("completion")
+        drawn = self.renderer.render(gaussians, camera, eps2d=eps2d, tiles=tiles, onto=onto)
+        self.lap("rerender")
+        return drawn
 
-    def _lap(self, camera: Camera) -> tuple[Mapping[str, float], int]:
-        """Seconds of every stage behind the base, and how many aux Gaussians came of it."""
-        base, timed = self.base.prediction.gaussians, self.clock.time
-        inside = ClockedRenderer(self.renderer, self.clock)
-        photo_camera = self.base.prediction.camera
-        completer = Completer(base, photo_camera, inside, self.network, precision=self.precision)
-        before, view = timed(lambda: self.renderer.render(base, camera))
-        shield, photo = timed(completer.photo_guard)
-        inside.seconds = 0.0
-        (aux, _), whole = timed(lambda: completer.completed_view(camera, [shield], rendering=before))
-        seconds = {"view": view, "photo": photo, "completion": whole - inside.seconds, "rerender": inside.seconds}
-        return seconds, len(aux)
+
+@torch.no_grad()
+def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussians:
+    """A view's aux Gaussians; one lap for each of `STAGES` behind the base ("rerender": only where there are holes)."""
+    before = completer.renderer.render(completer.base, camera)
+    lap("view")
+    shield = completer.photo_guard()
+    lap("photo")
+    inside = dataclasses.replace(completer, renderer=_LappedRenderer(completer.renderer, lap))
+    aux = inside.complete_view(camera, [shield], rendering=before)
+    lap("completion")
+    return aux
+
+
+def time_view(
+    base: TimedBase,
+    setting: str,
+    camera: Camera,
+    renderer: Renderer,
+    network: ResidualNet | None,
+    runs: int,
+    *,
+    device: torch.device,
+    precision: Precision = "auto",
+) -> ViewCost:
+    """The cost of one view: `runs` times after one time that does not count.
+
+    Args:
+        base: of the photo.
+        setting: what the tables call the view.
+        camera: the view.
+        renderer: draws everything.
+        network: of the residual; None: the seeds alone fill the holes.
+        runs: that count.
+        device: of the base's network.
+        precision: of the residual's network.
+    """
+    prediction, added = base.prediction, 0
+    completer = Completer(prediction.gaussians, prediction.camera, renderer, network, precision=precision)
+
+    def view(lap: Lap) -> None:
+        nonlocal added
+        added = len(complete_in_laps(completer, camera, lap))
+
+    times = measure(runs, {"": view}, device)
+    stages = {name: [ms / MS for ms in times.get(("", name), [0.0] * runs)] for name in STAGES if name != "base"}
+    return ViewCost(setting, len(prediction.gaussians), added, {"base": list(base.seconds), **stages})

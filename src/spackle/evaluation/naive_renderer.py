@@ -1,4 +1,4 @@
-"""The renderer that one writes first, to hold ours against: tile by tile, Gaussian by Gaussian, pixel by pixel."""
+"""The naive renderer that ours is measured against: tile by tile, Gaussian by Gaussian, pixel by pixel."""
 
 from __future__ import annotations
 
@@ -13,26 +13,22 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.evaluation.suite.clock import Lap
+from spackle.evaluation.timing import Lap
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
 
 Array = npt.NDArray[Any]
+Arrays = tuple[Array, ...]  # a scene's five tensors
 
 
 def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None) -> Tensor:
     """RGB [H, W, 3] sRGB of Gaussians, with `eps2d` 0; depth and alpha are drawn, too, as ours are."""
-    means, quats, scales, opacities, colors = (t.numpy() for t in scene.tensors)
-    view = KernelCamera.of(camera, 0.0)
+    tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
-    lens, size = (view.lens, view.pose), (view.width, view.height)
-    run_chunks(
-        lambda a, b: naive_project(a, b, means, quats, scales, opacities, *lens, *size, splats, boxes),
-        len(scene),
-        PROJECT_GRAIN,
-    )
+    lens = (view.lens, view.pose, (view.width, view.height))
+    run_chunks(lambda a, b: naive_project(a, b, tensors, lens, splats, boxes), len(scene), PROJECT_GRAIN)
     lap("project")
     order = np.argsort(splats[:, 2], kind="stable")
     lap("sort")
@@ -40,30 +36,17 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
     lap("bin")
     images = np.zeros((view.height, view.width, 5), np.float32)
     run_chunks(
-        lambda a, b: naive_blend(a, b, splats, boxes, opacities, colors, starts, ids, images),
-        len(starts) - 1,
-        BLEND_GRAIN,
+        lambda a, b: naive_blend(a, b, tensors, splats, boxes, starts, ids, images), len(starts) - 1, BLEND_GRAIN
     )
     lap("blend")
     return torch.from_numpy(images[..., :3])
 
 
 @numba.njit(nogil=True, cache=True)
-def naive_project(
-    first: int,
-    last: int,
-    means: Array,
-    quats: Array,
-    scales: Array,
-    opacities: Array,
-    lens: Array,
-    pose: Array,
-    width: int,
-    height: int,
-    splats: Array,
-    boxes: Array,
-) -> None:
+def naive_project(first: int, last: int, scene: Arrays, view: Any, splats: Array, boxes: Array) -> None:
     """Centre, depth and inverse covariance [N, 6], and boxes of pixels [N, 4], of Gaussians first..last."""
+    means, quats, scales, opacities, _ = scene
+    lens, pose, (width, height) = view
     for i in range(first, last):
         x, y, z = pose[:, 0] * means[i, 0] + pose[:, 1] * means[i, 1] + pose[:, 2] * means[i, 2] + pose[:, 3]
         splats[i, 2] = z
@@ -101,17 +84,10 @@ def naive_bin(order: Array, boxes: Array, rows: int, columns: int) -> tuple[Arra
 
 @numba.njit(nogil=True, fastmath=True, cache=True)
 def naive_blend(
-    first: int,
-    last: int,
-    splats: Array,
-    boxes: Array,
-    opacities: Array,
-    colors: Array,
-    starts: Array,
-    ids: Array,
-    images: Array,
+    first: int, last: int, scene: Arrays, splats: Array, boxes: Array, starts: Array, ids: Array, images: Array
 ) -> None:
     """Blend tiles first..last into [H, W, 5], black before: sRGB, depth and alpha."""
+    opacities, colors = scene[3], scene[4]
     height, width, _ = images.shape
     columns = (width + TILE - 1) // TILE
     for tile in range(first, last):
@@ -136,9 +112,8 @@ def naive_blend(
                         full[py - top, px - left] = True
                         continue
                     weight = alpha * light
-                    pixel[0] += weight * colors[i, 0]
-                    pixel[1] += weight * colors[i, 1]
-                    pixel[2] += weight * colors[i, 2]
+                    for channel in range(3):
+                        pixel[channel] += weight * colors[i, channel]
                     pixel[3] += weight * splats[i, 2]
                     pixel[4] += weight
         for py in range(top, bottom):

@@ -15,21 +15,38 @@ from evaluation_data import write_boxes
 from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
 
-from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import BaseError
+from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.layers import TINY
+from spackle.device import MemoryShort
+from spackle.errors import InputError
 from spackle.evaluation import efficiency, paper
 from spackle.evaluation import paper_efficiency as published
-from spackle.evaluation.efficiency import Clock, TimedBase, ViewBench, count_parameters, time_base
-from spackle.evaluation.efficiency_cells import SIDE
-from spackle.evaluation.efficiency_results import BASE_PATH, EXTRA, STAGES, Bill, ImageCost, ViewCost
-from spackle.evaluation.efficiency_tables import efficiency_tables
+from spackle.evaluation.bench import time_image
+from spackle.evaluation.case import Case, Points
+from spackle.evaluation.datasets import get_dataset
+from spackle.evaluation.efficiency import (
+    BASE_PATH,
+    EXTRA,
+    STAGES,
+    Efficiency,
+    ImageCost,
+    TimedBase,
+    ViewCost,
+    count_parameters,
+    time_base,
+    time_view,
+)
+from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
 from spackle.evaluation.protocols import large_views
+from spackle.evaluation.setup import Bench, EvaluateOptions, open_evaluation
 from spackle.evaluation.table import EMPTY
-from spackle.image import Photo
+from spackle.jobs.options import PredictOptions
 from spackle.render import get_renderer
 from spackle.residual import Completer
 
-CPU = Clock(torch.device("cpu"))
+CPU = torch.device("cpu")
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rerender": 9.0}
 
 
@@ -39,7 +56,7 @@ def cost(setting: str = "0.3", added: int = 20, factor: float = 1.0) -> ViewCost
     return ViewCost(setting, 1000, added, runs)
 
 
-def bill(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> Bill:
+def results(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> Efficiency:
     """Three images of Middlebury, the second twice as slow and the third four times, and one that failed."""
     facts = {"load": 1.5, "warm": True, "notes": {"precision": "bf16"}, **facts}
     images = [
@@ -55,7 +72,7 @@ def bill(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> Bill
         "hardware": {"cpu": "A Processor", "cores": 2, "threads": 2},
         "versions": {"spackle": "0", "torch": "2"},
     }
-    return Bill(config, (*images, ImageCost("broken", problem="no such file")))
+    return Efficiency(config, (*images, ImageCost("broken", problem="no such file")))
 
 
 # --- parameters and the paper's numbers
@@ -105,14 +122,14 @@ def test_times_are_medians_of_runs_and_add_up() -> None:
 
 
 def test_medians_and_quartiles_run_over_the_images_that_were_measured() -> None:
-    found = bill().spread("0.4", "base_ms")
+    found = results().spread("0.4", "base_ms")
     assert (found.n, found.median) == (3, pytest.approx(2800))
     assert (found.q1, found.q3, found.mean) == tuple(pytest.approx(ms) for ms in (2100, 4200, 9800 / 3))
-    assert bill().spread("0.4", "added").mean == 10
+    assert results().spread("0.4", "added").mean == 10
 
 
 def test_an_image_survives_json() -> None:
-    image = bill().images[1]
+    image = results().images[1]
     assert ImageCost.of(json.loads(json.dumps(image.plain()))) == image
     with pytest.raises(KeyError):
         ImageCost.of({**image.plain(), "views": [{**dataclasses.asdict(cost()), "seconds": {"base": [1.0]}}]})
@@ -122,7 +139,7 @@ def test_an_image_survives_json() -> None:
 
 
 def test_the_layouts_are_the_papers() -> None:
-    overhead, expanded, stages, parameters = efficiency_tables(bill(), count_parameters())
+    overhead, expanded, stages, parameters = efficiency_tables(results(), count_parameters())
     assert overhead.label == "tab:efficiency_gaussian_overhead"
     assert [name for name, _ in overhead.groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
     rows = {line.cells[:2]: line.cells[2:] for line in overhead.lines}
@@ -154,7 +171,7 @@ def test_the_layouts_are_the_papers() -> None:
 
 
 def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
-    overhead, expanded, *_ = efficiency_tables(bill((0.6,), warm=False, load=None), count_parameters())
+    overhead, expanded, *_ = efficiency_tables(results((0.6,), warm=False, load=None), count_parameters())
     assert overhead.groups[1] == ("disparity 0.6", 2)
     assert {line.cells[2:] for line in overhead.lines if "paper" in line.cells[1]} == {(EMPTY, EMPTY)}
     assert [line.cells[1] for line in expanded.lines] == ["disparity 0.6"]
@@ -165,37 +182,28 @@ def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
 # --- timing
 
 
-@dataclasses.dataclass
-class CountedBase:
-    """Says how often it was asked."""
-
-    prediction: BasePrediction
-    count: int = 0
-    name = "counted"
-
-    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        self.count += 1
-        return self.prediction
-
-
 def test_a_first_prediction_counts_only_where_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = CountedBase(box_before_wall().lift())
-    photo = Photo(torch.zeros(4, 4, 3), 4.0, "", Path("photo.png"))
-    cold = time_base(base, photo, 3, CPU, warm=False)
-    assert (base.count, len(cold.seconds), cold.warm) == (4, 3, True)
-    assert len(time_base(base, photo, 3, CPU, warm=True).seconds) == 3
-    assert base.count == 7
+    count = 0
+
+    def predict() -> BasePrediction:
+        nonlocal count
+        count += 1
+        return box_before_wall().lift()
+
+    cold = time_base(predict, 3, CPU, warm=False)
+    assert (count, len(cold.seconds), cold.warm) == (4, 3, True)
+    assert len(time_base(predict, 3, CPU, warm=True).seconds) == 3
+    assert count == 7
     monkeypatch.setattr(efficiency, "COLD_S", 0.0)
-    long = time_base(base, photo, 1, CPU, warm=False)
-    assert (base.count, len(long.seconds), long.warm) == (8, 1, False)
+    long = time_base(predict, 1, CPU, warm=False)
+    assert (count, len(long.seconds), long.warm) == (8, 1, False)
 
 
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
-    views = [view for view in large_views(prediction, (0.3, 0.5)) if view.name == SIDE]
-    bench = ViewBench(TimedBase(prediction, [0.25, 0.5, 4.0], True), renderer, None, CPU)
-    for view in views:
-        found = bench.time_view(view.setting, view.camera, 3)
+    base = TimedBase(prediction, [0.25, 0.5, 4.0], True)
+    for view in large_views(prediction, (0.3, 0.5)):
+        found = time_view(base, view.setting, view.camera, renderer, None, 3, device=CPU)
         aux = Completer(prediction.gaussians, prediction.camera, renderer).complete_view(view.camera)
         assert found.added == len(aux) > 0
         assert found.base_gaussians == len(prediction.gaussians)
@@ -210,12 +218,62 @@ def test_a_view_costs_what_a_completion_adds() -> None:
 def test_a_view_without_holes_needs_no_second_render() -> None:
     prediction = box_before_wall().lift()
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
-    whole = dataclasses.replace(prediction, gaussians=opaque)
-    bench = ViewBench(TimedBase(whole, [1.0], True), get_renderer(), None, CPU)
-    found = bench.time_view("0", whole.camera, 1)
+    base = TimedBase(dataclasses.replace(prediction, gaussians=opaque), [1.0], True)
+    found = time_view(base, "0", prediction.camera, get_renderer(), None, 1, device=CPU)
     assert found.added == 0
     assert found.seconds["rerender"] == [0.0]
     assert found.figures()["merged"] == len(opaque)
+
+
+# --- one image
+
+
+@pytest.fixture(scope="module")
+def tools(scenes: Path) -> Bench:
+    base = PredictOptions(base="rgbd", residual="seeds")
+    options = EvaluateOptions("middlebury", scenes, methods=("spackle",), disparities=(0.3,), metrics=(), base=base)
+    return open_evaluation(options)[1]
+
+
+@pytest.fixture(scope="module")
+def case(scenes: Path) -> Case:
+    return get_dataset("middlebury").cases(scenes)[0]
+
+
+def test_points_stand_in_for_a_depth_map(tools: Bench, case: Case) -> None:
+    assert case.depth is not None
+    known = case.depth()
+    rows, columns = torch.nonzero(known.valid, as_tuple=True)
+    points = Points(torch.stack([columns, rows], dim=-1) + 0.5, known.depth[rows, columns])
+    found = time_image(
+        dataclasses.replace(case, depth=None, points=lambda: points), tools, {"base_runs": 1, "runs": 1}, CPU, True
+    )
+    assert found.views[0].base_gaussians > 0
+    with pytest.raises(InputError, match="no depth map and no points"):
+        time_image(dataclasses.replace(case, depth=None), tools, {"base_runs": 1, "runs": 1}, CPU, True)
+
+
+def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
+    tools: Bench, case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict = RgbdBase.predict
+
+    def too_large(*arguments: Any) -> BasePrediction:
+        found = predict(*arguments)
+        return dataclasses.replace(
+            found, gaussians=dataclasses.replace(found.gaussians, means=found.gaussians.means / 0)
+        )
+
+    def too_little(*arguments: Any) -> BasePrediction:
+        raise MemoryShort("not enough memory for the network")
+
+    monkeypatch.setattr(RgbdBase, "predict", too_large)
+    with pytest.raises(InputError, match="float32") as failed:
+        time_image(case, tools, {"base_runs": 1, "runs": 1}, CPU, True)
+    assert not isinstance(failed.value, BaseError)
+    monkeypatch.setattr(RgbdBase, "predict", too_little)
+    with pytest.raises(BaseError, match="not enough memory"):
+        time_image(case, tools, {"base_runs": 1, "runs": 1}, CPU, True)
 
 
 # --- the command

@@ -1,0 +1,196 @@
+"""`spackle bench`: what Spackle costs in Gaussians and in time on a dataset, in the paper's tables of efficiency."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import BaseError, OpenedBase, kind_of, open_loaded
+from spackle.errors import InputError
+from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
+from spackle.evaluation.efficiency import Efficiency, ImageCost, count_parameters, time_base, time_view
+from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
+from spackle.evaluation.protocols import large_views
+from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write_text
+from spackle.evaluation.run import inputs_digest, problem_of
+from spackle.evaluation.setup import Bench, EvaluateOptions, check_evaluate_options, metrics_device, open_evaluation
+from spackle.evaluation.table import to_latex, to_markdown
+from spackle.machine import hardware, versions
+from spackle.output_folder import alone_in, results_folder
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
+
+T = TypeVar("T")
+
+RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
+SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
+MAX_RUNS = 1000
+
+
+def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
+    """Time a dataset, or go on with that.
+
+    Args:
+        options: which images and views, which base; the views are those of an evaluation without metrics.
+        runs: how often everything behind the base is timed.
+        base_runs: how often the base is timed; None: once for SHARP, which takes long, else `runs` times.
+        output: a folder; bench.json, bench.md, bench.tex and images/ go there. It belongs to one machine: times of
+            two do not go together.
+        reporter: tells which images fail, and with -v each image's figures.
+
+    Returns:
+        "complete", or "stopped" where Ctrl-C came.
+
+    Raises:
+        InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
+            memory for the base.
+    """
+    check_evaluate_options(options)
+    check_runs(runs, base_runs)
+    cases, tools, whole = open_evaluation(options)
+    kind = kind_of(options.base.base)
+    device = torch.device(metrics_device(options) if kind.network else "cpu")
+    config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
+    config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if kind.slow else runs)}
+    config["base"] |= {"device": device.type}
+    config |= {"hardware": hardware(device), "versions": versions()}
+    images: list[ImageCost] = []
+    warm = False  # whether this process has predicted something
+    with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output, "benchmark"):
+        begin(output, config)
+        with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
+            for index, case in enumerate(cases):
+                if stop():
+                    reporter.say("stopped; the same command goes on from here")
+                    return "stopped"
+                path = output / IMAGES / f"{stem_of(index, case.name)}.json"
+                inputs = inputs_digest(case)
+                image = load_part(path, inputs, ImageCost.of)
+                if image is None:
+                    image = _measure(case, tools, config, device, warm, reporter)
+                    if image.problem is None:
+                        warm = True
+                        write_part(path, inputs, image.plain())
+                images.append(image)
+                step(index + 1, len(cases))
+        _finish(Efficiency(config, tuple(images)), options, output, reporter)
+    return "complete"
+
+
+def _measure(
+    case: Case, tools: Bench, config: Mapping[str, Any], device: torch.device, warm: bool, reporter: Reporter
+) -> ImageCost:
+    """One image; a problem of its own is its record, which the next run tries again."""
+    try:
+        image = time_image(case, tools, config, device, warm)
+    except BaseError:  # no other image would fare better; too little memory is one, too
+        raise
+    except InputError as error:
+        problem = problem_of(case, error, tools.options.root)
+        reporter.say(f"passed over: {problem}")
+        return ImageCost(case.name, problem=problem)
+    for view in image.views:
+        found = view.figures()
+        times = f"{found['base_ms']:,.0f} ms, with Spackle {found['spackle_ms']:,.0f}"
+        reporter.detail(f"  {case.name}, {view.setting}: {times}, {view.added:,} Gaussians added")
+    return image
+
+
+def time_image(case: Case, tools: Bench, config: Mapping[str, Any], device: torch.device, warm: bool) -> ImageCost:
+    """All settings of an image.
+
+    Args:
+        case: the image.
+        tools: what all images share.
+        config: how often what is timed.
+        device: of the base's network.
+        warm: something was predicted before in this process.
+
+    Raises:
+        InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
+        BaseError: no image can be worked on.
+    """
+    load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+    loaded = load_case(dataclasses.replace(case, seconds=()))
+    opened = _open(loaded, tools)
+    base = time_base(lambda: opened.predict(loaded.full)[0], config["base_runs"], device, warm)
+    try:
+        views = large_views(base.prediction, tools.options.disparities)
+    except ValueError as error:
+        raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
+    more: dict[str, Any] = {"device": device, "precision": tools.options.base.precision}
+    costs = [
+        time_view(base, view.setting, view.camera, tools.renderer, tools.network, config["runs"], **more)
+        for view in views
+        if view.name == SIDE
+    ]
+    size = {"width": loaded.photo.width, "height": loaded.photo.height}
+    facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}
+    return ImageCost(case.name, facts, tuple(costs))
+
+
+def _open(loaded: LoadedCase, tools: Bench) -> OpenedBase:
+    """The network, or the case's own depth or points."""
+    return open_loaded(RgbdBase(known_depth(loaded.case)) if tools.base is None else tools.base())
+
+
+def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter: Reporter) -> None:
+    """Write everything that is made of all images; bench.json comes last and vouches for the rest."""
+    total, measured, parameters = len(found.images), len(found.measured), count_parameters()
+    if not measured:
+        raise InputError(f"{options.root}: none of {total} images gave figures (the lines above say why)")
+    tables = efficiency_tables(found, parameters)
+    write_text(to_markdown(tables), output / MARKDOWN)
+    write_text(to_latex(tables), output / LATEX)
+    counted = {**dataclasses.asdict(parameters), "share": parameters.share}
+    write_json({"parameters": counted, **found.plain()}, output / RESULTS)
+    overheads = ", ".join(f"{s}: {100 * found.spread(s, 'overhead').median:.2f} %" for s in found.settings)
+    reporter.say(f"{found.config['title']}: {measured} of {total} images, overhead {overheads} -> {output}")
+    reporter.result({"folder": output, "images": total, "measured": measured})
+
+
+def load_part(path: Path, inputs: object, decode: Callable[[Any], T]) -> T | None:
+    """What an earlier run measured; None where it is not there, or of other inputs."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return decode(content["found"]) if content["inputs"] == inputs else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def write_part(path: Path, inputs: object, found: Mapping[str, Any]) -> None:
+    """Write what `load_part` reads."""
+    write_json({"inputs": inputs, "found": found}, path)
+
+
+def check_runs(runs: int, base_runs: int | None) -> None:
+    """InputError for counts that cannot be."""
+    for name, value in (("--runs", runs), ("--base-runs", base_runs)):
+        if value is not None and not 1 <= value <= MAX_RUNS:
+            raise InputError(f"{name} must be between 1 and {MAX_RUNS}, got {value}")
+
+
+def check_choice(suite: bool, given: Collection[str]) -> None:
+    """InputError where neither a dataset nor the suite was asked for, or options of both.
+
+    Args:
+        suite: whether --suite was given.
+        given: the options that were given, by their long names.
+    """
+    of_dataset = ("--dataset", "--root", "--limit", "--disparity")
+    of_suite = ("--only", "--compile", "--windows", "--side")
+    if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):
+        raise InputError(f"{' and '.join(missing)} missing: give --dataset NAME --root DIR, or --suite")
+    for name in of_dataset if suite else of_suite:
+        if name in given:
+            raise InputError(f"{name} is {'not for --suite' if suite else 'for --suite alone'}: leave one of them out")
+    for name in ("--windows", "--compile"):
+        if name in given and not {"--base", "--checkpoint"} & set(given):
+            raise InputError(f"{name} is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")

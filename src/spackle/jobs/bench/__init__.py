@@ -1,1 +1,0 @@
-"""`spackle bench`: what Spackle costs, in Gaussians and in time, on a dataset's images or stage by stage."""
