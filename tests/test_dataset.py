@@ -347,7 +347,7 @@ def test_another_configuration_is_refused_and_the_difference_shown(place: Path, 
 
 
 def test_a_folder_in_which_a_build_is_at_work_is_refused(place: Path, tmp_path: Path) -> None:
-    from spackle.downloads.fetch import hold
+    from spackle.downloads import hold
 
     (tmp_path / "out").mkdir()
     with hold(tmp_path / "out" / ".lock"):

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from spackle.downloads.fetch import hold
+from spackle.downloads import hold
 from spackle.errors import InputError
 from spackle.formats import check_writable
 

@@ -31,8 +31,7 @@ from rich.console import Console
 from sites import Site, serve
 
 from spackle import cli
-from spackle.downloads import transfer
-from spackle.downloads.fetch import WEIGHTS, Record, check_recorded, download, installed, weights_folder
+from spackle.downloads import WEIGHTS, Record, check_recorded, download, installed, transfer, weights_folder
 from spackle.errors import InputError
 from spackle.jobs.weights import get_weights
 from spackle.progress import Reporter
@@ -245,7 +244,7 @@ def test_ctrl_c_keeps_what_has_come(site: Site, target: Path) -> None:
 def test_a_killed_download_leaves_no_file_and_the_next_one_finishes(site: Site, target: Path) -> None:
     site.hang_after = BREAK
     part = target.with_name("weights.pt.part")
-    code = f"from spackle.downloads.fetch import download; download({site.url!r}, {str(target)!r})"
+    code = f"from spackle.downloads import download; download({site.url!r}, {str(target)!r})"
     with subprocess.Popen([sys.executable, "-c", code]) as process:
         try:
             deadline = time.monotonic() + 60

@@ -21,7 +21,7 @@ from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
 
-from spackle.downloads.fetch import hold
+from spackle.downloads import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet, load_residual

@@ -21,7 +21,7 @@ from PIL import Image
 from recipe import LiteRecipe
 from train import main
 from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
-from weights import EVEN, balanced, save_networks
+from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite.network import LiteNet, load_networks
 from spackle.training.recipe import load_recipe_as
@@ -115,7 +115,7 @@ def test_the_encoders_first_stages_stay_and_the_others_learn_at_a_rate_of_their_
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
     torch.manual_seed(0)
-    before, after = LiteNet().state_dict(), state(whole[0]).network
+    before, after = start_decoder(LiteNet()).state_dict(), state(whole[0]).network
     frozen = ("encoder.stem.", "encoder.stages.0.", "encoder.stages.1.")
     learned = {name for name, tensor in after.items() if not torch.equal(tensor, before[name])}
     assert not {name for name in learned if name.startswith(frozen)}
@@ -141,7 +141,7 @@ def test_a_run_starts_from_weights_of_another(place: Path, whole: tuple[Path, Ru
 
 def test_weights_of_even_size_are_the_same_function() -> None:
     torch.manual_seed(0)
-    network, rgb = LiteNet(), torch.rand(1, 3, 64, 96)
+    network, rgb = start_decoder(LiteNet()), torch.rand(1, 3, 64, 96)
     with torch.no_grad():
         for name, weight in network.named_parameters():
             if name.endswith(("refine.weight", "bias")) and not name.startswith("encoder."):

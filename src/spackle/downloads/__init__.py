@@ -1,25 +1,203 @@
-"""Files that others publish: fetched once, whole or not at all, and recorded."""
+"""Big files that others publish: fetched once, continued after a break, whole or not there, and recorded."""
 
-from spackle.downloads.fetch import (
-    WEIGHTS,
-    KnownWeights,
-    Record,
-    check_recorded,
-    download,
-    installed,
-    known_weights,
-    read_record,
-    weights_folder,
-)
+from __future__ import annotations
 
-__all__ = [
-    "WEIGHTS",
-    "KnownWeights",
-    "Record",
-    "check_recorded",
-    "download",
-    "installed",
-    "known_weights",
-    "read_record",
-    "weights_folder",
-]
+import contextlib
+import dataclasses
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from spackle.downloads.transfer import Progress, check_url, digest, read_json, receive, version_file, write_json
+from spackle.errors import InputError
+
+AGAIN = "run `spackle weights get` again"
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What was downloaded; lies beside the file as NAME.json.
+
+    The digest is that of the first download: it shows damage and later change, not a download that was bad at once.
+    """
+
+    url: str
+    size: int  # bytes
+    sha256: str  # 64 hexadecimal digits
+
+
+def weights_folder() -> Path:
+    """Where downloaded weights lie: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
+
+    InputError where none is set, and there is no home.
+    """
+    try:
+        if chosen := os.environ.get("SPACKLE_WEIGHTS"):
+            return Path(chosen).expanduser()
+        cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        return (cache if cache.is_absolute() else Path.home() / ".cache") / "spackle" / "weights"
+    except RuntimeError as error:
+        raise InputError("no home folder for downloaded weights: name a folder in SPACKLE_WEIGHTS") from error
+
+
+def download(url: str, path: str | os.PathLike[str], progress: Progress | None = None) -> Record:
+    """Fetch `url` (http or https, without a password) to `path` in a folder that exists, and write its record.
+
+    A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
+    Ctrl-C the next call asks for the rest only, unless the remote file has changed or the server cannot do that.
+    `progress` gets the bytes done, those of earlier calls among them, and their number.
+
+    Raises:
+        InputError: the file cannot be had or not be written, or another process is at it.
+    """
+    check_url(url)
+    target = _real(path)
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise InputError(f"{path}: cannot write: this is not a plain file; give another name")
+    part = _beside(target, ".part")
+    try:
+        with hold(_beside(target, ".lock")):
+            record = Record(url, *receive(url, part, progress or (lambda done, total: None)))
+            # The record first: a kill in between leaves a file that its record refuses, not one without.
+            write_json(dataclasses.asdict(record), _beside(target, ".json"))
+            os.replace(part, target)
+            version_file(part).unlink()
+            return record
+    except BlockingIOError as error:
+        raise InputError(f"{path}: another process is downloading this file: wait until it is done") from error
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{path}: cannot write: {reason}: make room or choose another folder") from error
+
+
+def read_record(path: str | os.PathLike[str]) -> Record | None:
+    """The record beside a file; None where none lies there, InputError for one that makes no sense."""
+    place = _beside(_real(path), ".json")
+    try:
+        fields = read_json(place)
+        if fields is None or "sha256" not in fields:  # somebody's notes on a file of their own
+            return None
+        return Record(str(fields["url"]), int(fields["size"]), str(fields["sha256"]))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:  # the last: a size of 1e400
+        raise InputError(f"{place}: this record of a download cannot be read: delete it and {AGAIN}") from error
+
+
+def check_recorded(path: str | os.PathLike[str]) -> Record | None:
+    """Hold a file against its record: size first, then every byte. None where it has none.
+
+    InputError where they differ, or one of them cannot be read.
+    """
+    record = read_record(path)
+    if record is None:
+        return None
+    try:
+        size = os.path.getsize(path)
+        if size != record.size:
+            raise InputError(f"{path}: {size:,} bytes, but {record.size:,} were downloaded: delete it and {AGAIN}")
+        with open(path, "rb") as file:
+            found = digest(file).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if found != record.sha256:
+        raise InputError(f"{path}: its SHA-256 is not that of what was downloaded: delete it and {AGAIN}")
+    return record
+
+
+def _real(path: str | os.PathLike[str]) -> Path:
+    """The file itself, links followed: beside it lie its record and its part."""
+    try:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError) as error:  # a zero byte in the name
+        raise InputError(f"{str(path)!r}: not the name of a file: {error}") from error
+
+
+def _beside(file: Path, suffix: str) -> Path:
+    return file.with_name(file.name + suffix)
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownWeights:
+    """One published file."""
+
+    name: str
+    url: str
+    file: str  # its name in the folder of weights
+    licence: str  # in a few words
+    notice: tuple[str, ...]  # lines that a person sees before the download
+
+
+WEIGHTS = {
+    known.name: known
+    for known in (
+        KnownWeights(
+            name="sharp",
+            url="https://ml-site.cdn-apple.com/models/sharp/sharp_2572gikvuh.pt",
+            file="sharp_2572gikvuh.pt",
+            licence="Apple, research only",
+            notice=(
+                "SHARP's weights are Apple's, under the Apple Machine Learning Research Model licence:",
+                "for non-commercial scientific research only. Spackle's own licence does not cover them.",
+                "Read its terms: https://github.com/apple/ml-sharp/blob/main/LICENSE_MODEL",
+            ),
+        ),
+    )
+}
+
+
+def known_weights(name: str) -> KnownWeights:
+    """The entry of that name; InputError where there is none."""
+    if name not in WEIGHTS:
+        raise InputError(f"{name}: no weights of that name are known: choose from {', '.join(WEIGHTS)}")
+    return WEIGHTS[name]
+
+
+def installed(name: str) -> Path | None:
+    """The file of known weights in the folder of weights; None where it is not there."""
+    path = weights_folder() / known_weights(name).file
+    return path if os.path.isfile(path) else None
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock(file: BinaryIO) -> None:
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            raise BlockingIOError(*error.args) from error
+else:
+    import fcntl
+
+    def _lock(file: BinaryIO) -> None:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextlib.contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Hold the lock file `path` during the block; a killed process's lock is free.
+
+    Raises:
+        BlockingIOError: somebody else holds it.
+        OSError: the file cannot be created, or the file system has no locks.
+    """
+    file = _acquire(path)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows deletes no open file, and it may stay
+            path.unlink()
+        file.close()
+
+
+def _acquire(path: Path) -> BinaryIO:
+    while True:
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(open(path, "ab"))
+            _lock(file)
+            # Its last holder may have removed it between these two steps: then what we hold has no name.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                    stack.pop_all()
+                    return file

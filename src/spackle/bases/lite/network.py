@@ -38,7 +38,6 @@ STAGES: dict[Size, tuple[tuple[int, int, int, int, int], ...]] = {
 }
 STEM = 32
 TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
-SPREADS = (6.0, 9.6, 8.0, 6.7, 2.4)  # standard deviations of those features of lite2, nearly lite0's too, on photos
 DECODER = (24, 40, 64, 96, 160)  # its channels at those scales
 MEAN, STD = 127.0 / 255, 128.0 / 255  # the input that the features were learned on
 
@@ -131,23 +130,6 @@ class LiteNet(nn.Module):
         )
         self.fuse = nn.ModuleList(Fuse(DECODER[n + 1], channels[n], DECODER[n]) for n in reversed(range(len(TAPS) - 1)))
         self.head = nn.Sequential(nn.Conv2d(DECODER[0], 16, 3, padding=1), nn.ReLU(), nn.Conv2d(16, 1, 1))
-        self._start()
-
-    def _start(self) -> None:
-        """First weights of the decoder: values of about one everywhere, and corrections that begin at nothing."""
-        for name, module in self.named_modules():
-            if isinstance(module, nn.Conv2d) and not name.startswith("encoder."):
-                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
-        with torch.no_grad():
-            for weight in (self.top.weight, self.context.weight):
-                weight /= SPREADS[-1]
-            for fuse, spread in zip(self.fuse, reversed(SPREADS[:-1]), strict=True):
-                fuse.get_parameter("lateral.weight").div_(spread)
-                fuse.get_parameter("reduce.weight").mul_(0.5)
-                fuse.get_parameter("refine.weight").zero_()
-            self.get_parameter("spread.2.weight").zero_()
-            self.get_parameter("head.2.weight").mul_(0.2)
 
     def forward(self, rgb: Tensor) -> Tensor:
         """[B, 3, H, W] sRGB in 0..1, sides multiples of 32, to log inverse depth [B, H/2, W/2] up to a constant."""
