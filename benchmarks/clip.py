@@ -26,8 +26,8 @@ from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
+from spackle.inpaint.opencv import OpenCV
 from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
-from spackle.opencv import OpenCV
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer

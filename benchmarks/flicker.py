@@ -22,8 +22,8 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange
-from spackle.pseudo.inpainters import get_inpainter
-from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views
+from spackle.dataset.views import PathChoice, path_cameras, render_views, scene_completion
+from spackle.inpaint import InpainterOptions, ViewStack, get_inpainter
 from spackle.render import get_renderer
 from spackle.residual import Completer
 
@@ -101,7 +101,7 @@ def main() -> None:
     prediction = lift(rgb, depth, camera)
     ways: dict[str, Callable[[ViewStack], Tensor]] = {"complete_view": by_view}
     for name in ("geometry", "opencv", "none"):
-        ways[name] = get_inpainter(name, get_renderer()).complete
+        ways[name] = get_inpainter(name, InpainterOptions(complete_scene=scene_completion(get_renderer()))).complete
     print(f"{'path':16}{'holes':>8}", *(f"{name:>24}" for name in ways))
     for kind in TRAJECTORIES:
         path = PathChoice(kind, options.disparity)
@@ -110,7 +110,7 @@ def main() -> None:
         order = list(range(1, len(cameras)))
         numbers = [flicker(stack, way(stack), order) for way in ways.values()]
         cells = [f"{a:10.2f} between {b:5.1f} off" if math.isfinite(a) else "-" for a, b in numbers]
-        print(f"{kind:16}{sum(stack.holes) / len(stack.holes):8.1%}", *cells)
+        print(f"{kind:16}{float(stack.mask.double().mean()):8.1%}", *cells)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from stand_in import StandIn, base_of, predict, refuses, write_lite
 from spackle.bases.hf import HfBase
 from spackle.bases.open import KINDS
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
@@ -27,7 +28,6 @@ from spackle.image import Photo
 from spackle.jobs.bases import base_files, public_name, says_of
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.request import shared_digest
-from spackle.pseudo.manifest import load_manifest
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
+from spackle.inpaint.opencv import OpenCV
 from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
-from spackle.opencv import OpenCV
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, hole_mask
 from spackle.residual.temporal import (

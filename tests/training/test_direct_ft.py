@@ -40,10 +40,10 @@ from spackle.bases.sharp.checkpoint import (
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.camera import Camera
+from spackle.dataset import PseudoFiles
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.pseudo import PseudoFiles
 from spackle.render import get_renderer
 from spackle.render.reference import ReferenceRenderer
 from spackle.training.callbacks import Callbacks

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -19,15 +18,6 @@ from spackle.cli.options import (
 )
 
 dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
-
-
-class InpainterChoice(str, Enum):
-    """What completes the views of a dataset."""
-
-    geometry = "geometry"
-    opencv = "opencv"
-    propainter = "propainter"
-    none = "none"
 
 
 DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folder, or an address (s3://…).")]
@@ -58,13 +48,13 @@ def dataset_build(
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),
     inpainter: Annotated[
-        InpainterChoice, typer.Option(help="What completes the views; none leaves the holes.")
-    ] = InpainterChoice.geometry,
+        str, typer.Option(help="What completes the views: geometry, opencv, propainter; none leaves the holes.")
+    ] = "geometry",
     inpainter_weights: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Weights of propainter: three .pth files.")
+        Path | None, typer.Option(metavar="FOLDER", help="Its weights: propainter's three .pth files.")
     ] = None,
     inpainter_side: Annotated[
-        int | None, typer.Option(help="Long side in pixels at which propainter works; default: 640.")
+        int | None, typer.Option(help="Long side in pixels at which it works; default: propainter's 640.")
     ] = None,
     workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
     ray: Annotated[
@@ -77,16 +67,19 @@ def dataset_build(
     verbose: VerboseOption = False,
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
-    from spackle.jobs.dataset.build import build_dataset
-    from spackle.jobs.dataset.options import DatasetOptions, base_options, view_choices
+    from spackle.bases.open import BaseSettings
+    from spackle.dataset.build import build_dataset
+    from spackle.dataset.options import DatasetOptions
+    from spackle.dataset.views import ViewChoices
     from spackle.progress import Reporter
 
+    settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision.value, device=device.value)
     options = DatasetOptions(
-        base=base_options(base, depth, checkpoint, precision.value, device.value),
-        choices=view_choices(seed, views, trajectory and trajectory.name, disparity),
+        settings,
+        ViewChoices.named(seed, views, trajectory and trajectory.name, disparity),
         images=images,
         sample=sample,
-        inpainter=inpainter.value,
+        inpainter=inpainter,
         inpainter_weights=inpainter_weights,
         inpainter_side=inpainter_side,
         workers=workers,
@@ -103,7 +96,7 @@ def dataset_info(location: DatasetArgument) -> None:
     """Say what a dataset holds: counts, sizes, holes of each view, configuration."""
     from rich.console import Console
 
-    from spackle.jobs.dataset.look import show_info
+    from spackle.dataset.inspect import show_info
 
     show_info(location, Console(highlight=False))
 
@@ -111,7 +104,7 @@ def dataset_info(location: DatasetArgument) -> None:
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
     """Read every byte and name each damaged sample; exit code 1 where there is one."""
-    from spackle.jobs.dataset.look import verify_dataset
+    from spackle.dataset.inspect import verify_dataset
     from spackle.progress import Reporter
 
     if verify_dataset(location, Reporter()):
@@ -126,7 +119,7 @@ def dataset_preview(
     views: Annotated[int, typer.Option(help="How many views of each.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
-    from spackle.jobs.dataset.look import preview_dataset
+    from spackle.dataset.inspect import preview_dataset
     from spackle.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())

@@ -14,8 +14,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.pseudo.opencv import OpencvInpainter
-from spackle.pseudo.views import ViewStack
+from spackle.inpaint import InpainterOptions, ViewStack, get_inpainter
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
@@ -140,7 +139,7 @@ class Inpaint2d:
 
     def __init__(self) -> None:
         """Find OpenCV; InputError where it is not installed."""
-        self._inpainter = OpencvInpainter()
+        self._inpainter = get_inpainter("opencv", InpainterOptions())
 
     def views(self, shot: Shot) -> Iterator[View]:
         for camera, before in zip(shot.cameras, shot.before, strict=True):

@@ -19,6 +19,7 @@ from spackle.bases.open import NETWORKS, BaseError, kind_of
 from spackle.bases.sharp import SharpBase
 from spackle.camera_path import MAX_DISPARITY
 from spackle.choose import Load
+from spackle.dataset.options import base_digest
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.digest import digest_of, weights_digest
 from spackle.errors import InputError, check_name
@@ -29,7 +30,6 @@ from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OW
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
 from spackle.jobs.bases import public_name, says_of, title_of
-from spackle.jobs.dataset.options import base_digest
 from spackle.jobs.options import PredictOptions, check_base_options
 from spackle.jobs.setup import set_up
 from spackle.render import Renderer, get_renderer
@@ -210,7 +210,7 @@ def _configuration(
     base = options.base
     names = digest_of([case.name for case in cases])
     about = {"name": public_name(base.base), "title": title_of(base.base), "says": says_of(base.base, base.checkpoint)}
-    weights = {"weights": base_digest(base), "precision": base.precision}
+    weights = {"weights": base_digest(base.base_files), "precision": base.precision}
     residual = base.residual_file and weights_digest(base.residual_file)
     return {
         "spackle": spackle.__version__,

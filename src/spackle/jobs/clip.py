@@ -15,12 +15,12 @@ from spackle.camera_path import spelled
 from spackle.errors import InputError
 from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
 from spackle.image import Photo, focal_length, resize_photo
+from spackle.inpaint.opencv import OpenCV
 from spackle.jobs.clip_frames import FIGURES, ClipChoices, ClipCompleter, Drawn
 from spackle.jobs.options import PredictOptions
 from spackle.jobs.report import focal_source, write_report
 from spackle.jobs.setup import Tools
 from spackle.jobs.video_options import VideoOptions
-from spackle.opencv import OpenCV
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter, Step
 from spackle.residual import hole_area_ratio

@@ -25,7 +25,8 @@ from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.pseudo import PseudoFiles, PseudoSample
+from spackle.dataset.reader import PseudoFiles
+from spackle.dataset.sample import PseudoSample
 from spackle.render import Renderer
 from spackle.training.data import digest_of
 from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod

@@ -13,14 +13,13 @@ from rich.filesize import decimal
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from spackle.dataset.reader import PseudoFiles
+from spackle.dataset.sample import PhotoGroup
+from spackle.dataset.shards import Manifest, load_manifest, problems
 from spackle.errors import InputError
 from spackle.formats import save_png, save_video
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
-from spackle.pseudo.manifest import Manifest, load_manifest
-from spackle.pseudo.reader import PseudoFiles
-from spackle.pseudo.sample import PhotoGroup
-from spackle.pseudo.shards import problems
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"
 THUMBNAIL = 192  # pixels along its longer side

@@ -27,12 +27,21 @@ from scenes import Scene, box_before_wall, shifted
 from torch import Tensor, nn
 
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.dataset.shards import load_manifest
+from spackle.dataset.views import PathChoice, path_cameras, render_views
 from spackle.errors import InputError
-from spackle.pseudo.inpainters import InpainterOptions, get_inpainter
-from spackle.pseudo.manifest import load_manifest
-from spackle.pseudo.propainter import DILATION, PropainterInpainter, dilated, padded, path_order
-from spackle.pseudo.propainter_weights import NETWORKS, give_weights, weight_files
-from spackle.pseudo.views import PathChoice, ViewStack, path_cameras, render_views
+from spackle.inpaint import ViewStack, get_inpainter
+from spackle.inpaint.propainter import (
+    DILATION,
+    NETWORKS,
+    PropainterInpainter,
+    dilated,
+    give_weights,
+    padded,
+    path_order,
+    weight_files,
+)
+from spackle.inpaint.protocol import InpainterOptions
 from spackle.render import get_renderer
 
 OURS = ("torchvision", "pytorchcv.models.propainter")  # modules that hold the convolution
@@ -184,7 +193,7 @@ def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def inpainter(weights: Path) -> PropainterInpainter:
     """With random weights."""
-    return PropainterInpainter(weights, device="cpu")
+    return PropainterInpainter(InpainterOptions(weights, device="cpu"))
 
 
 def stack_of(scene: Scene, rights: list[float]) -> ViewStack:
@@ -218,7 +227,7 @@ def test_holes_get_colours_and_all_else_stays(targets: Tensor, seen: ViewStack) 
 
 
 def test_the_same_views_give_the_same_bits(weights: Path, targets: Tensor, seen: ViewStack) -> None:
-    again = get_inpainter("propainter", get_renderer(), InpainterOptions(weights, device="cpu"))
+    again = get_inpainter("propainter", InpainterOptions(weights, device="cpu"))
     assert torch.equal(again.complete(seen), targets)
     assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", again.version)
 
@@ -270,7 +279,7 @@ def test_large_views_are_worked_on_in_small_and_no_hole_is_lost(video: type[Vide
     mask = torch.zeros_like(stack.mask)
     mask[1, 50, :] = True  # one pixel high
     stack = dataclasses.replace(stack, mask=mask)
-    small = PropainterInpainter(weights, side=150, device="cpu")
+    small = PropainterInpainter(InpainterOptions(weights, 150, "cpu"))
     targets = small.complete(stack)
     frames, _ = video.given[0]
     assert frames.shape == (2, 3, 128, 152)

@@ -1,10 +1,10 @@
-"""The views that a dataset has of a photo: a controlled camera path, drawn with the base (paper, "Dataset")."""
+"""The views that a dataset has of a photo: a controlled camera path, drawn with the base (paper, appendix)."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -12,9 +12,12 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
+from spackle.inpaint import SceneCompletion, ViewStack
 from spackle.render import Renderer
-from spackle.residual import hole_mask
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, hole_mask
 from spackle.residual.hole_features import MASK_THRESHOLD
 
 VIEWS = 20  # the paper's, the photo's own view among them
@@ -24,29 +27,28 @@ SPARE = 6  # frames of a path that may coincide with others
 
 
 @dataclasses.dataclass(frozen=True)
+class ViewChoices:
+    """What decides which views a photo gets."""
+
+    seed: int = 0
+    views: int = VIEWS  # of a photo, its own among them
+    trajectory: TrajectoryKind | None = None  # drawn for each photo where None
+    disparity: tuple[float, float] = DISPARITY  # drawn between these
+    threshold: float = MASK_THRESHOLD
+
+    @staticmethod
+    def named(seed: int, views: int, trajectory: str | None, disparity: tuple[float, float]) -> ViewChoices:
+        """The choices of a person; the trajectory by its name in `TRAJECTORIES`."""
+        kinds: dict[str, TrajectoryKind] = {name: name for name in TRAJECTORIES}
+        return ViewChoices(seed, views, None if trajectory is None else kinds[trajectory], disparity)
+
+
+@dataclasses.dataclass(frozen=True)
 class PathChoice:
     """Where the camera goes."""
 
     kind: TrajectoryKind
     disparity: float
-
-
-@dataclasses.dataclass(frozen=True)
-class ViewStack:
-    """A photo's Gaussians and what V cameras see of them; the first camera is the photo's."""
-
-    base: Gaussians
-    photo_camera: Camera
-    cameras: Sequence[Camera]
-    rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
-    depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
-    alpha: Tensor  # [V, H, W] opacity
-    mask: Tensor  # [V, H, W] bool: uncovered
-
-    @property
-    def holes(self) -> list[float]:
-        """HAR of each view (paper, section 4.2)."""
-        return [float(mask.double().mean()) for mask in self.mask]
 
 
 def draw_path(
@@ -58,7 +60,7 @@ def draw_path(
         seed: the dataset's.
         photo_sha256: of the photo's file.
         kind: this one; drawn where None.
-        disparity: between these two, see `spackle.camera_path.max_offset`.
+        disparity: between these two, see `spackle.trajectory.max_offset`.
     """
     digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
     rng = np.random.default_rng(list(digest))
@@ -114,8 +116,28 @@ def render_views(
     renderer: Renderer,
     threshold: float = MASK_THRESHOLD,
 ) -> ViewStack:
-    """Draw the base from each camera; a pixel with less opacity than `threshold` is uncovered (eq. 3)."""
+    """Draw the base from each camera; a pixel with less opacity than `threshold` is uncovered (eq. 4)."""
     drawn = [renderer.render(base, camera) for camera in cameras]
     alpha = torch.stack([view.alpha for view in drawn])
     rgb, depth = torch.stack([view.rgb for view in drawn]), torch.stack([view.depth for view in drawn])
     return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha, threshold))
+
+
+def scene_completion(renderer: Renderer) -> SceneCompletion:
+    """Completion of a whole scene, by seeds alone: each hole is filled in the widest view that shows it."""
+
+    def complete(base: Gaussians, photo_camera: Camera, cameras: Sequence[Camera]) -> Callable[[Camera], Tensor]:
+        aux = Completer(base, photo_camera, renderer).complete_scene(cameras, exact=True)
+        return lambda camera: _closed(renderer.render([base, aux], camera))
+
+    return complete
+
+
+def _closed(drawn: Rendering) -> Tensor:
+    """The colours [H, W, 3] of a view, the few pixels that are still uncovered grown from those around them."""
+    left = hole_mask(drawn.alpha)
+    known = ~left & (drawn.depth > 0)
+    if not bool(left.any()) or not bool(known.any()):
+        return drawn.rgb
+    inverse_depth = torch.where(known, 1.0 / drawn.depth.clamp_min(1e-6), 0.0)
+    return far_fill(inverse_depth, drawn.rgb.permute(2, 0, 1), known)[1].permute(1, 2, 0)

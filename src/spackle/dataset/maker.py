@@ -1,4 +1,4 @@
-"""Who makes the samples of a dataset: this process, or several at once."""
+"""Who makes the samples of a dataset: a photo's base, views, targets and files, in this process or several at once."""
 
 from __future__ import annotations
 
@@ -10,28 +10,34 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from spackle.bases.open import BaseError
+from spackle.bases.open import BaseError, OpenedBase, open_base
 from spackle.bases.protocol import BasePrediction
-from spackle.device import MemoryShort
+from spackle.camera_path import DepthRange
+from spackle.dataset.options import DatasetOptions
+from spackle.dataset.photos import PhotoFile
+from spackle.dataset.sample import pack, to_members
+from spackle.dataset.views import PathChoice, draw_path, path_cameras, render_views, scene_completion
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.image import Photo
-from spackle.jobs.dataset.options import DatasetOptions, depth_of
-from spackle.jobs.setup import Tools, make_base, set_up
-from spackle.pseudo.build import Seconds, key_of, make_sample, timed
-from spackle.pseudo.inpainters import Inpainter, get_inpainter
-from spackle.pseudo.photos import PhotoFile
+from spackle.image import Photo, load_photo, resize_photo
+from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
+from spackle.render import Renderer, get_renderer
 
 PARTS = "parts"  # in the output: samples that are in no shard yet
 IN_HAND = 2  # photos of a worker: the one it works on, and the next
+
+Seconds = dict[str, float]  # of each stage
+Job = tuple[int, PhotoFile]  # a photo, and its place among all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +49,9 @@ class Made:
     problem: str | None  # why there is no sample
 
 
-Job = tuple[int, PhotoFile]
+def key_of(index: int) -> str:
+    """How a photo's files begin: its place among the photos."""
+    return f"{index:06d}"
 
 
 def part_file(output: Path, index: int) -> Path:
@@ -57,14 +65,20 @@ class Maker:
 
     options: DatasetOptions
     output: Path
-    tools: Tools
+    base: OpenedBase
+    renderer: Renderer
     inpainter: Inpainter
 
     @staticmethod
     def of(options: DatasetOptions, output: Path) -> Maker:
         """Set up; a network is loaded with the first photo. InputError where that cannot be."""
-        tools = set_up(options.base)
-        return Maker(options, output, tools, get_inpainter(options.inpainter, tools.renderer, options.for_inpainter))
+        base, renderer = open_base(options.base), get_renderer(options.base.device)
+        device = None if options.base.device == "auto" else options.base.device
+        weights, side = options.inpainter_weights, options.inpainter_side
+        inpainter = get_inpainter(
+            options.inpainter, InpainterOptions(weights, side, device, scene_completion(renderer))
+        )
+        return Maker(options, output, base, renderer, inpainter)
 
     def make(self, job: Job) -> Made:
         """Write a photo's sample, whole or not at all.
@@ -75,32 +89,57 @@ class Maker:
         return keep(self.output, *self.sample(job))
 
     def sample(self, job: Job) -> tuple[Made, bytes | None]:
-        """A photo's sample, or None where it gives none.
+        """A photo's sample as a stretch of a tar archive, or None where the photo gives none.
 
         Raises:
             InputError: no photo can be worked on.
         """
-        index, photo = job
+        index, file = job
         seconds: Seconds = {}
-        predict = functools.partial(self._predict, photo)
-        tools, choices = self.tools, self.options.choices
         try:
-            data = make_sample(photo, key_of(index), predict, tools.renderer, self.inpainter, choices, seconds)
+            return Made(index, seconds, None), self._sample(key_of(index), file, seconds)
         except BaseError:
             raise
         except InputError as error:
             return Made(index, seconds, str(error)), None
-        return Made(index, seconds, None), data
 
-    def _predict(self, file: PhotoFile, photo: Photo) -> BasePrediction:
-        options = self.options.base
-        if options.depth is None:
-            try:
-                return make_base(photo, options, self.tools).predict(photo)
-            except MemoryShort as error:  # no fault of the photo's
-                raise BaseError(str(error)) from error
-        depth = depth_of(file, options.depth)
-        return make_base(photo, dataclasses.replace(options, depth=depth), self.tools).predict(photo)
+    def _sample(self, key: str, file: PhotoFile, seconds: Seconds) -> bytes:
+        with timed("load", seconds):
+            photo = load_photo(file.path)
+        with timed("base", seconds):
+            prediction, _ = self.base.predict(photo, self.options.depth_of(file))
+        with timed("render", seconds):
+            path, stack = self._draw(file, prediction)
+        with timed("inpaint", seconds):
+            targets = self.inpainter.complete(stack)
+        with timed("encode", seconds):
+            facts = self._facts(file, photo, prediction)
+            picture = resize_photo(photo).rgb
+            return pack(to_members(key, picture, stack, targets, self.options.choices.threshold, path, facts))
+
+    def _draw(self, file: PhotoFile, prediction: BasePrediction) -> tuple[PathChoice, ViewStack]:
+        choices, camera = self.options.choices, prediction.camera
+        path = draw_path(choices.seed, file.sha256, choices.trajectory, choices.disparity)
+        even = camera.even()
+        try:
+            cameras = path_cameras(path, even, DepthRange.of(prediction.gaussians), choices.views)
+        except ValueError as error:
+            raise InputError(f"{file.path}: no camera path: {error}") from error
+        return path, render_views(prediction.gaussians, camera, cameras, self.renderer, choices.threshold)
+
+    def _facts(self, file: PhotoFile, photo: Photo, prediction: BasePrediction) -> dict[str, Any]:
+        """What the JSON says of the photo, besides its views."""
+        return {
+            "photo": {
+                "name": file.name,
+                "sha256": file.sha256,
+                "width": photo.width,
+                "height": photo.height,
+                "focal_source": prediction.lens_source or photo.focal_source,
+            },
+            "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
+            "inpainter": {"name": self.inpainter.name, "version": self.inpainter.version},
+        }
 
 
 def keep(output: Path, made: Made, data: bytes | None) -> Made:
@@ -109,6 +148,16 @@ def keep(output: Path, made: Made, data: bytes | None) -> Made:
         with timed("write", made.seconds), atomic_path(part_file(output, made.index)) as temporary:
             temporary.write_bytes(data)
     return made
+
+
+@contextlib.contextmanager
+def timed(stage: str, seconds: Seconds) -> Iterator[None]:
+    """Add the block's time to `seconds[stage]`."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 @contextlib.contextmanager

@@ -15,14 +15,15 @@ from typing import Any
 
 import pytest
 from command import Run, names_in
-from test_dataset import SHORT, build, content, is_alive, write_inputs
+from test_dataset_build import SHORT, build, content, is_alive, write_inputs
 
-from spackle.jobs.dataset import crew as crews
-from spackle.jobs.dataset import ray as on_ray
-from spackle.jobs.dataset.options import DatasetOptions, base_options, view_choices
-from spackle.jobs.dataset.remote import RemoteMaker
-from spackle.jobs.dataset.worker import IN_HAND, Job, Made
-from spackle.pseudo.photos import PhotoFile
+from spackle.bases.open import BaseSettings
+from spackle.dataset import ray as on_ray
+from spackle.dataset.maker import IN_HAND, Job, Made
+from spackle.dataset.options import DatasetOptions
+from spackle.dataset.photos import PhotoFile
+from spackle.dataset.ray import RemoteMaker
+from spackle.dataset.views import ViewChoices
 
 os.environ.setdefault("RAY_AUTH_MODE", "token")  # before it is loaded: a cluster of newer versions wants one
 ray = pytest.importorskip("ray")
@@ -98,7 +99,7 @@ def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, tmp_path: Pa
 def test_photos_of_a_killed_worker_are_made_again_by_another(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(crews, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
+    monkeypatch.setattr(on_ray, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
     done = on(address, place, tmp_path / "out")
     assert (done.code, done.out) == (0, ""), done.err
     assert len(done.lines) == 3
@@ -112,7 +113,7 @@ def test_a_photo_that_kills_every_worker_ends_the_build_which_goes_on_later(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(crews, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
+        patch.setattr(on_ray, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
         done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (2, "", 4)
     assert f"{place}/photos/3.png: at this photo a worker died for the 4th time" in done.lines[-1]
@@ -129,7 +130,7 @@ def test_workers_and_their_cluster_end_with_a_killed_build(place: Path, tmp_path
     code = f"""
 import os, subprocess, sys
 sys.argv = {[str(word) for word in words]!r}
-import spackle.jobs.dataset.build as build
+import spackle.dataset.build as build
 def dying(*arguments):
     with open({str(note)!r}, "w") as file:
         subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
@@ -199,7 +200,7 @@ def test_a_cluster_without_room_is_a_line(place: Path, address: str, tmp_path: P
     ("name", "instead", "line"),
     [
         ("what_is_seen", ["another", "photo"], "0.png: node {node} does not find this photo or its depth map"),
-        ("setting", {"spackle": "0.0"}, 'would make another dataset (base: null -> {{"name'),
+        ("configuration", {"spackle": "0.0"}, 'would make another dataset (base: null -> {{"name'),
         ("RemoteMaker", "begin", "as it started a worker died for the 4th time"),
     ],
 )
@@ -207,9 +208,9 @@ def test_a_node_that_is_not_like_the_others_is_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, instead: Any, line: str
 ) -> None:
     if name == "RemoteMaker":
-        monkeypatch.setattr(crews, name, dying(0, 99, tmp_path / "notes", instead))
+        monkeypatch.setattr(on_ray, name, dying(0, 99, tmp_path / "notes", instead))
     else:
-        monkeypatch.setattr(crews, name, lambda *arguments: instead)
+        monkeypatch.setattr(on_ray, name, lambda *arguments: instead)
     done = on(address, place, tmp_path / "out")
     assert (done.code, len(done.lines)) == (2, 1 if name != "RemoteMaker" else 4)
     assert line.format(node=socket.gethostname()) in done.lines[-1]
@@ -218,8 +219,7 @@ def test_a_node_that_is_not_like_the_others_is_a_line(
 
 def test_a_worker_takes_a_gpu_only_where_a_network_uses_one(tmp_path: Path) -> None:
     def options(base: str, device: str = "auto", inpainter: str = "geometry") -> DatasetOptions:
-        one = base_options(base, None, None, "auto", device)
-        return DatasetOptions(one, view_choices(0, 2, None, (0.1, 0.2)), inpainter=inpainter)
+        return DatasetOptions(BaseSettings(base, device=device), ViewChoices(), inpainter=inpainter)
 
     with_one = [{"Alive": True, "Resources": {"CPU": 4.0}}, {"Alive": True, "Resources": {"CPU": 4.0, "GPU": 1.0}}]
     assert on_ray.gpus_of(options("sharp"), with_one) == 1
@@ -260,10 +260,9 @@ def noting(counts: list[int]) -> SimpleNamespace:
 
 
 def test_workers_have_few_photos_in_hand(tmp_path: Path) -> None:
-    base = base_options("rgbd", tmp_path, None, "auto", "auto")
-    options = DatasetOptions(base, view_choices(0, 2, None, (0.1, 0.2)), workers=3, ray="local")
+    options = DatasetOptions(BaseSettings("rgbd", tmp_path), ViewChoices(), workers=3, ray="local")
     jobs = [(number, PhotoFile(tmp_path / f"{number}.png", f"{number}.png", "")) for number in range(50)]
     counts: list[int] = []
-    crew = crews.Crew(noting(counts), options, tmp_path, jobs, 0, print)
+    crew = on_ray.WorkerPool(noting(counts), options, tmp_path, jobs, 0, print)
     assert sorted(made.index for made in crew.results()) == list(range(50))
     assert max(counts) == 3 * IN_HAND

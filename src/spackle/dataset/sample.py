@@ -1,21 +1,19 @@
-"""A photo with its views as the files of a shard, and back."""
+"""A photo with its views as a stretch of a tar archive, and back."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
-from collections.abc import Mapping, Sequence
+import tarfile
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.errors import InputError
-from spackle.formats.camera_files import checked_camera
-from spackle.gaussians import Gaussians
-from spackle.pseudo.archive import unpack
-from spackle.pseudo.encode import (
+from spackle.dataset.encode import (
     decode_alpha,
     decode_depth,
     decode_gaussians,
@@ -26,9 +24,44 @@ from spackle.pseudo.encode import (
     encode_gaussians,
     encode_mask,
     encode_rgb,
-)  # fmt: skip
-from spackle.pseudo.views import PathChoice, ViewStack
+)
+from spackle.dataset.views import PathChoice
+from spackle.errors import InputError
+from spackle.formats.camera_files import checked_camera
+from spackle.gaussians import Gaussians
+from spackle.inpaint import ViewStack
 from spackle.render.protocol import Rendering
+
+BLOCK = 512
+END = bytes(2 * BLOCK)  # of an archive
+
+
+def pack(members: Iterable[tuple[str, bytes]]) -> bytes:
+    """Named files as a stretch of a tar archive, without its end: stretches may follow one another.
+
+    No time, owner or machine is in it.
+    """
+    parts: list[bytes] = []
+    for name, data in members:
+        header = tarfile.TarInfo(name)  # mtime 0, uid 0, gid 0, mode 644
+        header.size = len(data)
+        parts += [header.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % BLOCK)]
+    return b"".join(parts)
+
+
+def unpack(data: bytes) -> Mapping[str, bytes]:
+    """The files of such a stretch by name; ValueError where it is none."""
+    found: dict[str, bytes] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
+            for member in archive:
+                file = archive.extractfile(member)
+                if file is None:
+                    raise ValueError(f"{member.name} is no plain file")
+                found[member.name] = file.read()
+    except tarfile.TarError as error:
+        raise ValueError(f"no tar archive: {error}") from error
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +112,7 @@ def to_members(
             "alpha": encode_alpha(alpha, mask, threshold),
             "depth": depth_png,
         }
-        files += [(view_file(key, index, kind), data) for kind, data in kinds.items()]
+        files += [(_view_file(key, index, kind), data) for kind, data in kinds.items()]
         views.append(_camera_facts(camera) | {"depth_range": list(depth_range), "hole": float(mask.double().mean())})
     common = {
         "key": key,
@@ -93,7 +126,7 @@ def to_members(
     return [*first, (f"{key}.base.safetensors", encode_gaussians(stack.base)), *files]
 
 
-def view_file(key: str, index: int, kind: str) -> str:
+def _view_file(key: str, index: int, kind: str) -> str:
     """What a picture of a view is called."""
     return f"{key}.{index:02d}.{kind}.png"
 
@@ -123,6 +156,11 @@ class PhotoGroup:
     def views(self) -> int:
         """How many there are."""
         return len(self.facts["views"])
+
+    @property
+    def holes(self) -> tuple[float, ...]:
+        """HAR of each view (paper, eq. 11)."""
+        return tuple(float(view["hole"]) for view in self.facts["views"])
 
     def view(self, index: int, *, with_base: bool = False) -> PseudoSample:
         """Decode one view.
@@ -160,7 +198,7 @@ class PhotoGroup:
         return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
     def _file(self, index: int, kind: str) -> bytes:
-        return self.files[view_file(self.key, index, kind)]
+        return self.files[_view_file(self.key, index, kind)]
 
 
 def _camera_facts(camera: Camera) -> dict[str, Any]:
@@ -176,8 +214,3 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
 def _camera(facts: Mapping[str, Any], where: str) -> Camera:
     K, matrix = (torch.tensor(facts[name], dtype=torch.float64) for name in ("K", "world_to_camera"))
     return checked_camera(K, matrix, facts["width"], facts["height"], where)
-
-
-def holes_of(facts: Mapping[str, Any]) -> Sequence[float]:
-    """HAR of each view, as the JSON has it."""
-    return [float(view["hole"]) for view in facts["views"]]

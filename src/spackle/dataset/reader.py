@@ -9,11 +9,9 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
+from spackle.dataset.sample import PhotoGroup, PseudoSample
+from spackle.dataset.shards import Manifest, SampleEntry, ShardEntry, load_manifest, open_in, read_sample
 from spackle.errors import InputError
-from spackle.pseudo.manifest import Manifest, SampleEntry, ShardEntry, load_manifest
-from spackle.pseudo.places import open_in
-from spackle.pseudo.sample import PhotoGroup, PseudoSample
-from spackle.pseudo.shards import read_sample
 
 Place = tuple[ShardEntry, SampleEntry]
 

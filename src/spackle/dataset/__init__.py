@@ -1,6 +1,6 @@
 """The pseudo-supervised dataset (paper, appendix): photos to views with holes and completed targets, in shards."""
 
-from spackle.pseudo.reader import PseudoDataset, PseudoFiles
-from spackle.pseudo.sample import PhotoGroup, PseudoSample
+from spackle.dataset.reader import PseudoDataset, PseudoFiles
+from spackle.dataset.sample import PhotoGroup, PseudoSample
 
 __all__ = ["PhotoGroup", "PseudoDataset", "PseudoFiles", "PseudoSample"]

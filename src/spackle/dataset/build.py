@@ -1,0 +1,190 @@
+"""`spackle dataset build`: photos to shards, in any number of runs with the same bytes at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.filesize import decimal
+
+from spackle.dataset.maker import PARTS, Made, Maker, Seconds, at_work, key_of, part_file, timed
+from spackle.dataset.options import MAX_PHOTOS, DatasetOptions, configuration
+from spackle.dataset.photos import PhotoFile, choose, find_photos
+from spackle.dataset.ray import at_work_on_ray, cluster
+from spackle.dataset.shards import NAME, Manifest, ShardEntry, differences, load_manifest, shard_name, write_shard
+from spackle.errors import InputError
+from spackle.output_folder import alone_in, make_folder, remove_half_written, results_folder
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
+
+STAGES = ("load", "base", "render", "inpaint", "encode", "write")
+NAMED = 5  # missing files that are spelled out
+
+
+def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
+    """Build a dataset, or go on with one.
+
+    Args:
+        source: a folder of photos, or COCO annotations.
+        output: a folder for manifest and shards.
+        options: everything else.
+        reporter: says what is passed over, and at the end how long each stage took.
+
+    Returns:
+        "complete", or "stopped" where Ctrl-C came.
+
+    Raises:
+        InputError: options, photos or folders that cannot be used; another dataset in `output`.
+    """
+    options.check()
+    inpainter = Maker.of(options, output).inpainter  # what cannot be is refused before long work
+    if inpainter.notice:
+        reporter.say(inpainter.notice)
+    with cluster(options) as ray:
+        photos = _photos(source, options, reporter)
+        config = configuration(options, photos, inpainter)
+        with results_folder(output, (NAME,)), alone_in(output, "build"):
+            manifest = _begin(output, config)
+            return _Build(photos, output, options, reporter, manifest).run(ray)
+
+
+def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[PhotoFile]:
+    found = find_photos(source, options.images)
+    if found.missing:
+        more = len(found.missing) - NAMED
+        names = ", ".join(found.missing[:NAMED]) + (f" and {more} more" if more > 0 else "")
+        reporter.say(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
+    if options.sample is None and len(found.names) > MAX_PHOTOS:
+        raise InputError(
+            f"{source}: {len(found.names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
+            "give --sample, or build several"
+        )
+    with reporter.stage("photos", {}) as step:
+        return choose(found, options.sample, options.choices.seed, reporter.say, step)
+
+
+def _begin(output: Path, config: dict[str, Any]) -> Manifest:
+    """The manifest to go on from, a new one where there is none; InputError where it is of another dataset."""
+    new = Manifest(config, (), complete=False)
+    if not (output / NAME).exists():
+        new.save(output)
+    manifest = load_manifest(output)
+    if lines := differences(manifest.config, new.config):
+        raise InputError(f"{output}: holds a dataset of another configuration ({'; '.join(lines)}): choose another -o")
+    make_folder(output / PARTS)
+    remove_half_written(output, output / PARTS)
+    return manifest
+
+
+class _Build:
+    """The photos of a dataset and how far it has come."""
+
+    def __init__(
+        self, photos: Sequence[PhotoFile], output: Path, options: DatasetOptions, reporter: Reporter, manifest: Manifest
+    ) -> None:
+        self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
+        self.config, size = manifest.config, options.shard_size
+        self.shards = {int(shard.file[6:-4]): shard for shard in manifest.shards if self._is_there(shard)}
+        self.problems: dict[int, str] = {}  # of photos that give no sample
+        self.seconds: Seconds = dict.fromkeys(STAGES, 0.0)
+        self.jobs = [
+            (index, photo)
+            for index, photo in enumerate(photos)
+            if index // size not in self.shards and not part_file(output, index).is_file()
+        ]
+        missing = range(-(-len(photos) // size))
+        self.waiting: dict[int, set[int]] = {n: set() for n in missing if n not in self.shards}  # shards for photos
+        for index, _ in self.jobs:
+            self.waiting[index // size].add(index)
+
+    def run(self, ray: Any) -> str:
+        """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
+        ready, made = len(self.photos) - len(self.jobs), 0
+        if ready:
+            self.reporter.say(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
+        with self.reporter.stage("photos", {}) as step, asked_to_stop(alone=True) as stop:
+            self._write_ready()
+            if not self.jobs:
+                return self._finish(0, 0.0)
+            total: Seconds = {}
+            work = (self.options, self.output, self.jobs)
+            workers = at_work(*work) if ray is None else at_work_on_ray(ray, *work, self.reporter.say)
+            with timed("wall", total), workers as results:
+                for result in results:
+                    made += self._note(result)
+                    self._write_ready()
+                    step(ready + made + len(self.problems), len(self.photos))
+                    if stop():
+                        break
+        if any(self.waiting.values()):
+            self.reporter.say("stopped; the same command goes on from here")
+            return "stopped"
+        return self._finish(made, total["wall"])
+
+    def _is_there(self, shard: ShardEntry) -> bool:
+        """Whether a shard still lies where it was written; what is in it is for `verify`."""
+        path = self.output / shard.file
+        return path.is_file() and path.stat().st_size == shard.size
+
+    def _note(self, result: Made) -> int:
+        """Note what became of a photo; 1 where it gave a sample, else 0."""
+        self.waiting[result.index // self.options.shard_size].discard(result.index)
+        for stage, time in result.seconds.items():
+            self.seconds[stage] += time
+        if result.problem is None:
+            return 1
+        self.problems[result.index] = result.problem
+        self.reporter.say(f"passed over: {result.problem}")
+        return 0
+
+    def _write_ready(self) -> None:
+        """Shards whose photos are all done: first the file, then its entry, and its parts go last."""
+        size = self.options.shard_size
+        for number in sorted(n for n, missing in self.waiting.items() if not missing and n not in self.shards):
+            own = range(number * size, min((number + 1) * size, len(self.photos)))
+            parts = [(key_of(i), part_file(self.output, i)) for i in own if i not in self.problems]
+            passed = [self._portable(self.photos[i].name, self.problems[i]) for i in own if i in self.problems]
+            with timed("write", self.seconds):
+                self.shards[number] = write_shard(parts, self.output / shard_name(number), passed)
+                self._save(complete=False)
+                for _, path in parts:
+                    path.unlink(missing_ok=True)
+            self.reporter.detail(f"  {shard_name(number)}: {len(parts)} photos, {decimal(self.shards[number].size)}")
+
+    def _save(self, *, complete: bool) -> None:
+        Manifest(self.config, tuple(self.shards[n] for n in sorted(self.shards)), complete).save(self.output)
+
+    def _finish(self, made: int, wall: float) -> str:
+        """The last manifest, and no trace of how it came to be.
+
+        Raises:
+            InputError: no photo gave a sample; then nothing stays, and the next run tries all photos again.
+        """
+        shards = self.shards.values()
+        samples = sum(len(shard.samples) for shard in shards)
+        if samples:
+            self._save(complete=True)
+        for file in (self.output / PARTS).iterdir():  # of shards that an earlier run had finished
+            file.unlink(missing_ok=True)
+        (self.output / PARTS).rmdir()
+        if not samples:
+            for name in (NAME, *(shard.file for shard in shards)):
+                (self.output / name).unlink(missing_ok=True)
+            why = min(line for shard in shards for line in shard.passed_over)
+            raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample, such as {why}")
+        if made:
+            stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
+            self.reporter.say(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
+        total = decimal(sum(shard.size for shard in shards))
+        self.reporter.say(f"{samples} photos in {len(shards)} shards, {total} -> {self.output}")
+        return "complete"
+
+    def _portable(self, name: str, problem: str) -> str:
+        """What is wrong with a photo, without the folders in which it and its depth happened to lie."""
+        for photo in self.photos:
+            problem = problem.replace(str(photo.path), photo.name)
+        depth = self.options.base.depth
+        if isinstance(depth, Path) and depth.name:  # "." and "/" stand anywhere
+            problem = problem.replace(str(depth), "--depth")
+        return problem if problem.startswith(f"{name}: ") else f"{name}: {problem}"

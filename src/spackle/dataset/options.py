@@ -1,0 +1,118 @@
+"""The choices of `spackle dataset build`, which of them cannot be, and what they are called in the manifest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import spackle
+from spackle.bases.open import BaseSettings, find_depth, kind_of
+from spackle.camera_path import MAX_DISPARITY, spelled
+from spackle.dataset.photos import PhotoFile
+from spackle.dataset.views import ViewChoices
+from spackle.digest import digest_of, fingerprint, weights_digest
+from spackle.errors import InputError
+from spackle.inpaint import INPAINTERS, Inpainter
+
+MAX_VIEWS = 100  # two digits name a view
+MAX_PHOTOS = 1_000_000  # six digits name a photo
+MAX_THREADS = 1024
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetOptions:
+    """The choices of `spackle dataset build`."""
+
+    base: BaseSettings
+    choices: ViewChoices
+    images: Path | None = None  # where the photos of a COCO JSON lie
+    sample: int | None = None  # so many photos; all where None
+    inpainter: str = "geometry"
+    inpainter_weights: Path | None = None  # a folder, for one with a network
+    inpainter_side: int | None = None  # pixels of the long side at which that works
+    workers: int = 1  # processes
+    ray: str | None = None  # the cluster where they are; this machine where None
+    threads: int = 2  # of each
+    shard_size: int = 50  # photos
+
+    @property
+    def takes_gpu(self) -> bool:
+        """Whether a worker could use a GPU."""
+        return self.base.device != "cpu" and (self.base.kind.network or INPAINTERS[self.inpainter].network)
+
+    def check(self) -> None:
+        """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
+        kind_of(self.base.name)  # a dataset says of which base it is, so no `auto`
+        self.base.check()
+        self.base.check_has_depth()
+        depth = self.base.depth
+        if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
+            raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
+        low, high = self.choices.disparity
+        if not 0 < low <= high <= MAX_DISPARITY:
+            raise InputError(
+                f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
+            )
+        for name, value, least, most in (
+            ("--views", self.choices.views, 2, MAX_VIEWS),
+            ("--seed", self.choices.seed, 0, 2**31 - 1),
+            ("--sample", 1 if self.sample is None else self.sample, 1, MAX_PHOTOS),
+            ("--workers", self.workers, 1, MAX_THREADS),
+            ("--threads", self.threads, 1, MAX_THREADS),
+            ("--shard-size", self.shard_size, 1, MAX_PHOTOS),
+        ):
+            if not least <= value <= most:
+                raise InputError(f"{name} must be between {least} and {most}, got {value}")
+
+    def depth_of(self, photo: PhotoFile) -> Path | None:
+        """The depth map of a photo: in --depth, below the same subfolder as the photo; None without --depth.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        folder = self.base.depth
+        if not isinstance(folder, Path):
+            return None
+        beside = folder / Path(photo.name).parent
+        return find_depth(beside if beside.is_dir() else folder, photo.path)
+
+    def inputs_of(self, photo: PhotoFile) -> list[str]:
+        """Name and content of a photo and of its depth map."""
+        try:
+            depth = self.depth_of(photo)
+            return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
+        except InputError:  # its turn will come
+            return [photo.name, photo.sha256, "none"]
+
+
+def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter) -> dict[str, Any]:
+    """Everything that decides what the shards hold, ready for JSON; nothing of where files lie.
+
+    Threads are part of it: SHARP's last bits depend on their number. Workers are not.
+    """
+    base, choices = options.base, options.choices
+    inputs = digest_of([options.inputs_of(photo) for photo in photos])
+    weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
+    return {
+        "spackle": spackle.__version__,
+        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
+        "base": {
+            "name": base.public_name,
+            "weights": base_digest(base.files),
+            "precision": base.precision,
+            "device": base.device,
+        },
+        "views": dataclasses.asdict(choices)
+        | {"disparity": list(choices.disparity), "trajectory": choices.trajectory and spelled(choices.trajectory)},
+        "inpainter": {"name": inpainter.name, "version": inpainter.version} | ({"weights": weights} if weights else {}),
+        "shard_size": options.shard_size,
+        "threads": options.threads,
+    }
+
+
+def base_digest(files: Mapping[str, Path]) -> str | dict[str, str] | None:
+    """SHA-256 of a base's weights, of each file where there are several; None where none are known."""
+    digests = {name: weights_digest(file) for name, file in files.items()}
+    return digests if len(digests) > 1 else next(iter(digests.values()), None)

@@ -1,0 +1,278 @@
+"""What a dataset holds and how it was made: the manifest and the shards, and whether they are still what they were.
+
+They lie in a folder, or at an address (optional: pip install fsspec, and what the address needs).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from spackle.dataset.sample import END, PhotoGroup
+from spackle.errors import InputError, reason_in_a_line
+from spackle.formats import atomic_path
+
+NAME = "manifest.json"
+FORMAT = 1  # of shards and manifest; a reader of another one refuses
+PIECE = 1 << 20  # bytes read at once
+
+
+def is_address(location: str | os.PathLike[str]) -> bool:
+    """Whether this is a URL such as s3://bucket/dataset and not a folder."""
+    return "://" in str(location)
+
+
+def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
+    """Open a file of a dataset for reading; it can be sought in.
+
+    Args:
+        location: a folder, or an address that fsspec understands.
+        name: of the file in it.
+
+    Raises:
+        InputError: it is not there or cannot be read, or fsspec is missing.
+    """
+    place = f"{str(location).rstrip('/')}/{name}"
+    try:
+        return _open_remote(place) if is_address(location) else open(os.path.join(location, name), "rb")
+    except FileNotFoundError as error:
+        raise InputError(f"{place}: not there: is {location} a dataset of `spackle dataset build`?") from error
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{place}: cannot be read: {error.strerror or reason_in_a_line(error)}") from error
+
+
+def _open_remote(url: str) -> IO[bytes]:
+    try:
+        import fsspec
+    except ImportError as error:
+        raise InputError(f"{url}: addresses need a package: pip install fsspec") from error
+    try:
+        file: Any = fsspec.open(url, "rb").open()
+        opened: IO[bytes] = file
+        return opened
+    except (ValueError, ImportError) as error:  # an unknown protocol, or one whose package is missing
+        raise InputError(f"{url}: cannot be opened: {reason_in_a_line(error)}") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleEntry:
+    """A photo in a shard."""
+
+    key: str
+    photo: str  # its name in its folder
+    offset: int  # of its first byte in the shard
+    size: int
+    sha256: str  # of those bytes
+    holes: tuple[float, ...]  # HAR of each view
+
+
+@dataclasses.dataclass(frozen=True)
+class ShardEntry:
+    """One tar file."""
+
+    file: str
+    size: int
+    sha256: str
+    samples: tuple[SampleEntry, ...]
+    passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifest:
+    """A dataset, finished or not."""
+
+    config: Mapping[str, Any]  # everything that decides what is in it
+    shards: tuple[ShardEntry, ...]
+    complete: bool
+
+    @property
+    def samples(self) -> list[tuple[ShardEntry, SampleEntry]]:
+        """All photos in their order."""
+        return [(shard, sample) for shard in self.shards for sample in shard.samples]
+
+    @property
+    def views(self) -> int:
+        """Views of all photos."""
+        return sum(len(sample.holes) for _, sample in self.samples)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over everything that is in it."""
+        return _digest(self._plain())
+
+    def save(self, folder: Path) -> None:
+        """Write manifest.json, whole or not at all."""
+        text = json.dumps(self._plain() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
+        with atomic_path(folder / NAME) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+    def _plain(self) -> dict[str, Any]:
+        counts = {"photos": len(self.samples), "views": self.views, "bytes": sum(shard.size for shard in self.shards)}
+        shards = [dataclasses.asdict(shard) for shard in self.shards]
+        content = {"format": FORMAT, "config": dict(self.config), "counts": counts, "shards": shards}
+        plain: dict[str, Any] = json.loads(json.dumps(content | {"complete": self.complete}))  # no tuples
+        return plain
+
+
+def load_manifest(location: str | os.PathLike[str]) -> Manifest:
+    """Read the manifest of a dataset in a folder or at an address.
+
+    Raises:
+        InputError: it is missing, damaged, or of another format.
+    """
+    where = f"{str(location).rstrip('/')}/{NAME}"
+    with open_in(location, NAME) as file:
+        text = file.read()
+    try:
+        content = json.loads(text)
+        if content["format"] != FORMAT:
+            raise InputError(f"{where}: format {content['format']!r} is not known here, which reads {FORMAT}")
+        recorded = content.pop("sha256")
+        shards = tuple(_shard(shard) for shard in content["shards"])
+        manifest = Manifest(dict(content["config"]), shards, bool(content["complete"]))
+        if _digest(content) != recorded or manifest.digest != recorded:
+            raise ValueError("its digest does not fit")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where}: damaged, or no manifest of a dataset: {error}") from error
+    return manifest
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
+    """What two configurations disagree on, as "key: old -> new"."""
+    found: list[str] = []
+    for key in sorted({*old, *new}):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            found += differences(a, b, f"{where}{key}.")
+        elif a != b:
+            found.append(f"{where}{key}: {_short(a)} -> {_short(b)}")
+    return found
+
+
+def _shard(content: Mapping[str, Any]) -> ShardEntry:
+    samples = [SampleEntry(**{**sample, "holes": tuple(sample["holes"])}) for sample in content["samples"]]
+    return ShardEntry(**{**content, "samples": tuple(samples), "passed_over": tuple(content["passed_over"])})
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:12] + "…"
+
+
+def shard_name(number: int) -> str:
+    """The file of a shard."""
+    return f"shard-{number:06d}.tar"
+
+
+def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
+    """Put samples one after the other into a tar file, whole or not at all.
+
+    Args:
+        parts: key and file of each sample, as `make_sample` made it.
+        target: the shard.
+        passed_over: photos that are not in it, for its entry.
+
+    Raises:
+        InputError: a part that is damaged, or a disk that is full.
+    """
+    samples: list[SampleEntry] = []
+    whole, offset = hashlib.sha256(), 0
+    with atomic_path(target) as temporary, open(temporary, "wb") as file:
+        for key, path in parts:
+            data = path.read_bytes()
+            try:
+                group = PhotoGroup.of(key, data, str(path))
+            except InputError as error:
+                raise InputError(f"{error}: delete it, and the same command makes it again") from error
+            digest = hashlib.sha256(data).hexdigest()
+            samples.append(SampleEntry(key, group.facts["photo"]["name"], offset, len(data), digest, group.holes))
+            file.write(data)
+            whole.update(data)
+            offset += len(data)
+        file.write(END)
+        whole.update(END)
+    size = offset + len(END)
+    return ShardEntry(target.name, size, whole.hexdigest(), tuple(samples), tuple(passed_over))
+
+
+def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
+    """One photo's files out of an open shard, held to their digest.
+
+    Raises:
+        InputError: they are damaged or cut off.
+    """
+    try:
+        file.seek(sample.offset)
+        data = file.read(sample.size)
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read: {error.strerror or error}") from error
+    if hashlib.sha256(data).hexdigest() != sample.sha256:
+        raise InputError(
+            f"{where}: sample {sample.key} ({sample.photo}) is damaged: `spackle dataset verify` says more"
+        )
+    return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")
+
+
+def problems(
+    location: str | os.PathLike[str], manifest: Manifest, progress: Callable[[int, int], None]
+) -> Iterator[str]:
+    """Read every byte of a dataset and say in a line each what is wrong.
+
+    Args:
+        location: folder or address.
+        manifest: of the dataset.
+        progress: called with (bytes read, of how many).
+    """
+    total, done = sum(shard.size for shard in manifest.shards), 0
+    if not manifest.complete:
+        yield "the dataset is not finished: the command that builds it goes on"
+    for shard in manifest.shards:
+        try:
+            with open_in(location, shard.file) as file:
+                yield from (f"{shard.file}: {line}" for line in _shard_problems(file, shard))
+        except InputError as error:
+            yield str(error)
+        except OSError as error:
+            yield f"{shard.file}: cannot be read: {error.strerror or error}"
+        done += shard.size
+        progress(done, total)
+
+
+def _shard_problems(file: IO[bytes], shard: ShardEntry) -> Iterator[str]:
+    """Each sample is held to its own digest, and the end of the file to what it must be."""
+    size = file.seek(0, os.SEEK_END)
+    if size != shard.size:
+        yield f"{size:,} bytes instead of {shard.size:,}"
+    file.seek(0)
+    whole, named = hashlib.sha256(), False
+    for sample in shard.samples:
+        digest = hashlib.sha256()
+        for piece in _pieces(file, sample.size):
+            digest.update(piece)
+            whole.update(piece)
+        if digest.hexdigest() != sample.sha256:
+            named = True
+            yield f"sample {sample.key} ({sample.photo}) is damaged"
+    for piece in _pieces(file, len(END)):
+        whole.update(piece)
+    if whole.hexdigest() != shard.sha256 and not named:
+        yield "damaged after its last sample"
+
+
+def _pieces(file: IO[bytes], size: int) -> Iterator[bytes]:
+    while size and (piece := file.read(min(PIECE, size))):
+        yield piece
+        size -= len(piece)

@@ -1,0 +1,226 @@
+"""ProPainter, the paper's inpainter (optional: pip install 'spackle-nvs[propainter]').
+
+It follows the flow of a video into the holes, and draws what no frame shows. Its networks are pytorchcv's, which
+fetches weights by itself for networks that it builds; so it is handed networks that have theirs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import max_pool2d
+
+from spackle.camera import Camera
+from spackle.device import enough_memory, pick_device
+from spackle.errors import InputError, reason_in_a_line
+from spackle.image import MAX_SIDE, check_file, working_size
+from spackle.inpaint.protocol import InpainterOptions, ViewStack
+
+NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; so their files begin
+SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
+SIDE = 640  # pixels of the long side at which it works; it was trained on 432×240
+MIN_SIDE = 128  # of what the networks are given: the coarsest map of the flow, 1/64, needs two cells each way
+MULTIPLE = 8  # of that
+DILATION = 4  # pixels around a hole that count as hole, the authors' choice: its rim is a mixture
+ITERATIONS = 20  # of the flow, the authors' choice
+
+
+class PropainterInpainter:
+    """Completes all views of a photo at once, as the frames of one video."""
+
+    name = "propainter"
+    network: ClassVar[bool] = True
+    notice: ClassVar[str] = (
+        "ProPainter and its weights are S-Lab's, for non-commercial use only: "
+        "https://github.com/sczhou/ProPainter/blob/main/LICENSE"
+    )
+
+    def __init__(self, options: InpainterOptions) -> None:
+        """Find the package, and load the weights. What it draws is enlarged from `options.side` to the views' size.
+
+        Raises:
+            InputError: a side that cannot be, no package, or weights that are missing, damaged or others.
+        """
+        self._side = SIDE if options.side is None else options.side
+        if not MIN_SIDE <= self._side <= MAX_SIDE:
+            raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self._side}")
+        version = _package_version()
+        self.files = weight_files(options.weights)
+        self._networks = [_network(name, file) for name, file in self.files.items()]
+        self._device = pick_device(options.device)
+        self.version = f"1, pytorchcv {version}, long side {self._side}"
+
+    @torch.no_grad()
+    def complete(self, views: ViewStack) -> Tensor:
+        """The colours of the completed video, in the holes.
+
+        Raises:
+            InputError: too little memory, or no finite colours.
+        """
+        if not bool(views.mask.any()):
+            return views.rgb
+        height, width = views.mask.shape[1:]
+        small = working_size(width, height, self._side)[::-1]
+        order = path_order(views.cameras)
+        frames = F.interpolate(views.rgb[order].permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
+        holes = F.interpolate(views.mask[order, None].float(), small, mode="area") > 0  # a thin one is not lost
+        try:
+            with enough_memory():
+                filled = self._fill(frames.clamp(0, 1), holes.float()).to(views.rgb)
+        except InputError as error:
+            raise InputError(f"ProPainter: too little memory at {self._side} pixels: lower --inpainter-side") from error
+        if not bool(filled.isfinite().all()):
+            raise InputError("ProPainter: its colours are not finite: give the published --inpainter-weights")
+        targets = torch.empty_like(views.rgb)
+        targets[order] = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
+        return torch.where(views.mask[..., None], targets, views.rgb)
+
+    def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
+        """Frames [V, 3, h, w] in 0..1, drawn anew in and around the holes [V, 1, h, w], which are 1."""
+        from pytorchcv.models.propainter_stream import ProPainterIterator, TensorSequencer
+
+        count, _, height, width = frames.shape
+        turns = [*range(count), *[0] * (count == 1)]  # a video has two frames
+        margin = (0, padded(width) - width, 0, padded(height) - height)
+        frames, holes = (F.pad(x[turns].to(self._device), margin, mode="replicate") for x in (frames, holes))
+        video = ProPainterIterator(
+            TensorSequencer(2 * frames - 1),
+            TensorSequencer(dilated(holes)),
+            *(network.to(self._device) for network in self._networks),
+            use_cuda=self._device.type == "cuda",
+            step=len(turns),
+        )
+        drawn: Tensor = torch.cat(list(video))
+        return (drawn[:count, :, :height, :width] + 1) / 2
+
+
+def path_order(cameras: Sequence[Camera]) -> list[int]:
+    """Views as a flight along the path meets them: the first one, the photo's, is put where it is the least detour."""
+    eyes = torch.stack([camera.position.double() for camera in cameras])
+    others = list(range(1, len(cameras)))
+    orders = [[*others[:place], 0, *others[place:]] for place in range(len(cameras))]
+    return min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))
+
+
+def padded(side: int) -> int:
+    """Pixels of a side that the networks can take."""
+    return max(MIN_SIDE, -(-side // MULTIPLE) * MULTIPLE)
+
+
+def dilated(holes: Tensor) -> Tensor:
+    """Holes [V, 1, h, w] with all that is at most DILATION steps away, up, down, left or right."""
+    for _ in range(DILATION):
+        holes = torch.maximum(max_pool2d(holes, (3, 1), 1, (1, 0)), max_pool2d(holes, (1, 3), 1, (0, 1)))
+    return holes
+
+
+def _package_version() -> str:
+    try:
+        import pytorchcv
+        import pytorchcv.models.propainter_stream
+    except Exception as error:  # a torchvision of another build raises RuntimeError
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("pytorchcv"):
+            raise InputError("--inpainter propainter needs a package: pip install 'spackle-nvs[propainter]'") from error
+        raise InputError(
+            f"--inpainter propainter: torchvision cannot be imported ({reason_in_a_line(error)}): "
+            f"install the one that was built for torch {torch.__version__}, from where this torch came"
+        ) from error
+    return str(pytorchcv.__version__)
+
+
+def _network(name: str, file: Path) -> nn.Module:
+    from pytorchcv.models.propainter import propainter
+    from pytorchcv.models.propainter_rfc import propainter_rfc
+    from pytorchcv.models.raft import raft_things
+
+    if name == "raft_things":
+        network: nn.Module = raft_things(in_normalize=False, iters=ITERATIONS)
+    else:
+        network = propainter_rfc() if name == "propainter_rfc" else propainter()
+    give_weights(network, name, file)
+    return network
+
+
+def weight_files(folder: Path | None) -> dict[str, Path]:
+    """The file of each of `NETWORKS`: NAME.pth, NAME-….pth as it is published, or .safetensors.
+
+    Args:
+        folder: where they lie, unpacked.
+
+    Raises:
+        InputError: there is no such folder, or not one file of each.
+    """
+    wanted = f"{', '.join(NETWORKS)}: one .pth file of each, unpacked from {SOURCE}"
+    if folder is None:
+        raise InputError(f"--inpainter propainter: has no weights: give --inpainter-weights FOLDER with {wanted}")
+    try:
+        names = sorted(file.name for file in folder.iterdir())
+    except (OSError, ValueError) as error:
+        raise InputError(f"--inpainter-weights {folder}: no folder that can be read: give one with {wanted}") from error
+    files = {}
+    for network in NETWORKS:
+        own = [name for name in names if re.fullmatch(rf"{network}(-.*)?\.(pth|safetensors)", name)]
+        if len(own) != 1:
+            found = f"{own[0]} and {own[1]}" if own else f"no {network}-….pth"
+            raise InputError(f"--inpainter-weights {folder}: holds {found}: it should hold {wanted}")
+        files[network] = folder / own[0]
+    return files
+
+
+def give_weights(network: nn.Module, name: str, file: Path) -> None:
+    """Fill a network from its file and freeze it; half precision is widened.
+
+    As in the package that publishes them, tensors that the network does not have are ignored. Those that are no
+    floats are its own constants, and stay as they are.
+
+    Raises:
+        InputError: a missing or broken file, or one of another network.
+    """
+    found, ours = _read(file), network.state_dict()
+    used = {key: tensor for key, tensor in ours.items() if tensor.is_floating_point()}
+    wrong = [key for key, tensor in used.items() if not _fits(found.get(key), tensor)]
+    if wrong:
+        raise InputError(
+            f"{file}: not the weights of {name}: {len(wrong)} of {len(used)} tensors are missing, of another shape "
+            f"or not finite, such as {wrong[0]}: give the file of that name from {SOURCE}"
+        )
+    network.load_state_dict(ours | {key: found[key].float() for key in used})
+    network.eval().requires_grad_(False)
+
+
+def _read(file: Path) -> dict[str, Tensor]:
+    """Whatever is in a stranger's file, its kind told by its first bytes."""
+    check_file(file, "weight file")
+    try:
+        with open(file, "rb") as opened:
+            head = opened.read(9)
+        if head[8:] == b"{":
+            return dict(load_file(file))
+        named = re.search(r"-\d{4}-([0-9a-f]{8})\.pth$", file.name)  # as published: the first digits of its SHA-1
+        if named and not hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest().startswith(named[1]):
+            raise ValueError("its SHA-1 is not the one in its name")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about kinds of tensors that are refused
+            return dict(torch.load(file, map_location="cpu", weights_only=True))
+    except Exception as error:  # a stranger's bytes can raise anything
+        reason = reason_in_a_line(error)
+        raise InputError(f"{file}: cannot be read as weights ({reason}): unpack the file of {SOURCE} again") from error
+
+
+def _fits(value: object, ours: Tensor) -> bool:
+    """Whether a file's value is a plain tensor that can stand for ours."""
+    if type(value) not in (Tensor, nn.Parameter):  # others can hide what they are
+        return False
+    assert isinstance(value, Tensor)
+    if value.layout != torch.strided or value.device.type != "cpu":
+        return False
+    return value.is_floating_point() and value.shape == ours.shape and bool(value.float().isfinite().all())
