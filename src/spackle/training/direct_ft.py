@@ -20,13 +20,13 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
+from spackle.dataset.reader import PseudoFiles
+from spackle.dataset.sample import PseudoSample
 from spackle.device import enough_memory
 from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.dataset.reader import PseudoFiles
-from spackle.dataset.sample import PseudoSample
 from spackle.render import Renderer
 from spackle.training.data import digest_of
 from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod

@@ -17,9 +17,9 @@ from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
+from spackle.dataset.reader import PseudoFiles
 from spackle.errors import InputError
 from spackle.image import film_to_pixels, load_photo
-from spackle.dataset.reader import PseudoFiles
 from spackle.render import Renderer
 from spackle.training.composites import composite
 from spackle.training.reverse_view import reverse_view, seen_from, with_backing
