@@ -23,8 +23,8 @@ from spackle.formats import save_png
 from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual
 from spackle.scene import scene_path
-from spackle.training.distance import hole_distance, hole_psnr
 from spackle.training.features import FeatureNet, load_features
+from spackle.training.losses import hole_distance, hole_psnr
 from spackle.training.sources import load_pair
 
 DISPARITIES = (0.3, 0.4, 0.5)

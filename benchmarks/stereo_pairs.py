@@ -20,7 +20,7 @@ from torch import Tensor
 from spackle import complete, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.lift import lift
 from spackle.scene import scene_path
-from spackle.training.distance import hole_psnr
+from spackle.training.losses import hole_psnr
 from spackle.training.sources import load_pair
 
 DISPARITY = 0.3

@@ -120,7 +120,7 @@ def relit(rng: Rng, rgb: Tensor) -> Tensor:
 SAME = 1.05  # neighbours whose depths differ by less are of one surface
 
 
-def seen_from_the_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+def warp_to_right(depth: Tensor, valid: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
     """Each pixel's depth carried to where the right photo shows it; the nearest of several stays.
 
     Args:
@@ -179,7 +179,7 @@ class Measured:
             return reduced(rgb, stored.depth, stored.valid, side)
         moved = beside.world_to_camera[0, 3] * camera.K[0, 0]
         shift = beside.K[0, 2] - camera.K[0, 2] + moved / stored.depth.clamp_min(1e-6)
-        return reduced(other, *seen_from_the_right(stored.depth, stored.valid, shift), side)
+        return reduced(other, *warp_to_right(stored.depth, stored.valid, shift), side)
 
 
 @dataclasses.dataclass(frozen=True)

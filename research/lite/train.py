@@ -25,7 +25,7 @@ from spackle.bases.lite.network import LiteNet
 from spackle.errors import InputError
 from spackle.output_folder import make_folder
 from spackle.progress import Reporter
-from spackle.training.plan import CACHE, Plan, RunContext, Start, parameters
+from spackle.training.method import CACHE, Plan, RunContext, Start, parameters
 from spackle.training.recipe import load_recipe_as
 from spackle.training.run import train
 from spackle.training.trainer import adamw

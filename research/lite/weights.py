@@ -170,7 +170,7 @@ STEPS = 127  # of eight bits, to either side of zero
 
 
 def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
-    """Write networks into one file, which `spackle.bases.lite.weights.load_networks` reads.
+    """Write networks into one file, which `spackle.bases.lite.network.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
     precision. `Look.network` counts them in this order.

@@ -46,11 +46,10 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import get_renderer
 from spackle.render.reference import ReferenceRenderer
-from spackle.training.callbacks import Callbacks
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
 from spackle.training.method import Objective, ViewBatch
 from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
-from spackle.training.trainer import Trainer
+from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
 

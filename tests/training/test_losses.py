@@ -10,13 +10,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spackle.training.distance import hole_distance, hole_psnr
 from spackle.training.losses import (
     LossWeights,
     alpha_loss,
     color_loss,
     covered,
     dilate,
+    hole_distance,
+    hole_psnr,
     perceptual_loss,
     preserve_loss,
     total_loss,

@@ -33,9 +33,16 @@ from spackle.training import composites, sources
 from spackle.training.composites import composite
 from spackle.training.data import Cache
 from spackle.training.residual_method import MIN_AUX, training_cells
-from spackle.training.reverse_view import reverse_view, seen_from, with_backing
 from spackle.training.sample import HALVED, HOLE_SHARE, Sample, load_sample, random_crops, save_sample
-from spackle.training.sources import Composites, RgbdFrames, StereoPairs, load_pair
+from spackle.training.sources import (
+    Composites,
+    RgbdFrames,
+    StereoPairs,
+    load_pair,
+    reverse_view,
+    seen_from,
+    with_backing,
+)
 
 CPU = CpuRenderer()
 PROPERTY = settings(deadline=None, max_examples=40)

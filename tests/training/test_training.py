@@ -25,13 +25,12 @@ from spackle.downloads import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet, load_residual
-from spackle.training.callbacks import Callbacks
 from spackle.training.data import SampleFiles
 from spackle.training.method import Objective
 from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
 from spackle.training.residual_method import MIN_AUX, ResidualMethod, aux_of, complete_samples, training_cells
 from spackle.training.sample import Sample, load_sample, save_sample
-from spackle.training.trainer import Trainer
+from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
 

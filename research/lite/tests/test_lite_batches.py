@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from depth_loss import DepthJudge, DepthLossWeights
-from frames import MINGLED_SCALE, Frame, Measured, mingled, seen_from_the_right
+from frames import MINGLED_SCALE, Frame, Measured, mingled, warp_to_right
 from lite_data import write_data
 from method import LiteMethod, Prefetch
 from mixture import GuessedPhotos, Kept, Mixture, sure_inverse_depth
@@ -22,6 +22,8 @@ from spackle.bases.lite.base import LiteBase
 from spackle.errors import InputError
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import RgbdFolder
+
+pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
 
 @pytest.fixture(scope="module")
@@ -134,13 +136,13 @@ def test_the_right_photo_has_the_depth_of_the_left_one() -> None:
     """A near thing moves by 3 pixels and hides what is there; what it uncovers is not known."""
     depth = torch.tensor([[8.0, 8.0, 8.0, 8.0, 2.0, 2.0, 8.0, 8.0]])
     valid = torch.tensor([[True, True, True, True, True, True, True, False]])
-    seen, known = seen_from_the_right(depth, valid, -6 / depth + 0.75)  # 0, and 2.25 to the left
+    seen, known = warp_to_right(depth, valid, -6 / depth + 0.75)  # 0, and 2.25 to the left
     assert known.tolist() == [[True, True, True, True, False, False, True, False]]
     assert seen[known].tolist() == [8, 8, 2, 2, 8]
     # A slope that is seen wider has a crack a pixel wide; with nothing in it, or what is behind, it is closed.
     slope, shift = torch.tensor([[9.0, 2.0, 2.02, 2.04, 2.06]]), torch.tensor([[3.0, 0.0, 0.0, 1.0, 1.0]])
     for behind in (True, False):
-        seen, known = seen_from_the_right(slope, torch.tensor([[behind, True, True, True, True]]), shift)
+        seen, known = warp_to_right(slope, torch.tensor([[behind, True, True, True, True]]), shift)
         assert known.tolist() == [[False, True, True, True, True]]
         torch.testing.assert_close(seen[0, 1:], torch.tensor([2.0, 2.02, 2.04, 2.04]))
 

@@ -19,6 +19,8 @@ from textures import FIRST_SHAPE, PEAK, RING, SIDE, WHOLE, textures
 
 from spackle.errors import InputError
 
+pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
+
 Kind = Callable[[np.random.Generator], Scene]
 
 

@@ -23,6 +23,8 @@ from weights import load_encoder
 from spackle.bases.lite.network import STAGES, TAPS, Encoder, Size
 from spackle.errors import InputError
 
+pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
+
 Floats = NDArray[np.float32]
 
 

@@ -26,6 +26,8 @@ from weights import EVEN, balanced, save_networks, start_decoder
 from spackle.bases.lite.network import LiteNet, load_networks
 from spackle.training.recipe import load_recipe_as
 
+pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
+
 pytest.importorskip("yaml")
 
 LITE = Path(__file__).parent.parent
@@ -210,7 +212,6 @@ def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple
     assert "recipe.yaml: encoder is unknown; there are data, loss, optim" in done.err
 
 
-@pytest.mark.slow
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     options = ["optim.steps=2", "run.validate_every=2"]
     with socket.socket() as free:

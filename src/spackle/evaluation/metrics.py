@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import reason_in_a_line
-from spackle.training.distance import hole_psnr
+from spackle.training.losses import hole_psnr
 
 OWN = "own"
 

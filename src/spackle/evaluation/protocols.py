@@ -19,8 +19,8 @@ from spackle.evaluation.results import Row
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.training.distance import hole_distance
 from spackle.training.features import FeatureNet
+from spackle.training.losses import hole_distance
 
 NEAR = "near"
 

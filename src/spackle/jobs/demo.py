@@ -27,7 +27,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.residual.network import shipped_network
 from spackle.scene import Scene, complete, scene_path
-from spackle.training.distance import hole_psnr
+from spackle.training.losses import hole_psnr
 
 FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
 DISPARITY = 0.3

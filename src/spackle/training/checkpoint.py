@@ -62,9 +62,8 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     Raises:
         InputError: where it cannot be written, or the disk is full; what was there stays.
     """
-    state = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
     progress = dataclasses.asdict(checkpoint.progress)
-    state["progress"] = {**progress, "history": list(progress["history"])}
+    state = {**vars(checkpoint), "progress": {**progress, "history": list(progress["history"])}}
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
     torch.save(state, buffer)
     newest = folder / NEWEST
@@ -85,7 +84,9 @@ def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
         if not path.exists():
             continue
         try:
-            return _read(path), problem
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            history = tuple(state["progress"].pop("history"))
+            return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)}), problem
         except Exception as error:  # a damaged file can raise anything
             problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
     if problem:
@@ -93,36 +94,22 @@ def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
     return None, None
 
 
-def _read(path: Path) -> Checkpoint:
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    history = tuple(state["progress"].pop("history"))
-    return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)})
-
-
 def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
     """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
-    if checkpoint.method != method:
-        raise InputError(
-            f"{folder}: holds a run of --method {checkpoint.method}, not of {method}: choose another with -o, "
-            "or --overwrite to start anew"
-        )
     other = differences(checkpoint.recipe, recipe)
     if not other and checkpoint.digest != digest:
         other = ["the files that data names"]
-    if other:
-        more = f" and {len(other) - 1} more" if len(other) > 1 else ""
-        raise InputError(
-            f"{folder}: holds a run of another recipe ({other[0]}{more} differs): choose another with -o, "
-            "or --overwrite to start anew"
-        )
+    if checkpoint.method != method:
+        what = f"--method {checkpoint.method}, not of {method}"
+    elif other:
+        what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
+    else:
+        return
+    raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
 
 
 def export_weights(network: nn.Module, path: Path) -> None:
-    """Write weights with half precision, as `spackle.residual.network.load_residual` reads them.
-
-    Raises:
-        InputError: where the file cannot be written.
-    """
+    """Write weights with half precision, as `load_residual` reads them; InputError where that cannot be."""
     tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
     with atomic_path(path) as temporary:
         temporary.write_bytes(save(tensors))

@@ -29,8 +29,17 @@ from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.render import Renderer
 from spackle.training.data import digest_of
-from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod
-from spackle.training.plan import Plan, RunContext, Start, load_objective, parameters
+from spackle.training.method import (
+    PICTURED,
+    Objective,
+    Plan,
+    RunContext,
+    Start,
+    ViewBatch,
+    ViewMethod,
+    load_objective,
+    parameters,
+)
 from spackle.training.recipe import DataRecipe, Recipe
 from spackle.training.sources import PseudoViews
 
@@ -89,28 +98,16 @@ class PseudoPhotos:
 
     def widest(self, place: int) -> list[PseudoSample]:
         """A photo's own view and the one with the largest hole; InputError likewise."""
-        holes: Sequence[float] = self.files.samples[place][1].holes
-        group = self.files.group(place)
+        group, holes = self.files.group(place), self.files.samples[place][1].holes
         return [group.view(index) for index in (0, int(np.argmax(holes)))]
-
-    def name(self, place: int) -> str:
-        """What a photo is called in its folder."""
-        return self.files.samples[place][1].photo
 
 
 def render_photo(
     decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoSample], renderer: Renderer
 ) -> ViewBatch:
-    """Predict a photo's Gaussians anew, and draw them in some of its views.
+    """Predict a photo's Gaussians anew, and draw them in some of its views; InputError where memory is too small.
 
-    Args:
-        decoder: the only thing that gets gradients.
-        base: everything before it.
-        views: of one photo.
-        renderer: draws.
-
-    Raises:
-        InputError: too little memory.
+    Only the decoder, which follows on `base`, gets gradients.
     """
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
@@ -176,7 +173,7 @@ class DirectFt(ViewMethod):
         """Write which photos and views a step had, a file each."""
         for item in items:
             views = self._drawn(step, item)
-            facts = {"step": step, "photo": self.photos.name(self.photos.learned[item])}
+            facts = {"step": step, "photo": self.photos.files.samples[self.photos.learned[item]][1].photo}
             with atomic_path(folder / f"{views[0].key}.json") as temporary:
                 text = json.dumps({**facts, "views": [view.index for view in views]}, indent=1)
                 temporary.write_text(text + "\n", encoding="utf-8")

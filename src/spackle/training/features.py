@@ -27,6 +27,7 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of
 CAFFE_MEAN = (104.0, 117.0, 123.0)  # of BGR 0..255
 
 RESNET50_HEAD: Shapes = {"fc.weight": (1000, 2048), "fc.bias": (1000,)}
+COUNTER = "num_batches_tracked"
 SQUEEZENET_HEAD: Shapes = {"conv10.w": (1000, 512, 1, 1), "conv10.b": (1000,)}
 
 
@@ -42,10 +43,7 @@ class FeatureNet(Protocol):
 
 
 class _Frozen(nn.Module):
-    """Never trained: no gradients to its own numbers, and normalisation by stored statistics whatever is asked."""
-
-    def _freeze(self) -> None:
-        self.requires_grad_(False).eval()
+    """Never trained: normalisation by stored statistics whatever is asked."""
 
     def train(self, mode: bool = True) -> _Frozen:
         return super().train(False)
@@ -82,7 +80,7 @@ class ResNet50(_Frozen):
         self.conv1, self.bn1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64)
         self.layer1, self.layer2 = _layer(64, 64, 3, 1), _layer(256, 128, 4, 2)
         self.layer3, self.layer4 = _layer(512, 256, 6, 2), _layer(1024, 512, 3, 2)
-        self._freeze()
+        self.requires_grad_(False).eval()
 
     def forward(self, images: Tensor) -> list[Tensor]:
         mean, std = _channels(IMAGENET_MEAN, images), _channels(IMAGENET_STD, images)
@@ -99,10 +97,8 @@ class Fire(nn.Module):
     def __init__(self, inside: int, squeeze: int) -> None:
         super().__init__()
         self.conv1x1_1 = nn.Conv2d(inside, squeeze, 1)
-        self.conv1x1_2, self.conv3x3_2 = (
-            nn.Conv2d(squeeze, 4 * squeeze, 1),
-            nn.Conv2d(squeeze, 4 * squeeze, 3, padding=1),
-        )
+        self.conv1x1_2 = nn.Conv2d(squeeze, 4 * squeeze, 1)
+        self.conv3x3_2 = nn.Conv2d(squeeze, 4 * squeeze, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.conv1x1_1(x).relu()
@@ -125,7 +121,7 @@ class SqueezeNet(_Frozen):
         self.fire2, self.fire3, self.fire4 = Fire(96, 16), Fire(128, 16), Fire(128, 32)
         self.fire5, self.fire6, self.fire7 = Fire(256, 32), Fire(256, 48), Fire(384, 48)
         self.fire8, self.fire9 = Fire(384, 64), Fire(512, 64)
-        self._freeze()
+        self.requires_grad_(False).eval()
 
     def forward(self, images: Tensor) -> list[Tensor]:
         conv1 = self.conv1(255 * images.flip(1) - _channels(CAFFE_MEAN, images)).relu()
@@ -156,16 +152,13 @@ def load_features(
         raise InputError(f"{name}: its weights are not given: name their file, or choose none")
     check_file(path, "weight file")
     network: ResNet50 | SqueezeNet = ResNet50() if name == "resnet50" else SqueezeNet()
-    ours = network.state_dict()
-    counters = {
-        key: value for key, value in ours.items() if key.endswith("num_batches_tracked")
-    }  # older files lack them
-    names = {_file_name(key, name): key for key in ours if key not in counters}
-    found = _read(path, name)
-    head = RESNET50_HEAD if name == "resnet50" else SQUEEZENET_HEAD
+    state = network.state_dict()
+    ours = {key: value for key, value in state.items() if not key.endswith(COUNTER)}  # older files lack counters
+    found = {key: value for key, value in _read(path, name).items() if key not in state or key in ours}
+    names = {_file_name(key, name): key for key in ours}
     expected = {file_name: tuple(ours[key].shape) for file_name, key in names.items()}
-    _check({key: value for key, value in found.items() if key not in counters}, expected, head, path, name)
-    network.load_state_dict(counters | {key: found[file_name].float() for file_name, key in names.items()})
+    _check(found, expected, RESNET50_HEAD if name == "resnet50" else SQUEEZENET_HEAD, path, name)
+    network.load_state_dict({key: found[file_name].float() for file_name, key in names.items()}, strict=False)
     return network.to(device)
 
 
@@ -189,7 +182,7 @@ def _read(path: Path, network: str) -> dict[str, Tensor]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about kinds of tensors that are refused
             loaded = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(loaded, Mapping) or not all(map(_is_plain, loaded.values())):
+        if not isinstance(loaded, Mapping) or not all(map(_is_dense, loaded.values())):
             raise TypeError("it holds more than named tensors")
         return {str(name): value for name, value in loaded.items()}
     except Exception as error:  # a stranger's bytes can raise anything
@@ -198,8 +191,7 @@ def _read(path: Path, network: str) -> dict[str, Tensor]:
         raise InputError(f"{path}: cannot be read as {kind} ({reason}): give the weights of {network} again") from error
 
 
-def _is_plain(value: object) -> bool:
-    """A dense tensor with its numbers at hand."""
+def _is_dense(value: object) -> bool:
     return isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
 
 

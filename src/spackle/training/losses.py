@@ -1,13 +1,17 @@
-"""The four terms that the residual is trained with, as pure functions: paper, "Training Details and Loss Weights".
+"""The four terms of eq. 6 as pure functions (paper, "Training Details and Loss Weights"), and two numbers that are
+reported, neither of them trained on: how far a filled hole is from the truth.
 
-Each is a mean over the pixels of an image that it speaks about, then over the images of the batch: a small hole counts
-as much as a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the
-mean of the losses of its images, however they are divided between processes. Where `valid` says that the target is
-not known it may be anything, NaN too: it has no part in a loss, nor in a gradient.
+They compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with the `target` [B, H, W, 3] in
+the `hole` [B, H, W] bool, and with `base_rgb` [B, H, W, 3], the same view of the base alone, outside of it. Each is a
+mean over the pixels of an image that it speaks about, then over the images of the batch: a small hole counts as much as
+a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean of the
+losses of its images, however processes divide them. Where `valid` says that the target is unknown it may be anything,
+NaN too: it has no part in a loss, nor in a gradient.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +21,7 @@ from torch import Tensor
 from spackle.training.features import FeatureNet
 
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
+NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhere
 TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
 
 
@@ -34,49 +39,24 @@ PAPER_WEIGHTS = LossWeights()
 
 
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor) -> Tensor:
-    """mean |rgb - target| over a hole's pixels and the channels ("Training Details and Loss Weights").
-
-    Args:
-        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
-        target: [B, H, W, 3] what it should show.
-        hole: [B, H, W] bool.
-
-    Returns:
-        [] the images' mean, in which one without a hole is 0.
-    """
+    """[] mean |rgb - target| over a hole's pixels and the channels."""
     # Cleared before abs: the gradient of an unknown (NaN) difference would be NaN times zero.
     apart = torch.where(hole[..., None], rgb - target, 0).abs()
     return _mean_of_images(apart.mean(-1), hole)
 
 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
-    """mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1 ("Training Details and Loss Weights").
+    """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1.
 
     The clamp holds the loss under 6.9 and its gradient under 1000. It costs nothing: a pixel below it shows no
     Gaussian at all, because a splat under 1/255 is not drawn.
-
-    Args:
-        alpha: [B, H, W] opacity of the completed view, 0..1.
-        hole: [B, H, W] bool.
-
-    Returns:
-        [] the images' mean, in which one without a hole is 0.
     """
     opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
     return _mean_of_images(-opaque.log(), hole)
 
 
 def preserve_loss(rgb: Tensor, base_rgb: Tensor, hole: Tensor) -> Tensor:
-    """mean |rgb - base_rgb| over pixels outside of the hole, and channels ("Training Details and Loss Weights").
-
-    Args:
-        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
-        base_rgb: [B, H, W, 3] the same view of the base alone; detached here.
-        hole: [B, H, W] bool.
-
-    Returns:
-        [] the images' mean, in which one that is all hole is 0.
-    """
+    """[] mean |rgb - base_rgb| over pixels outside of the hole, and channels; no gradient goes to `base_rgb`."""
     return color_loss(rgb, base_rgb.detach(), ~hole)
 
 
@@ -90,7 +70,7 @@ def perceptual_loss(
     size: int | None = 512,
     valid: Tensor | None = None,
 ) -> Tensor:
-    """Feature reconstruction and Gram statistics near the hole ("Training Details and Loss Weights").
+    """[] feature reconstruction and Gram statistics near the hole.
 
     Near is the hole grown by a max-pool of `dilation`; elsewhere the prediction is replaced by the target. For each
     layer, F and T are the features [C, h, w] of prediction and target, both divided by the root mean square of T (one
@@ -104,15 +84,10 @@ def perceptual_loss(
 
     Args:
         features: the frozen network.
-        rgb: [B, H, W, 3] the completed view, sRGB 0..1.
-        target: [B, H, W, 3] what it should show.
-        hole: [B, H, W] bool.
+        rgb, target, hole: as above.
         dilation: side of the max-pool in pixels of `hole`, odd; 1 grows nothing.
         size: the longer side of the images that the network sees; None leaves them as they are.
         valid: [B, H, W] bool, where the target is known; elsewhere both images show the prediction, and nothing counts.
-
-    Returns:
-        [] the images' mean, in which one without a hole is 0.
 
     Raises:
         ValueError: an even dilation.
@@ -142,10 +117,10 @@ def total_loss(
     dilation: int = 21,
     size: int | None = 512,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum that is minimised ("Training Details and Loss Weights").
+    """The weighted sum that is minimised, eq. 6.
 
     Args:
-        rgb, alpha, target, base_rgb, hole: as in the terms above.
+        rgb, alpha, target, base_rgb, hole: as above.
         features: None leaves the perceptual term out.
         weights: one number for each term.
         valid: [B, H, W] bool, where the target is known; colour and perceptual terms look at hole & valid. Opacity
@@ -165,6 +140,53 @@ def total_loss(
         terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size, valid=valid)
     total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
     return total, {name: term.detach() for name, term in terms.items()}
+
+
+@torch.no_grad()
+def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
+    """Perceptual distance inside a hole, like LPIPS without its learned weights; 0 is equal, lower is better.
+
+    Outside of the hole the prediction is replaced by the target, so that only the hole's content counts. For each layer
+    the feature vectors of both images are scaled to unit length along the channels; the squared difference (0 to 2 a
+    cell, for features that are not negative) is averaged over the cells by the share of each that is hole, not dilated,
+    and the layers are summed. The layers are the network's own: `SqueezeNet` has conv1, fire4, fire8, fire9 (0 to 8 in
+    all), `ResNet50` layer1 to layer4. Numbers of different networks do not compare, nor do they with published LPIPS.
+
+    Args:
+        features: the network to look with.
+        rgb: [H, W, 3] the completed view, sRGB 0..1.
+        target: [H, W, 3] the truth, finite everywhere.
+        hole: [H, W] bool.
+
+    Returns:
+        The distance; NaN where there is no hole.
+    """
+    if not hole.any():
+        return math.nan
+    shown = torch.where(hole[..., None], rgb, target)
+    total = 0.0
+    for both in features(torch.stack([shown, target]).movedim(-1, 1)):  # [2, C, h, w]
+        ours, theirs = both / both.norm(dim=1, keepdim=True).clamp_min(NO_LENGTH)
+        weight = covered(hole[None], both)[0, 0]
+        total += float(((ours - theirs).square().sum(0) * weight).sum() / weight.sum())
+    return total
+
+
+def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
+    """-10 log10 of the mean squared difference over a hole's pixels and the channels, in dB; higher is better.
+
+    Args:
+        rgb: [H, W, 3] the completed view, sRGB 0..1.
+        target: [H, W, 3] the truth.
+        hole: [H, W] bool.
+
+    Returns:
+        Decibels; infinite where both are equal, NaN where there is no hole.
+    """
+    if not hole.any():
+        return math.nan
+    error = float((rgb - target)[hole].double().square().mean())
+    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def dilate(mask: Tensor, side: int) -> Tensor:

@@ -1,24 +1,29 @@
-"""What is trained, and on what, as the trainer sees it: it knows of items and losses, not of Gaussians."""
+"""What is trained, and on what, as the trainer sees it: it knows of items and losses, not of Gaussians.
+
+`Plan` and `Start` are what each method needs before its first step, `RunContext` where a run takes place.
+"""
 
 from __future__ import annotations
 
 import abc
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
-from spackle.render import Renderer
+from spackle.device import pick_dtype
+from spackle.progress import Reporter
+from spackle.render import Renderer, get_renderer
 from spackle.residual.hole_features import hole_area_ratio
-from spackle.training.distance import hole_psnr
-from spackle.training.features import FeatureNet
-from spackle.training.losses import total_loss
+from spackle.training.features import FeatureNet, load_features
+from spackle.training.losses import hole_psnr, total_loss
 from spackle.training.ranks import Ranks
-from spackle.training.recipe import LossRecipe
+from spackle.training.recipe import AnyRecipe, LossRecipe, Recipe
 
 T = TypeVar("T")
 PICTURED = 6  # views in the picture
@@ -72,19 +77,9 @@ class Method(abc.ABC):
 
 @torch.no_grad()
 def validate(network: nn.Module, method: Method, device: torch.device, ranks: Ranks) -> dict[str, float]:
-    """Means over the validation items, each in its own right; the same in all processes.
+    """Means of the method's measures over its validation items, the same in all processes; none of what no item has.
 
-    Args:
-        network: the averaged one.
-        method: whose items and measures count.
-        device: where the processes' sums are added up.
-        ranks: the processes that share the work.
-
-    Returns:
-        The method's measures, but those that no item has.
-
-    Raises:
-        InputError: an item that cannot be read.
+    The processes share the items and add up their sums on `device`. InputError for an item that cannot be read.
     """
     totals, counts = dict.fromkeys(method.measures, 0.0), dict.fromkeys(method.measures, 0)
     mine = range(ranks.rank, method.validation_items, ranks.count)
@@ -147,11 +142,7 @@ class ViewMethod(Method):
 
     @abc.abstractmethod
     def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
-        """Views of items to learn from, with gradients; the same for the same step.
-
-        Raises:
-            InputError: an item that cannot be read.
-        """
+        """Views of items to learn from, with gradients; the same for the same step. InputError as for `loss`."""
 
     @abc.abstractmethod
     def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
@@ -164,9 +155,6 @@ class ViewMethod(Method):
     def measure(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
         """Of each view: loss and its terms; hole_psnr and seen_psnr in dB, inside of the hole against the target and
         outside of it against the base, where they are not infinite; har_before and har_after, the share of hole pixels.
-
-        Raises:
-            InputError: an item that cannot be read.
         """
         done = self.complete_validation(network, items)
         loss, terms = self.objective.total(done)
@@ -185,3 +173,57 @@ class ViewMethod(Method):
         """Decibels, where there are any, and holes."""
         psnr = "".join(f", {found[name]:.2f} dB {place}" for name, place in PLACES.items() if name in found)
         return f"{psnr}, holes {found['har_before']:.1%} -> {found['har_after']:.2%}"
+
+
+CACHE = "cache"  # in the output, where the recipe names no other place
+R_co = TypeVar("R_co", bound=AnyRecipe, covariant=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunContext(Generic[R_co]):
+    """A recipe and where it is followed."""
+
+    recipe: R_co
+    output: Path
+    reporter: Reporter  # silent but in the first process
+    ranks: Ranks
+    device: torch.device  # of the networks
+
+    @property
+    def precision(self) -> torch.dtype:
+        """What the networks compute in."""
+        return pick_dtype(self.recipe.optim.precision, self.device)
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """A method with the weights that it begins with."""
+
+    method: Method
+    network: nn.Module
+    facts: dict[str, Any]  # about it, for run.json
+    optimizer: Optimizer | None = None  # in place of the trainer's own
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What can be refused at once has been; the long work is still to come."""
+
+    method: str  # its name
+    digest: str  # as `Method.digest` will have it
+    start: Callable[[], Start]  # the long work; every process does it, InputError for files that cannot be used
+
+
+def load_objective(context: RunContext[Recipe]) -> Objective:
+    """The recipe's loss; InputError where its feature network cannot be read."""
+    loss = context.recipe.loss
+    features = load_features(loss.features if loss.perceptual else "none", loss.features_path, context.device)
+    return Objective(loss, features, get_renderer(), context.precision, context.device)
+
+
+def parameters(network: nn.Module) -> dict[str, int]:
+    """How many weights of a whole network learn and how many stay, for run.json."""
+    counts = {"learn": 0, "stay": 0}
+    for weight in network.parameters():
+        counts["learn" if weight.requires_grad else "stay"] += weight.numel()
+    return counts

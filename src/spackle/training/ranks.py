@@ -36,8 +36,6 @@ class Ranks:
 
     def mean(self, numbers: Sequence[float], device: torch.device) -> list[float]:
         """Each number's mean over the processes, the same in all of them."""
-        if self.count == 1:
-            return list(numbers)
         return [total / self.count for total in self.sum(numbers, device)]
 
     def sum(self, numbers: Sequence[float], device: torch.device) -> list[float]:
@@ -55,11 +53,7 @@ class Ranks:
 def joined_ranks(device: str) -> Iterator[Ranks]:
     """Join the processes of this run, as torchrun's environment names them; alone where it names none.
 
-    Args:
-        device: "cuda" talks by nccl, "cpu" by gloo.
-
-    Raises:
-        InputError: variables that are no numbers, or others that cannot be reached.
+    "cuda" talks by nccl, "cpu" by gloo. InputError for variables that are no numbers, or others that cannot be reached.
     """
     if "WORLD_SIZE" not in os.environ:
         yield Ranks()

@@ -19,8 +19,18 @@ from spackle.residual.hole_features import Cues
 from spackle.residual.network import ResidualNet, load_residual, network_input
 from spackle.training.checkpoint import export_weights
 from spackle.training.data import SampleFiles, Supply
-from spackle.training.method import PICTURED, Objective, ViewBatch, ViewMethod
-from spackle.training.plan import CACHE, Plan, RunContext, Start, load_objective, parameters
+from spackle.training.method import (
+    CACHE,
+    PICTURED,
+    Objective,
+    Plan,
+    RunContext,
+    Start,
+    ViewBatch,
+    ViewMethod,
+    load_objective,
+    parameters,
+)
 from spackle.training.recipe import Recipe
 from spackle.training.sample import Sample, load_sample
 

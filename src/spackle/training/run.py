@@ -17,7 +17,6 @@ from spackle.machine import hardware, versions, without_nan
 from spackle.output_folder import alone_in, results_folder
 from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
-from spackle.training.callbacks import Callbacks, Logs, open_logs
 from spackle.training.checkpoint import (
     BEST,
     LAST,
@@ -32,12 +31,11 @@ from spackle.training.checkpoint import (
     remove_run,
 )
 from spackle.training.direct_ft import plan_direct_ft
-from spackle.training.method import Method
-from spackle.training.plan import Plan, RunContext, Start
+from spackle.training.method import Method, Plan, RunContext, Start
 from spackle.training.ranks import joined_ranks
 from spackle.training.recipe import AnyRecipe, DeviceName, load_recipe, plain
 from spackle.training.residual_method import plan_residual
-from spackle.training.trainer import Trainer
+from spackle.training.trainer import Callbacks, Logs, Trainer, open_logs
 
 R = TypeVar("R", bound=AnyRecipe)
 MethodName = Literal["residual", "direct-ft"]

@@ -8,24 +8,79 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import AdamW, Optimizer
 
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import save_png
-from spackle.training.callbacks import Callbacks, Logs
 from spackle.training.checkpoint import BAD, BEST, LAST, PICTURES, Checkpoint, Progress, save_checkpoint
 from spackle.training.method import Method, chunks, validate
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import AnyRecipe, OptimRecipe, plain
+
+
+@dataclasses.dataclass(frozen=True)
+class Callbacks:
+    """Functions that the trainer calls."""
+
+    step: Callable[[int, dict[str, float]], None]  # steps done, and their mean numbers since it was last called
+    validated: Callable[[Progress], None]
+    saved: Callable[[Progress], None]  # a checkpoint is on the disk
+    stop: Callable[[], bool]  # whether somebody wants it to end after this step
+
+
+class Logs:
+    """TensorBoard's event files in a folder; without a folder, nothing."""
+
+    def __init__(self, folder: Path | None = None, purge_step: int = 0) -> None:
+        """ImportError where tensorboard is not installed; what an earlier start logged after a step is hidden."""
+        self.folder, self.writer = folder, None
+        if folder is not None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of protobuf's, about itself
+                import tensorboard  # noqa: F401  # torch's own import of it fails with other words
+                from torch.utils.tensorboard import SummaryWriter
+            self.writer = SummaryWriter(str(folder), purge_step=purge_step)
+
+    def numbers(self, group: str, values: Mapping[str, float], step: int) -> None:
+        """Points of the curves GROUP/NAME."""
+        for name, value in values.items():
+            self._write("add_scalar", f"{group}/{name}", value, step)
+
+    def picture(self, name: str, rgb: Tensor, step: int) -> None:
+        """An image [H, W, 3] sRGB."""
+        self._write("add_image", name, rgb.clamp(0, 1), step, dataformats="HWC")
+
+    def close(self) -> None:
+        """Write what is still in memory."""
+        self._write("close")
+
+    def _write(self, method: str, *arguments: object, **options: object) -> None:
+        if self.writer is None:
+            return
+        try:
+            getattr(self.writer, method)(*arguments, **options)
+        except OSError as error:  # raised where the next number comes, for its thread cannot
+            raise InputError(f"{self.folder}: cannot write the logs: {reason_in_a_line(error)}") from error
+
+
+def open_logs(folder: Path, step: int, say: Callable[[str], None]) -> Logs:
+    """Logs in a folder, from a step on; says so where tensorboard is missing, and keeps none."""
+    try:
+        return Logs(folder, step)
+    except ImportError:
+        say("no TensorBoard logs: pip install 'spackle-nvs[train]'")
+        return Logs()
+
 
 EMA_START = 10  # the average forgets the first, bad weights this quickly: decay (s + 1) / (s + 10)
 
@@ -215,12 +270,7 @@ def adamw(groups: Sequence[dict[str, object]], recipe: AnyRecipe) -> AdamW:
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
-    """Linear warm-up, then a cosine down to `min_lr` ("Training Details and Loss Weights").
-
-    Args:
-        step: from 0 up.
-        optim: lr, min_lr, warmup and steps count.
-    """
+    """Linear warm-up, then a cosine down to `min_lr` ("Training Details and Loss Weights"); steps count from 0."""
     if step < optim.warmup:
         return optim.lr * (step + 1) / optim.warmup
     done = min(1.0, (step - optim.warmup) / max(1, optim.steps - optim.warmup))
@@ -235,19 +285,8 @@ def ema_decay(step: int, decay: float) -> float:
 def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> list[int]:
     """Which of `count` samples a process sees at a step: nothing but the arguments decides.
 
-    Every epoch is a permutation of all samples; a batch may end one and begin the next. However many
-    processes there are, they share the same global batch.
-
-    Args:
-        step: from 0 up.
-        count: samples in all.
-        batch: of all processes together; a multiple of `ranks`.
-        seed: of the permutations.
-        rank: the process, from 0.
-        ranks: how many there are.
-
-    Raises:
-        ValueError: a batch that cannot be divided.
+    Every epoch is a permutation of all samples by `seed`; a batch may end one and begin the next. All `ranks` processes
+    share the same global batch; ValueError where it cannot be divided between them.
     """
     share, rest = divmod(batch, ranks)
     if rest:
