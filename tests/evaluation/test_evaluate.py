@@ -316,7 +316,7 @@ def test_large_views_are_the_ends_of_a_swipe_at_each_disparity() -> None:
 def test_each_method_starts_from_the_same_base() -> None:
     shot = shot_of([shifted(box_before_wall().camera, side) for side in (0.4, -0.4)])
     alone, per_view, scene, dense = (
-        list(make_method(name, None).views(shot)) for name in ("base", "seeds", "spackle-scene", "dense")
+        list(make_method(name, None)(shot)) for name in ("base", "seeds", "spackle-scene", "dense")
     )
     for index, before in enumerate(shot.before):
         covered = ~hole_mask(before.alpha)
@@ -336,11 +336,11 @@ def test_each_method_starts_from_the_same_base() -> None:
 def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
     shot = shot_of([shifted(box_before_wall().camera, 0.4)])
     base = shot.prediction
-    same = list(make_method("direct-ft", None, lambda: (base, 1.0)).views(shot))
+    same = list(make_method("direct-ft", None, lambda: (base, 1.0))(shot))
     assert torch.equal(same[0].rgb, shot.before[0].rgb)
     g = base.gaussians
     double = dataclasses.replace(base, gaussians=dataclasses.replace(g, means=2 * g.means, scales=2 * g.scales))
-    other = list(make_method("direct-ft", None, lambda: (double, 2.0)).views(shot))
+    other = list(make_method("direct-ft", None, lambda: (double, 2.0))(shot))
     assert float((other[0].rgb - shot.before[0].rgb).abs().max()) < 1e-3
     with pytest.raises(ValueError, match="a base of its own"):
         make_method("direct-ft", None)

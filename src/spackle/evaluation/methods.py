@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.inpaint import InpainterOptions, ViewStack, get_inpainter
+from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
@@ -38,8 +37,8 @@ class Shot:
     def base(self) -> Gaussians:
         return self.prediction.gaussians
 
-    @functools.cached_property
-    def shield(self) -> OcclusionGuard:
+    @cached_property
+    def guard(self) -> OcclusionGuard:
         """What the photo shows, which no completion may cover."""
         return self.completer(None).photo_guard()
 
@@ -64,104 +63,65 @@ class View:
     aux: int | None  # Gaussians added for it; None where there are none by nature
 
 
-class Method(Protocol):
-    """A way to fill the holes."""
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        """The views of a shot, in its order, one at a time: there may be many."""
-        ...
+Method = Callable[[Shot], Iterator[View]]  # the views of a shot, in its order, one at a time: there may be many
 
 
-class BaseAlone:
-    """The base's render as it is."""
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        for index in range(len(shot.cameras)):
-            yield shot.draw(Gaussians.empty(), index)
+def _base_alone(shot: Shot) -> Iterator[View]:
+    for before in shot.before:
+        yield View(before.rgb, before.alpha, 0)
 
 
-@dataclasses.dataclass(frozen=True)
-class PerView:
+def _per_view(shot: Shot, network: ResidualNet | None, precision: Precision = "auto") -> Iterator[View]:
     """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
-
-    network: ResidualNet | None
-    precision: Precision = "auto"
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        completer = shot.completer(self.network, self.precision)
-        for camera, before in zip(shot.cameras, shot.before, strict=True):
-            aux, drawn = completer.completed_view(camera, [shot.shield], rendering=before)
-            yield View(drawn.rgb, drawn.alpha, len(aux))
+    completer = shot.completer(network, precision)
+    for camera, before in zip(shot.cameras, shot.before, strict=True):
+        aux, drawn = completer.completed_view(camera, [shot.guard], rendering=before)
+        yield View(drawn.rgb, drawn.alpha, len(aux))
 
 
-@dataclasses.dataclass(frozen=True)
-class OneScene:
+def _one_scene(shot: Shot, network: ResidualNet | None, precision: Precision) -> Iterator[View]:
     """One set of aux Gaussians for all views of a shot together."""
-
-    network: ResidualNet | None
-    precision: Precision = "auto"
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        completer = shot.completer(self.network, self.precision)
-        aux = completer.complete_scene(shot.cameras, exact=True)
-        for index in range(len(shot.cameras)):
-            yield shot.draw(aux, index)
+    aux = shot.completer(network, precision).complete_scene(shot.cameras, exact=True)
+    for index in range(len(shot.cameras)):
+        yield shot.draw(aux, index)
 
 
-@dataclasses.dataclass(frozen=True)
-class Dense:
+@torch.no_grad()
+def _dense(shot: Shot, network: ResidualNet | None, precision: Precision) -> Iterator[View]:
     """An aux Gaussian for every cell, hole or not: the other side of the mask-guided ablation (tab:mask_guided_init).
 
     Exactly one for each 2×2 pixels less the few that find no place behind what the photo shows, and no second pass.
     """
-
-    network: ResidualNet | None
-    precision: Precision = "auto"
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
-            aux = push_behind(self._everywhere(before, camera, shot.prediction.camera), camera.position, [shot.shield])
-            yield shot.draw(aux, index)
-
-    @torch.no_grad()
-    def _everywhere(self, before: Rendering, camera: Camera, photo_camera: Camera) -> Gaussians:
+    photo_camera = shot.prediction.camera
+    for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
         cues = Cues.of(before)
         seeds = make_seeds(cues, camera, photo_camera)
         deltas = None
-        if self.network is not None:
+        if network is not None:
             rim = Rim.of(cues, seeds, camera, photo_camera)
-            deltas = predict_deltas(self.network, cues, seeds, rim, self.precision, dense=True).flatten(0, 1)
-        return compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
+            deltas = predict_deltas(network, cues, seeds, rim, precision, dense=True).flatten(0, 1)
+        aux = compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
+        yield shot.draw(push_behind(aux, camera.position, [shot.guard]), index)
 
 
-class Inpaint2d:
+def _inpaint_2d(shot: Shot, inpainter: Inpainter) -> Iterator[View]:
     """The base's render with its hole inpainted as a flat picture, by OpenCV."""
-
-    def __init__(self) -> None:
-        """Find OpenCV; InputError where it is not installed."""
-        self._inpainter = get_inpainter("opencv", InpainterOptions())
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        for camera, before in zip(shot.cameras, shot.before, strict=True):
-            flat = [image[None] for image in (before.rgb, before.depth, before.alpha, hole_mask(before.alpha))]
-            stack = ViewStack(shot.base, shot.prediction.camera, [camera], *flat)
-            yield View(self._inpainter.complete(stack)[0], None, None)
+    for camera, before in zip(shot.cameras, shot.before, strict=True):
+        flat = [image[None] for image in (before.rgb, before.depth, before.alpha, hole_mask(before.alpha))]
+        stack = ViewStack(shot.base, shot.prediction.camera, [camera], *flat)
+        yield View(inpainter.complete(stack)[0], None, None)
 
 
-@dataclasses.dataclass(frozen=True)
-class DirectFt:
-    """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
+def _direct_ft(shot: Shot, prediction: BasePrediction, unit: float) -> Iterator[View]:
+    """The paper's naive decoupled framework: another base, trained on completed views, by itself.
 
-    prediction: BasePrediction  # of the same photo
-    unit: float = 1.0  # the other base's unit of length in this one's, where both were aligned with a dataset
-
-    def views(self, shot: Shot) -> Iterator[View]:
-        for camera in shot.cameras:
-            pose = camera.world_to_camera.clone()
-            pose[:3, 3] *= self.unit
-            moved = dataclasses.replace(camera, world_to_camera=pose)
-            drawn = shot.renderer.render(self.prediction.gaussians, moved)
-            yield View(drawn.rgb, drawn.alpha, None)
+    Its `unit` is its unit of length in this one's, where both were aligned with a dataset.
+    """
+    for camera in shot.cameras:
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] *= unit
+        drawn = shot.renderer.render(prediction.gaussians, dataclasses.replace(camera, world_to_camera=pose))
+        yield View(drawn.rgb, drawn.alpha, None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,17 +149,28 @@ def make_method(
     direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None,
     precision: Precision = "auto",
 ) -> Method:
-    """A method of `METHODS`; `direct_ft` predicts the photo at hand with the other base, and gives its `unit`."""
+    """A method of `METHODS`.
+
+    Args:
+        name: which one.
+        network: of the residual; None for seeds alone.
+        direct_ft: predicts the photo at hand with the other base, and gives that one's unit of length in this one's.
+        precision: of the residual's network.
+
+    Raises:
+        InputError: OpenCV is not installed, for inpaint2d.
+    """
     if name == "direct-ft":
         if direct_ft is None:
             raise ValueError("direct-ft needs a base of its own")
-        return DirectFt(*direct_ft())
-    plain: dict[str, Callable[[], Method]] = {
-        "base": BaseAlone,
-        "spackle": lambda: PerView(network, precision),
-        "spackle-scene": lambda: OneScene(network, precision),
-        "seeds": lambda: PerView(None),
-        "dense": lambda: Dense(network, precision),
-        "inpaint2d": Inpaint2d,
+        prediction, unit = direct_ft()
+        return partial(_direct_ft, prediction=prediction, unit=unit)
+    methods: dict[str, Callable[[], Method]] = {
+        "base": lambda: _base_alone,
+        "spackle": lambda: partial(_per_view, network=network, precision=precision),
+        "spackle-scene": lambda: partial(_one_scene, network=network, precision=precision),
+        "seeds": lambda: partial(_per_view, network=None),
+        "dense": lambda: partial(_dense, network=network, precision=precision),
+        "inpaint2d": lambda: partial(_inpaint_2d, inpainter=get_inpainter("opencv", InpainterOptions())),
     }
-    return plain[name]()
+    return methods[name]()

@@ -1,8 +1,6 @@
-"""The metrics that can be asked for: what they are called, and exactly what they are.
+"""The metrics of a picture: ours, and published ones by way of pyiqa.
 
-Figures of a view that need no network: what is covered, and how far a picture is from the truth.
-
-Published quality metrics by way of pyiqa (optional: pip install 'spackle-nvs[eval]'; not for commercial use).
+pyiqa is optional (pip install 'spackle-nvs[eval]') and not for commercial use.
 """
 
 from __future__ import annotations
@@ -23,40 +21,12 @@ from spackle.errors import reason_in_a_line
 from spackle.training.losses import hole_psnr
 
 OWN = "own"
+NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
+NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
+WINDOW, SIGMA = 11, 1.5  # of SSIM, in pixels (Wang et al. 2004)
+C1, C2 = 0.01**2, 0.03**2  # its constants K1 = 0.01, K2 = 0.03, for values in 0..1
 
-
-@dataclasses.dataclass(frozen=True)
-class Definition:
-    """Exactly which variant of a metric is meant."""
-
-    call: str  # pyiqa's name of it
-    says: str  # for the tables' captions
-    options: tuple[tuple[str, Any], ...]  # pinned, whatever another release has for defaults
-
-
-DEFINITIONS: dict[str, Definition] = {
-    "clipiqa": Definition(
-        "clipiqa",
-        "CLIP RN50 without positional embedding at the picture's own size; mean over the prompt pairs Good/bad image, "
-        "Sharp/blurry image, sharp/blurry edges, High/low resolution image, Noise-free/noisy image",
-        (("model_type", "clipiqa"), ("backbone", "RN50"), ("pos_embedding", False)),
-    ),
-    "niqe": Definition(
-        "niqe",
-        "on the float render, of which pyiqa rounds the luma (YIQ) to 0..255; blocks of 96×96, "
-        "the pristine model of the authors' release",
-        (("test_y_channel", True),),
-    ),
-    "musiq": Definition(
-        "musiq", "trained on KonIQ-10k; scales 224, 384 and the picture's own", (("pretrained", "koniq10k"),)
-    ),
-    "dists": Definition("dists", "VGG16 with the authors' weights, at the picture's own size", ()),
-    "lpips": Definition(
-        "lpips",
-        "AlexNet, version 0.1, at the picture's own size (the paper does not say which network it took)",
-        (("net", "alex"), ("version", "0.1")),
-    ),
-}
+Metric = Callable[[Tensor, Tensor | None], float]  # (picture, truth), [H, W, 3] sRGB 0..1 each, to a score
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,36 +34,63 @@ class Figure:
     """A metric of a view."""
 
     title: str  # with the direction that is better
-    says: str  # its definition, for captions
+    says: str  # its exact definition, for captions
     lower: bool  # is better
-    digits: int
-    truth: bool  # needs a true second view
+    digits: int = 4
+    truth: bool = False  # needs a true second view
+    options: dict[str, Any] | None = None  # of pyiqa, pinned whatever another release has for defaults; None: ours
 
     def text(self, value: float) -> str:
         return f"{value:.{self.digits}f}"
 
 
 METRICS: dict[str, Figure] = {
-    "clipiqa": Figure("CLIPIQA ↑", DEFINITIONS["clipiqa"].says, False, 4, False),
-    "niqe": Figure("NIQE ↓", DEFINITIONS["niqe"].says, True, 4, False),
-    "musiq": Figure("MUSIQ ↑", DEFINITIONS["musiq"].says, False, 4, False),
-    "psnr": Figure("PSNR ↑", "in dB over sRGB pixels and channels in 0..1", False, 2, True),
+    "clipiqa": Figure(
+        "CLIPIQA ↑",
+        "CLIP RN50 without positional embedding at the picture's own size; mean over the prompt pairs Good/bad image, "
+        "Sharp/blurry image, sharp/blurry edges, High/low resolution image, Noise-free/noisy image",
+        lower=False,
+        options={"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False},
+    ),
+    "niqe": Figure(
+        "NIQE ↓",
+        "on the float render, of which pyiqa rounds the luma (YIQ) to 0..255; blocks of 96×96, "
+        "the pristine model of the authors' release",
+        lower=True,
+        options={"test_y_channel": True},
+    ),
+    "musiq": Figure(
+        "MUSIQ ↑",
+        "trained on KonIQ-10k; scales 224, 384 and the picture's own",
+        lower=False,
+        options={"pretrained": "koniq10k"},
+    ),
+    "psnr": Figure("PSNR ↑", "in dB over sRGB pixels and channels in 0..1", lower=False, digits=2, truth=True),
     "ssim": Figure(
-        "SSIM ↑", "Gaussian window of 11 pixels, σ 1.5, K 0.01 and 0.03, mean of the sRGB channels", False, 4, True
+        "SSIM ↑",
+        "Gaussian window of 11 pixels, σ 1.5, K 0.01 and 0.03, mean of the sRGB channels",
+        lower=False,
+        truth=True,
     ),
     "distance": Figure(
         "distance ↓",
         "masked perceptual distance in the hole: SqueezeNet 1.0 at conv1, fire4, fire8 and fire9, unit feature "
         "vectors, 0 to 8 (spackle.training.distance.hole_distance); not LPIPS",
-        True,
-        4,
-        True,
+        lower=True,
+        truth=True,
     ),
-    "dists": Figure("DISTS ↓", DEFINITIONS["dists"].says, True, 4, True),
-    "lpips": Figure("LPIPS ↓", DEFINITIONS["lpips"].says, True, 4, True),
+    "dists": Figure(
+        "DISTS ↓", "VGG16 with the authors' weights, at the picture's own size", lower=True, truth=True, options={}
+    ),
+    "lpips": Figure(
+        "LPIPS ↓",
+        "AlexNet, version 0.1, at the picture's own size (the paper does not say which network it took)",
+        lower=True,
+        truth=True,
+        options={"net": "alex", "version": "0.1"},
+    ),
 }
-
-PROTOCOLS = ("large-view", "near-view")
+DEFINITIONS = {name: figure for name, figure in METRICS.items() if figure.options is not None}  # pyiqa's
 DEFAULT_METRICS = {
     "large-view": ("clipiqa", "niqe", "musiq"),
     "near-view": ("psnr", "ssim", "distance", "dists", "lpips"),
@@ -106,15 +103,11 @@ def definitions(names: tuple[str, ...]) -> list[str]:
     return [f"{METRICS[name].title[:-2]}: {METRICS[name].says}." for name in names]
 
 
-WINDOW, SIGMA = 11, 1.5  # of SSIM, in pixels (Wang et al. 2004)
-C1, C2 = 0.01**2, 0.03**2  # its constants K1 = 0.01, K2 = 0.03, for values in 0..1
-
-
 def reduction(before: float, after: float) -> float:
-    """Relative decrease of the HAR, 1 − after / before (paper, tab:controlled_disocclusion); NaN without any hole.
+    """Relative decrease of the HAR (paper, eq. 11), 1 − after / before; NaN without any hole.
 
-    The paper's own numbers are the reduction of a dataset's mean HAR, not the mean of its images' reductions; so are
-    those of our tables.
+    The paper's own numbers (tab:controlled_disocclusion) are the reduction of a dataset's mean HAR, not the mean of
+    its images' reductions; so are those of our tables.
     """
     return 1 - after / before if before > 0 else math.nan
 
@@ -178,35 +171,24 @@ def _blur(image: Tensor) -> Tensor:
     weights /= weights.sum()
     for axis in (1, 2):
         size = image.shape[axis]
-        wide = image.index_select(axis, _mirrored(size, reach))
+        folded = torch.arange(-reach, size + reach) % (2 * size)  # d c b a | a b c d | d c b a
+        wide = image.index_select(axis, torch.where(folded < size, folded, 2 * size - 1 - folded))
         image = torch.zeros_like(image)  # sums of slices: convolutions in float64 are slow
         for start, weight in enumerate(weights.tolist()):
             image.add_(wide.narrow(axis, start, size), alpha=weight)
     return image
 
 
-def _mirrored(size: int, reach: int) -> Tensor:
-    """Indices -reach..size+reach folded back into 0..size: d c b a | a b c d | d c b a."""
-    folded = torch.arange(-reach, size + reach) % (2 * size)
-    return torch.where(folded < size, folded, 2 * size - 1 - folded)
-
-
-NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
-NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
-
-Metric = Callable[[Tensor, Tensor | None], float]  # (picture, truth), [H, W, 3] sRGB 0..1 each, to a score
-
-
 @dataclasses.dataclass(frozen=True)
-class Opened:
-    """The metrics that can run here, and why the others cannot."""
+class Published:
+    """The metrics that pyiqa can measure here, and why it cannot measure the others."""
 
     metrics: dict[str, Metric]
     missing: dict[str, str]
     version: str | None  # pyiqa's
 
 
-def open_metrics(names: Sequence[str], device: str, download: bool) -> Opened:
+def open_metrics(names: Sequence[str], device: str, download: bool) -> Published:
     """Load metrics by their names in `DEFINITIONS`; what is missing is no error.
 
     Args:
@@ -217,41 +199,31 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> Opened:
     metrics: dict[str, Metric] = {}
     missing: dict[str, str] = {}
     if not names:
-        return Opened(metrics, missing, None)
+        return Published(metrics, missing, None)
     try:
-        pyiqa = _import()
-    except Exception as error:
-        return Opened(metrics, {name: _why_not(error) for name in names}, None)
+        with _quiet():
+            import pyiqa
+    except Exception as error:  # torchvision, which pyiqa needs, may not be the one of the installed torch
+        absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
+        why = NOT_INSTALLED if absent else f"pyiqa cannot be imported: {reason_in_a_line(error)}"
+        return Published(metrics, dict.fromkeys(names, why), None)
     for name in names:
         attempts: list[str] = []
         try:
             with _quiet(), contextlib.nullcontext() if download else _off_the_network(attempts):
-                metrics[name] = _open(pyiqa, DEFINITIONS[name], device)
+                options: dict[str, Any] = DEFINITIONS[name].options or {}
+                metrics[name] = _measure_by(pyiqa.create_metric(name, device=torch.device(device), **options))
         except Exception as error:  # whatever a stranger's package raises is one line of the report
             missing[name] = (
                 "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
                 if attempts
                 else f"pyiqa cannot load it: {reason_in_a_line(error)}"
             )
-    return Opened(metrics, missing, str(getattr(pyiqa, "__version__", "unknown")))
+    return Published(metrics, missing, str(getattr(pyiqa, "__version__", "unknown")))
 
 
-def _import() -> Any:
-    with _quiet():
-        import pyiqa
-    return pyiqa
-
-
-def _why_not(error: Exception) -> str:
-    """torchvision, which pyiqa needs, raises RuntimeError where it is not the one of the installed torch."""
-    if isinstance(error, ModuleNotFoundError) and error.name == "pyiqa":
-        return NOT_INSTALLED
-    return f"pyiqa cannot be imported: {reason_in_a_line(error)}"
-
-
-def _open(pyiqa: Any, definition: Definition, device: str) -> Metric:
+def _measure_by(network: Callable[..., Any]) -> Metric:
     """A metric that gives one number; NaN is passed on for the caller to count."""
-    network = pyiqa.create_metric(definition.call, device=torch.device(device), **dict(definition.options))
 
     def measure(picture: Tensor, truth: Tensor | None = None) -> float:
         images = [image.clamp(0, 1).permute(2, 0, 1)[None].float() for image in (picture, truth) if image is not None]

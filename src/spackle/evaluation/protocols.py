@@ -93,7 +93,7 @@ def measure(
         own = [index for index, view in enumerate(wanted) if view.setting == setting]
         shot = Shot(prediction, [wanted[i].camera for i in own], [before[i] for i in own], renderer)
         for name, method in methods.items():
-            for index, view in zip(own, method.views(shot), strict=True):
+            for index, view in zip(own, method(shot), strict=True):
                 figures = {"har_before": holes[index], **_counts(view, len(prediction.gaussians))}
                 figures |= _quality(view.rgb, wanted[index].truth, before[index], gauges, remarks)
                 rows.append(Row(setting, wanted[index].name, name, {k: _finite(v) for k, v in figures.items()}))
