@@ -290,4 +290,4 @@ def test_a_dataset_of_rgbd_takes_a_folder_of_depth(tmp_path: Path) -> None:
 
 
 def test_evaluations_start_from_the_papers_base() -> None:
-    assert EvaluateOptions("middlebury", Path("x")).base.base == "sharp"
+    assert EvaluateOptions("middlebury", Path("x")).base.name == "sharp"

@@ -16,7 +16,7 @@ from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
 
 from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseError
+from spackle.bases.open import BaseError, BaseSettings
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.layers import TINY
 from spackle.device import MemoryShort
@@ -40,9 +40,8 @@ from spackle.evaluation.efficiency import (
 )
 from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.setup import Bench, EvaluateOptions, open_evaluation
+from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.table import EMPTY
-from spackle.jobs.options import PredictOptions
 from spackle.render import get_renderer
 from spackle.residual import Completer
 
@@ -229,10 +228,10 @@ def test_a_view_without_holes_needs_no_second_render() -> None:
 
 
 @pytest.fixture(scope="module")
-def tools(scenes: Path) -> Bench:
-    base = PredictOptions(base="rgbd", residual="seeds")
-    options = EvaluateOptions("middlebury", scenes, methods=("spackle",), disparities=(0.3,), metrics=(), base=base)
-    return open_evaluation(options)[1]
+def tools(scenes: Path) -> Evaluation:
+    shared: dict[str, Any] = {"methods": ("spackle",), "disparities": (0.3,), "metrics": ()}
+    base = BaseSettings("rgbd")
+    return open_evaluation(EvaluateOptions("middlebury", scenes, base=base, residual="seeds", **shared))
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +239,7 @@ def case(scenes: Path) -> Case:
     return get_dataset("middlebury").cases(scenes)[0]
 
 
-def test_points_stand_in_for_a_depth_map(tools: Bench, case: Case) -> None:
+def test_points_stand_in_for_a_depth_map(tools: Evaluation, case: Case) -> None:
     assert case.depth is not None
     known = case.depth()
     rows, columns = torch.nonzero(known.valid, as_tuple=True)
@@ -254,7 +253,7 @@ def test_points_stand_in_for_a_depth_map(tools: Bench, case: Case) -> None:
 
 
 def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
-    tools: Bench, case: Case, monkeypatch: pytest.MonkeyPatch
+    tools: Evaluation, case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     predict = RgbdBase.predict
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,7 +13,7 @@ from spackle.cli.options import INTERRUPTED, JsonOption
 from spackle.errors import InputError
 
 if TYPE_CHECKING:
-    from spackle.jobs.options import PredictOptions
+    from spackle.bases.open import BaseSettings
 
 WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
 NUMBER = re.compile(r"[\d.,]+")
@@ -97,7 +97,8 @@ def evaluate(
         methods=split_words(methods),
         disparities=parse_disparities(_with_words(context, disparity)),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
-        base=_base_options(base, checkpoint, precision, low_memory, residual, device),
+        base=_settings(base, checkpoint, precision, low_memory, device),
+        residual=residual,
         direct_ft=direct_ft,
         features=features,
         limit=limit,
@@ -176,28 +177,35 @@ def bench(
     """
     from spackle.evaluation.bench import bench as run
     from spackle.evaluation.bench import check_choice
-    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
+    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, residual_file, split_words
     from spackle.evaluation.suite import SuiteOptions, run_suite
     from spackle.progress import Reporter
 
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     check_choice(suite, given)
     disparities = parse_disparities(_with_words(context, disparity))
-    bases = _base_options(base, checkpoint, precision, low_memory, residual, device)
+    bases = _settings(base, checkpoint, precision, low_memory, device)
     if dataset is None or root is None:
         asked = SuiteOptions(
             only=split_words(only or ""),
             runs=runs,
             base_runs=base_runs,
-            base=dataclasses.replace(bases.settings, windows=windows, compiled=compiled),
+            base=dataclasses.replace(bases, windows=windows, compiled=compiled),
             sharp=bool({"--base", "--checkpoint"} & given),
-            residual=bases.residual_file,
+            residual=residual_file(residual),
             side=side,
         )
         end = run_suite(asked, output or Path("bench-suite"), reporter)
     else:
         options = EvaluateOptions(
-            dataset, root, methods=("spackle",), disparities=disparities, metrics=(), base=bases, limit=limit
+            dataset,
+            root,
+            methods=("spackle",),
+            disparities=disparities,
+            metrics=(),
+            base=bases,
+            residual=residual,
+            limit=limit,
         )
         end = run(options, runs, base_runs, output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}"), reporter)
     if end == "stopped":
@@ -210,20 +218,11 @@ def _given(context: typer.Context) -> set[str]:
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
-def _base_options(
-    base: str, checkpoint: Path | None, precision: str, low_memory: bool, residual: str | None, device: str
-) -> PredictOptions:
-    from spackle.jobs.options import PredictOptions
+def _settings(base: str, checkpoint: Path | None, precision: str, low_memory: bool, device: str) -> BaseSettings:
+    from spackle.bases.open import BaseSettings
 
-    return PredictOptions(
-        base=base,
-        checkpoint=checkpoint,
-        precision=precision,  # type: ignore[arg-type]  # checked with the other options
-        low_memory=low_memory,
-        residual=residual,
-        device=device,
-        render=False,
-    )
+    named: Any = precision  # checked with the other options
+    return BaseSettings(base, checkpoint=checkpoint, precision=named, low_memory=low_memory, device=device)
 
 
 def _with_words(context: typer.Context, disparity: str) -> str:

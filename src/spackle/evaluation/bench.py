@@ -11,16 +11,15 @@ from typing import Any, TypeVar
 
 import torch
 
-from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseError, OpenedBase, kind_of, open_loaded
+from spackle.bases.open import BaseError
 from spackle.errors import InputError
-from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
+from spackle.evaluation.case import Case, load_case
 from spackle.evaluation.efficiency import Efficiency, ImageCost, count_parameters, time_base, time_view
 from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write_text
 from spackle.evaluation.run import inputs_digest, problem_of
-from spackle.evaluation.setup import Bench, EvaluateOptions, check_evaluate_options, metrics_device, open_evaluation
+from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.machine import hardware, versions
 from spackle.output_folder import alone_in, results_folder
@@ -52,12 +51,11 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
             memory for the base.
     """
-    check_evaluate_options(options)
     check_runs(runs, base_runs)
-    cases, tools, whole = open_evaluation(options)
-    kind = kind_of(options.base.base)
-    device = torch.device(metrics_device(options) if kind.network else "cpu")
-    config = {"kind": "bench", **{name: whole[name] for name in SHARED}}
+    tools = open_evaluation(options)
+    cases, kind = tools.cases, options.base.kind
+    device = options.device if kind.network else torch.device("cpu")
+    config = {"kind": "bench", **{name: tools.config[name] for name in SHARED}}
     config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if kind.slow else runs)}
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
@@ -85,7 +83,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
 
 
 def _measure(
-    case: Case, tools: Bench, config: Mapping[str, Any], device: torch.device, warm: bool, reporter: Reporter
+    case: Case, tools: Evaluation, config: Mapping[str, Any], device: torch.device, warm: bool, reporter: Reporter
 ) -> ImageCost:
     """One image; a problem of its own is its record, which the next run tries again."""
     try:
@@ -103,7 +101,7 @@ def _measure(
     return image
 
 
-def time_image(case: Case, tools: Bench, config: Mapping[str, Any], device: torch.device, warm: bool) -> ImageCost:
+def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], device: torch.device, warm: bool) -> ImageCost:
     """All settings of an image.
 
     Args:
@@ -119,7 +117,7 @@ def time_image(case: Case, tools: Bench, config: Mapping[str, Any], device: torc
     """
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
     loaded = load_case(dataclasses.replace(case, seconds=()))
-    opened = _open(loaded, tools)
+    opened = tools.open(loaded)
     base = time_base(lambda: opened.predict(loaded.full)[0], config["base_runs"], device, warm)
     try:
         views = large_views(base.prediction, tools.options.disparities)
@@ -134,11 +132,6 @@ def time_image(case: Case, tools: Bench, config: Mapping[str, Any], device: torc
     size = {"width": loaded.photo.width, "height": loaded.photo.height}
     facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}
     return ImageCost(case.name, facts, tuple(costs))
-
-
-def _open(loaded: LoadedCase, tools: Bench) -> OpenedBase:
-    """The network, or the case's own depth or points."""
-    return open_loaded(RgbdBase(known_depth(loaded.case)) if tools.base is None else tools.base())
 
 
 def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter: Reporter) -> None:

@@ -162,7 +162,7 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[Record, dict[str, Tenso
     if options.near and not case.seconds and case.problem is None:
         raise InputError(f"{case.name}: has no second photo")
     loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
-    prediction = evaluation.predict(loaded)
+    prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, evaluation.base.takes_depth) if options.near else None
     try:
         wanted = (

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 import spackle
-from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open_base
-from spackle.bases.protocol import BasePrediction
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open_base, open_loaded
 from spackle.camera_path import MAX_DISPARITY
 from spackle.dataset.options import base_digest
 from spackle.device import PRECISIONS, pick_dtype
@@ -29,6 +29,7 @@ from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual
 from spackle.training.features import load_features
 
+BASE = BaseSettings("sharp")
 DEFAULT_METHODS = ("base", "spackle")
 MAX_LIMIT = 1_000_000
 MAX_DISPARITIES = 6  # columns of a table
@@ -45,7 +46,7 @@ class EvaluateOptions:
     methods: Sequence[str] = DEFAULT_METHODS
     disparities: Sequence[float] = DISPARITIES  # of the large views
     metrics: Sequence[str] | None = None  # the protocol's where None
-    base: BaseSettings = BaseSettings("sharp")  # the paper's; its precision and device are the residual's, too
+    base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too
     residual: str | None = None  # a file, "seeds", or None for the shipped weights if any
     direct_ft: Path | None = None  # weights of the method direct-ft
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
@@ -64,10 +65,8 @@ class EvaluateOptions:
 
     @property
     def residual_file(self) -> Path | None:
-        """The file of the residual's weights; None for seeds alone."""
-        if self.residual is None:
-            return SHIPPED if SHIPPED.is_file() else None
-        return None if self.residual == "seeds" else Path(self.residual)
+        """As `residual_file` has it."""
+        return residual_file(self.residual)
 
     @property
     def device(self) -> torch.device:
@@ -126,6 +125,13 @@ class EvaluateOptions:
             raise InputError("--disparity: the same number twice: leave one out")
 
 
+def residual_file(named: str | None) -> Path | None:
+    """The file of the weights that --residual means: the shipped ones where it is not given, else "seeds" or a file."""
+    if named is None:
+        return SHIPPED if SHIPPED.is_file() else None
+    return None if named in ("seeds", "none") else Path(named)
+
+
 def split_words(text: str) -> tuple[str, ...]:
     """ "a, b,c" as words; a word twice counts once."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
@@ -145,7 +151,7 @@ class Evaluation:
 
     options: EvaluateOptions
     cases: Sequence[Case]
-    base: OpenedBase  # takes the dataset's depth where that is the base
+    base: OpenedBase  # see `open`
     direct: OpenedBase | None  # of the method direct-ft
     network: ResidualNet | None
     renderer: Renderer
@@ -153,15 +159,13 @@ class Evaluation:
     states: Mapping[str, str]  # metric → who measures it, or why nobody does
     config: dict[str, Any]  # everything that decides the figures, ready for JSON; nothing of where files lie
 
-    def predict(self, loaded: LoadedCase) -> BasePrediction:
-        """A case's Gaussians.
+    def open(self, loaded: LoadedCase) -> OpenedBase:
+        """The base of a case: the network, or the case's own depth or points.
 
         Raises:
-            InputError: the case has no depth for a base that takes it, or cannot be used.
-            BaseError: no image can be worked on.
+            InputError: the case has no depth for a base that takes it, or a file of it cannot be used.
         """
-        depth = known_depth(loaded.case) if self.base.takes_depth else None
-        return self.base.predict(loaded.full, depth)[0]
+        return open_loaded(RgbdBase(known_depth(loaded.case))) if self.base.takes_depth else self.base
 
 
 def open_evaluation(options: EvaluateOptions) -> Evaluation:
