@@ -26,26 +26,11 @@ def double(value: float) -> torch.Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-@pytest.mark.parametrize(
-    ("srgb", "linear"), [(0.0, 0.0), (1.0, 1.0), (0.5, 0.21404114), (0.04045, 0.0031308), (118 / 255, 0.18116424)]
-)
-def test_known_values(srgb: float, linear: float) -> None:
-    assert float(srgb_to_linear(double(srgb))) == pytest.approx(linear, abs=1e-8)
-    assert float(linear_to_srgb(double(linear))) == pytest.approx(srgb, abs=1e-6)
-
-
 @settings(deadline=None)
 @given(UNIT)
 def test_both_ways_follow_the_standard(value: float) -> None:
     assert float(srgb_to_linear(double(value))) == pytest.approx(decoded(value), abs=1e-12)
     assert float(linear_to_srgb(double(value))) == pytest.approx(encoded(value), abs=1e-12)
-
-
-@settings(deadline=None)
-@given(UNIT)
-def test_the_two_undo_each_other(value: float) -> None:
-    assert float(linear_to_srgb(srgb_to_linear(double(value)))) == pytest.approx(value, abs=1e-7)
-    assert float(srgb_to_linear(linear_to_srgb(double(value)))) == pytest.approx(value, abs=1e-7)
 
 
 def test_every_byte_survives_the_way_there_and_back_in_single_precision() -> None:

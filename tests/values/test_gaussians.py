@@ -58,16 +58,8 @@ def test_a_field_of_the_wrong_shape_is_named(field: str) -> None:
     wrong = torch.zeros(3, 1) if field == "opacities" else torch.zeros(3, 5)
     with pytest.raises(ValueError, match=rf"Gaussians\.{field} has shape"):
         dataclasses.replace(random_set(3), **{field: wrong})
-
-
-def test_fields_of_different_lengths_are_refused() -> None:
-    with pytest.raises(ValueError, match="scales"):
-        dataclasses.replace(random_set(3), scales=torch.ones(2, 3))
-
-
-def test_a_set_cannot_be_changed_in_place() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        random_set(2).means = torch.zeros(2, 3)  # type: ignore[misc]
+    with pytest.raises(ValueError, match="Gaussians"):
+        dataclasses.replace(random_set(3), **{field: getattr(random_set(2), field)})
 
 
 def test_the_empty_set_has_length_zero_and_vanishes_in_a_join() -> None:
@@ -143,22 +135,6 @@ def test_a_product_turns_by_the_second_factor_first(a: tuple[float, ...], b: tup
     assert float(product.norm()) == pytest.approx(math.hypot(*a) * math.hypot(*b))
 
 
-def test_hamiltons_table() -> None:
-    one, i, j, k = torch.eye(4).unbind()
-    assert torch.equal(quat_multiply(i, j), k)
-    assert torch.equal(quat_multiply(j, i), -k)
-    assert torch.equal(quat_multiply(j, k), i)
-    assert torch.equal(quat_multiply(k, i), j)
-    assert torch.equal(quat_multiply(i, i), -one)
-    assert torch.equal(quat_multiply(torch.eye(4), one), torch.eye(4))
-
-
-def test_a_quarter_turn_about_z_swaps_the_variances_of_x_and_y() -> None:
-    quat, scales = double([HALF, 0, 0, HALF]), double([1, 2, 3])
-    some = Gaussians(double([0, 0, 0]), quat, scales, double(1), double([0, 0, 0]))
-    torch.testing.assert_close(some.covariances()[0], torch.diag(double(4, 1, 9)))
-
-
 @PROPERTY
 @given(QUATS, st.tuples(FACTORS, FACTORS, FACTORS))
 def test_covariances_have_the_squared_scales_as_eigenvalues(quat: tuple[float, ...], scales: tuple[float, ...]) -> None:
@@ -177,16 +153,6 @@ def test_a_transform_moves_points_and_covariances_alike(quat: tuple[float, ...],
     torch.testing.assert_close(moved.covariances(), linear @ some.covariances() @ linear.T, rtol=1e-8, atol=1e-10)
     assert torch.equal(moved.opacities, some.opacities)
     assert torch.equal(moved.colors, some.colors)
-
-
-@PROPERTY
-@given(QUATS, QUATS, FACTORS, FACTORS, OFFSETS)
-def test_transforms_compose_as_their_matrices_do(a: tuple, b: tuple, s: float, t: float, offset: tuple) -> None:
-    some, first, second = random_set(3), similarity(a, s, offset), similarity(b, t, offset[::-1])
-    one, other = some.transform(first).transform(second), some.transform(second @ first)
-    torch.testing.assert_close(one.means, other.means)
-    torch.testing.assert_close(one.scales, other.scales)
-    torch.testing.assert_close(one.covariances(), other.covariances(), rtol=1e-8, atol=1e-8)
 
 
 def test_moving_scene_and_camera_together_leaves_the_picture_and_scales_its_depth() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.color import linear_to_srgb
 from spackle.formats.ply import LARGEST_SCALE, SMALLEST_QUAT, SMALLEST_SCALE
 from spackle.gaussians import Gaussians
 
@@ -55,10 +55,15 @@ class Columns:
         """The Gaussians that an index or a slice picks."""
         return Columns(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
-    def gaussians(self) -> Gaussians:
-        """The scene that these columns mean."""
-        means, quats, log_scales, opacities, srgb = (
-            torch.from_numpy(np.ascontiguousarray(getattr(self, field.name), np.float32))
-            for field in dataclasses.fields(self)
-        )
-        return Gaussians(means, quats, log_scales.exp(), opacities, srgb_to_linear(srgb))
+
+def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Which component [N] of unit quaternions wxyz is largest, and the others [N, 3] as shares 0..1, in their order.
+
+    Of a quaternion and its opposite, which turn alike, the one is taken whose largest component is positive: the others
+    say how large it is.
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
+    shares = np.clip(quats * sign * np.float32(0.5**0.5) + np.float32(0.5), 0, 1)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    return largest, np.take_along_axis(shares, others, axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.formats.columns import Columns, Floats
+from spackle.formats.columns import Columns, Floats, smallest_three
 from spackle.formats.ply import header_comments
 from spackle.gaussians import Gaussians
 
@@ -45,7 +45,8 @@ def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, ba
         sizes, chunks[:, 6:12] = _normalised(scales, starts)
         colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
         rows[:, 0] = _packed(places, (11, 10, 11))
-        rows[:, 1] = _packed_quats(columns.quats)
+        largest, others = smallest_three(columns.quats)
+        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others, (10, 10, 10))
         rows[:, 2] = _packed(sizes, (11, 10, 11))
         rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), (8, 8, 8, 8))
     return "\n".join(lines).encode() + chunks.tobytes() + rows.tobytes()
@@ -85,16 +86,4 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
     word = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, widths, strict=True):
         word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)
-    return word
-
-
-def _packed_quats(quats: Floats) -> NDArray[np.uint32]:
-    """[N] words of unit quaternions wxyz: which component is largest, and ten bits of each other one."""
-    largest = np.abs(quats).argmax(axis=1)
-    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
-    shares = np.clip(quats * sign * np.float32(0.5**0.5) + np.float32(0.5), 0, 1)
-    word: NDArray[np.uint32] = largest.astype(np.uint32)
-    for axis in range(4):
-        part = np.round(shares[:, axis] * np.float32(1023)).astype(np.uint32)
-        word = np.where(largest == axis, word, word << np.uint32(10) | part)
     return word

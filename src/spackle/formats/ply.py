@@ -265,20 +265,25 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
-    """The photo's camera that SHARP stores after the Gaussians, or we in a comment; None in other files.
+    """The photo's camera that SHARP stores after the Gaussians, or `save_ply` in a comment; None in other files.
 
     Raises:
         InputError: a broken file, or a camera that makes no sense.
     """
     header, words = _comment(path, CAMERA_COMMENT)
+    where = f"{path}: the stored camera"
+    K, matrix = np.eye(3), np.eye(4)
     if words is not None:
-        return _commented_camera(words, path)
+        try:
+            K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = (float(word) for word in words)
+            return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), int(width), int(height), where)
+        except (ValueError, OverflowError) as error:
+            raise InputError(f"{where} makes no sense: {error}") from error
     with open(path, "rb") as file:
         extras = read_extras(file, header)
     if "intrinsic" not in extras:
         return None
     intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", np.eye(4).ravel())
-    K, matrix = np.eye(3), np.eye(4)
     if len(intrinsic) == 9 and len(extras.get("image_size", ())) == 2:
         K, (width, height) = intrinsic.reshape(3, 3), extras["image_size"]
     elif len(intrinsic) == 4:  # older: fx, fy, width, height
@@ -292,12 +297,11 @@ def load_ply_camera(path: str | os.PathLike[str]) -> Camera | None:
     elif len(extrinsic) == 16:
         matrix = extrinsic.reshape(4, 4)
     width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
-    where = f"{path}: the stored camera"
     return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
 
 
 def load_ply_base_count(path: str | os.PathLike[str]) -> int | None:
-    """How many of the first Gaussians `save_ply` was told are the base's; None in other files.
+    """How many of the first Gaussians are the base's, as `save_ply` was told; None in other files.
 
     Raises:
         InputError: a broken file, or a number that makes no sense.
@@ -312,7 +316,7 @@ def load_ply_base_count(path: str | os.PathLike[str]) -> int | None:
 
 
 def load_ply_disparity(path: str | os.PathLike[str]) -> float | None:
-    """How far `save_ply` was told that the scene was completed; None in other files.
+    """How far the scene was completed, as `save_ply` was told; None in other files.
 
     Raises:
         InputError: a broken file, or a number that makes no sense.
@@ -343,26 +347,12 @@ def header_comments(camera: Camera | None, base_count: int | None, disparity: fl
 
 
 def _comment(path: str | os.PathLike[str], name: str) -> tuple[Header, list[str] | None]:
-    """The header of a file that is long enough for it, and the words of its comment of that name; None without one.
-
-    Raises:
-        InputError: a missing, broken or cut file.
-    """
+    """The header of a file that is long enough for it, and the words of its comment of that name; None without one."""
     size = check_file(path, "PLY file")
     with open(path, "rb") as file:
         header = read_header(file, path)
     header.check_size(size)
     return header, header.comments.get(name)
-
-
-def _commented_camera(words: list[str], path: str | os.PathLike[str]) -> Camera:
-    where = f"{path}: the stored camera"
-    try:
-        fx, fy, cx, cy, width, height = (float(word) for word in words)
-        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return checked_camera(K, torch.eye(4), int(width), int(height), where)
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{where} makes no sense: {error}") from error
 
 
 def _padded(part: Tensor) -> Tensor:

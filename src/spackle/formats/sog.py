@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spackle.errors import InputError
-from spackle.formats.columns import Columns, Floats
+from spackle.formats.columns import Columns, Floats, smallest_three
 from spackle.formats.ply import SH_C0
 from spackle.gaussians import Gaussians
 
@@ -45,11 +45,13 @@ def encode_sog(gaussians: Gaussians) -> bytes:
     color_book, colors = codebook((columns.srgb - np.float32(0.5)) / np.float32(SH_C0))
     opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
     opaque = np.full_like(opacities, 255)
+    largest, others = smallest_three(columns.quats)
+    quats = np.concatenate([np.round(others * 255), largest[:, None] + 252], axis=1).astype(np.uint8)
     pictures = {
         "means_l.webp": [(means & 255).astype(np.uint8), opaque],
         "means_u.webp": [(means >> 8).astype(np.uint8), opaque],
         "scales.webp": [scales, opaque],
-        "quats.webp": [_quats(columns.quats)],
+        "quats.webp": [quats],
         "sh0.webp": [colors, opacities],
     }
     meta = {
@@ -94,16 +96,6 @@ def _means(means: Floats) -> tuple[NDArray[np.uint16], Floats, Floats]:
     low, high = logs.min(axis=0), logs.max(axis=0)
     span = np.maximum(high - low, np.float32(1e-30))
     return np.round((logs - low) / span * np.float32(65535)).astype(np.uint16), low, high
-
-
-def _quats(quats: Floats) -> NDArray[np.uint8]:
-    """[N, 4] bytes of unit quaternions wxyz: the three smaller components, and 252 + which one is largest."""
-    largest = np.abs(quats).argmax(axis=1)
-    sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
-    bytes_ = np.clip(np.round((quats * sign * np.float32(0.5**0.5) + np.float32(0.5)) * 255), 0, 255)
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    smaller = np.take_along_axis(bytes_, others, axis=1)
-    return np.concatenate([smaller, largest[:, None] + 252], axis=1).astype(np.uint8)
 
 
 def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:

@@ -92,39 +92,6 @@ def spz_grid(gaussians: Gaussians) -> tuple[int, int]:
     return bits, int((reach * 2.0**bits > LARGEST).sum())
 
 
-def decode_spz(data: bytes) -> Gaussians:
-    """Gaussians of an SPZ file of version 2 or 3, x right, y down, z forward; harmonics above 0 are passed over.
-
-    Raises:
-        InputError: no such file, or a broken one.
-    """
-    try:
-        inflater = zlib.decompressobj(GZIP + WINDOW)
-        header = inflater.decompress(data, HEADER.size)
-        magic, version, count, _, bits, _, _ = HEADER.unpack(header)
-        if magic != MAGIC or version not in (2, 3) or not count <= MAX_COUNT or bits > 24:
-            raise ValueError("not SPZ of version 2 or 3")
-        widths = (9, 1, 3, 3, 4 if version == 3 else 3)
-        size = count * sum(widths)
-        body = inflater.decompress(inflater.unconsumed_tail, size) if size else b""
-        if len(body) < size:
-            raise ValueError("cut off")
-    except (zlib.error, struct.error, ValueError) as error:
-        raise InputError(f"not an SPZ scene that can be read: {error}") from error
-    ends = np.cumsum([count * width for width in widths])[:-1]
-    flat = np.split(np.frombuffer(body, np.uint8), ends)
-    parts = [part.reshape(count, width) for part, width in zip(flat, widths, strict=True)]
-    wide = np.zeros((count, 3, 4), np.uint8)
-    wide[:, :, 1:] = parts[0].reshape(count, 3, 3)
-    means = (wide.view("<i4")[..., 0] >> 8) * np.float32(2.0**-bits)
-    quats = _smallest_three_decoded(parts[4]) if version == 3 else _first_three_decoded(parts[4])
-    opacities = (parts[1][:, 0] / 255).astype(np.float32)
-    srgb = ((parts[2] / 255 - 0.5) * (SH_C0 / COLOR_SCALE) + 0.5).astype(np.float32)
-    log_scales = (parts[3] / 16 - 10).astype(np.float32)
-    columns = Columns(means * FLIPPED_MEANS, quats * FLIPPED_QUATS, log_scales, opacities, srgb)
-    return columns.gaussians()
-
-
 def _within(columns: Columns, bits: int) -> Columns:
     """Far Gaussians drawn towards the origin, position and size alike, until the grid holds them."""
     reach = np.abs(columns.means).max(axis=1, initial=0).astype(np.float64)
@@ -186,28 +153,6 @@ def _smallest_three(quats: Floats, step: int) -> NDArray[np.uint32]:
         sign = (((part < 0) ^ negative) & (size > 0)).astype("<u4")
         words = np.where(largest == axis, words, words << 10 | sign << 9 | size)
     return words
-
-
-def _smallest_three_decoded(rows: NDArray[np.uint8]) -> Floats:
-    """Quaternions wxyz [N, 4] of [N, 4] bytes."""
-    words = np.ascontiguousarray(rows).view("<u4")[:, 0]
-    largest = words >> 30
-    quats = np.zeros((len(words), 4), np.float32)
-    for axis in (3, 2, 1, 0):
-        size = (words & 511) * np.float32(0.5**0.5 / 511)
-        stored = largest != axis
-        quats[:, axis] = np.where(stored, np.where(words >> 9 & 1, -size, size), 0)
-        words = np.where(stored, words >> 10, words)
-    rest = np.sqrt(np.maximum(0, 1 - (quats * quats).sum(axis=1)))
-    np.put_along_axis(quats, largest[:, None].astype(np.int64), rest[:, None], axis=1)
-    return quats[:, [3, 0, 1, 2]]
-
-
-def _first_three_decoded(rows: NDArray[np.uint8]) -> Floats:
-    """Quaternions wxyz [N, 4] of [N, 3] bytes, as version 2 has them: x, y, z, and w ≥ 0 by its length."""
-    xyz = rows / np.float32(127.5) - np.float32(1)
-    w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1, keepdims=True)))
-    return np.concatenate([w, xyz], axis=1)
 
 
 def _deflated(data: bytes) -> bytes:

@@ -65,8 +65,8 @@ class Draw(torch.autograd.Function):
         drawing = draw(sets, view, wanted, onto, keep_linear=True)
         rendering = drawing.canvas.rendering()
         ctx.drawing, ctx.sizes = drawing, [len(part) for part in sets]
-        ctx.save_for_backward(rendering.rgb, rendering.depth, rendering.alpha, *fields)
-        return rendering.rgb, rendering.depth, rendering.alpha
+        ctx.save_for_backward(*rendering.tensors, *fields)
+        return rendering.tensors
 
     @staticmethod
     @once_differentiable
@@ -145,6 +145,6 @@ def draw_differentiably(
     sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None
 ) -> Rendering:
     """Draw with gradients; see `draw`."""
-    under = [None] * 3 if onto is None else [t.float() for t in (onto.rgb, onto.depth, onto.alpha)]
+    under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
     fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
     return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]

@@ -44,7 +44,7 @@ class CpuRenderer:
         view = KernelCamera.of(camera, eps2d)
         wanted = wanted_tiles(view, tiles)
         onto = onto if tiles is not None else None
-        inputs = [t for part in sets for t in part.tensors] + ([onto.rgb, onto.depth, onto.alpha] if onto else [])
+        inputs = [t for part in sets for t in part.tensors] + (list(onto.tensors) if onto else [])
         if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
             return draw_differentiably(sets, view, wanted, onto)
         if tiles is not None:

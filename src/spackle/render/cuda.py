@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
 from types import ModuleType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render.projection_cache import Snapshot
-from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, paste
+from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, paste, tile_grid
 
 UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # gsplat's order of a symmetric matrix' six values
 
@@ -40,26 +41,13 @@ class Material:
         return Material(usable.means, usable.covariances()[:, UPPER[0], UPPER[1]], usable.opacities, usable.colors)
 
 
-@dataclasses.dataclass(frozen=True)
-class Projection:
+class Projection(NamedTuple):
     """A set as C cameras see it."""
 
     radii: Tensor  # [C, N, 2] int; 0 where nothing is seen
     means2d: Tensor  # [C, N, 2] pixels; anything where nothing is seen, as the rest
     depths: Tensor  # [C, N]
     conics: Tensor  # [C, N, 3]
-
-    @staticmethod
-    def joined(parts: Sequence[Projection]) -> Projection:
-        """Of several sets, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return Projection(*(torch.cat(tensors, 1) for tensors in zip(*(part.tensors for part in parts), strict=True)))
-
-    @property
-    def tensors(self) -> tuple[Tensor, ...]:
-        """All fields."""
-        return self.radii, self.means2d, self.depths, self.conics
 
 
 @dataclasses.dataclass
@@ -139,15 +127,16 @@ class GsplatRenderer:
     ) -> Rendering:
         """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
         sets = _listed(gaussians)
-        grid = (-(-camera.height // TILE), -(-camera.width // TILE))
+        grid = tile_grid(camera.height, camera.width)
         if tiles is not None and tuple(tiles.shape) != grid:
             raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}")
         wanted = None if tiles is None else tiles.to(self.device, torch.bool)
-        found = _first(self._draw(sets, [camera], eps2d, None if wanted is None else wanted[None]))
+        drawn = self._draw(sets, [camera], eps2d, None if wanted is None else wanted[None])
+        found = Rendering(drawn.rgb[0], drawn.depth[0], drawn.alpha[0])
         if wanted is not None:
-            under = None if onto is None else Rendering(*(t.to(found.rgb) for t in (onto.rgb, onto.depth, onto.alpha)))
+            under = None if onto is None else Rendering(*(image.to(found.rgb) for image in onto.tensors))
             found = paste(found, wanted, under)
-        return Rendering(*(image.to(_home(sets)) for image in (found.rgb, found.depth, found.alpha)))
+        return Rendering(*(image.to(sets[0].means.device) for image in found.tensors))
 
     def render_batch(
         self, gaussians: Gaussians | Sequence[Gaussians], cameras: Sequence[Camera], *, eps2d: float = 0.0
@@ -159,7 +148,7 @@ class GsplatRenderer:
             return []
         sets = _listed(gaussians)
         drawn = self._draw(sets, cameras, eps2d, None)
-        rgb, depth, alpha = (image.to(_home(sets)) for image in (drawn.rgb, drawn.depth, drawn.alpha))
+        rgb, depth, alpha = (image.to(sets[0].means.device) for image in drawn.tensors)
         return [Rendering(*images) for images in zip(rgb, depth, alpha, strict=True)]
 
     def _draw(
@@ -167,7 +156,7 @@ class GsplatRenderer:
     ) -> Rendering:
         """[C, …] images of all cameras, drawn where `wanted` [C, rows, columns] says; elsewhere they hold anything."""
         count, width, height = len(cameras), cameras[0].width, cameras[0].height
-        rows, columns = -(-height // TILE), -(-width // TILE)
+        rows, columns = tile_grid(height, width)
         parts = [self._store.material(part) for part in sets]
         seen = self._seen(sets, cameras, eps2d)
         radii = seen.radii
@@ -198,16 +187,15 @@ class GsplatRenderer:
             )  # fmt: skip
             return Projection(radii, means2d, depths, conics)
 
-        key = (eps2d, _key(cameras[0])) if len(cameras) == 1 else None
-        return Projection.joined([self._store.projection(part, key, project) for part in sets])
+        own = cameras[0]
+        numbers = (*own.K.flatten().tolist(), *own.world_to_camera.flatten().tolist())
+        key = (eps2d, *size, *numbers) if len(cameras) == 1 else None
+        parts = [self._store.projection(part, key, project) for part in sets]
+        return parts[0] if len(parts) == 1 else Projection(*(torch.cat(field, 1) for field in zip(*parts, strict=True)))
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
-    """The package, once its kernels are known to be there.
-
-    Raises:
-        InputError: no GPU, no gsplat, or one that cannot be built here.
-    """
+    """The package, once its kernels are known to be there; see `GsplatRenderer` for what it raises."""
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
     try:
@@ -232,16 +220,6 @@ def _listed(gaussians: Gaussians | Sequence[Gaussians]) -> list[Gaussians]:
     return [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians] or [Gaussians.empty()]
 
 
-def _home(sets: Sequence[Gaussians]) -> torch.device:
-    """Where the images are wanted."""
-    return sets[0].means.device
-
-
-def _key(camera: Camera) -> Hashable:
-    """A camera's values."""
-    return camera.width, camera.height, *camera.K.flatten().tolist(), *camera.world_to_camera.flatten().tolist()
-
-
 def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
     """[C, N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
     rows, columns = wanted.shape[1:]
@@ -259,7 +237,3 @@ def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
 
     (left, top), (right, bottom) = low.unbind(-1), high.unbind(-1)
     return ((at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)) > 0).int()
-
-
-def _first(rendering: Rendering) -> Rendering:
-    return Rendering(rendering.rgb[0], rendering.depth[0], rendering.alpha[0])

@@ -42,7 +42,7 @@ class Canvas:
         if onto is None:
             rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
         else:
-            rgb, depth, alpha = (np.array(as_array(t)) for t in (onto.rgb, onto.depth, onto.alpha))
+            rgb, depth, alpha = (np.array(as_array(image)) for image in onto.tensors)
         return Canvas(rgb, depth, alpha, linear)
 
     def rendering(self) -> Rendering:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from spackle._numba import MANTISSA, ZERO, inlined_kernel, kernel
 from spackle.camera import Camera
-from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE
+from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 
 Array = npt.NDArray[Any]
 
@@ -61,7 +61,7 @@ class KernelCamera:
     @property
     def tiles(self) -> tuple[int, int]:
         """Rows and columns of tiles."""
-        return -(-self.height // TILE), -(-self.width // TILE)
+        return tile_grid(self.height, self.width)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,9 @@ from spackle.render.pipeline import Canvas, Drawing, blend, project
 from spackle.render.project import DEPTH, KernelCamera, Splats
 from spackle.render.protocol import Rendering
 
-State = tuple[int, int]  # the count of a tensor's changes in place, and where it lies
+Array = npt.NDArray[Any]
+
+MERGE_GRAIN = 64  # tiles a thread merges at a time
 
 
 class Snapshot:
@@ -42,14 +44,9 @@ class Snapshot:
         )
 
 
-def _state(tensor: Tensor) -> State:
+def _state(tensor: Tensor) -> tuple[int, int]:
     """What changes when PyTorch changes a tensor in place; a write to its memory by others is not seen."""
     return tensor._version, tensor.data_ptr()
-
-
-Array = npt.NDArray[Any]
-
-MERGE_GRAIN = 64  # tiles a thread merges at a time
 
 
 @dataclasses.dataclass(frozen=True)

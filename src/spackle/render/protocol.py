@@ -21,9 +21,14 @@ class Rendering:
     depth: Tensor  # [H, W] expected z, normalised by alpha; 0 where alpha is 0
     alpha: Tensor  # [H, W] accumulated opacity in 0..1
 
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The three images in field order."""
+        return self.rgb, self.depth, self.alpha
+
     def detach(self) -> Rendering:
         """The same values cut off from autograd."""
-        return Rendering(self.rgb.detach(), self.depth.detach(), self.alpha.detach())
+        return Rendering(*(image.detach() for image in self.tensors))
 
 
 ALPHA_MAX = 0.999  # one Gaussian's largest alpha (released gsplat; its main branch has 0.99)
@@ -61,13 +66,18 @@ class Renderer(Protocol):
         ...
 
 
+def tile_grid(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of tiles in an image."""
+    return -(-height // TILE), -(-width // TILE)
+
+
 def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
     """[H, W] bool: the pixels of the chosen tiles, [rows, columns] bool.
 
     Raises:
         ValueError: the tiles are not those of an image of this size.
     """
-    if tuple(tiles.shape) != (-(-height // TILE), -(-width // TILE)):
+    if tuple(tiles.shape) != tile_grid(height, width):
         raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected one of each {TILE}×{TILE} pixels")
     return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
 
@@ -75,7 +85,6 @@ def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
 def paste(rendering: Rendering, tiles: Tensor, onto: Rendering | None) -> Rendering:
     """Keep the chosen tiles of a rendering, [rows, columns] bool, and the rest of `onto`, or black."""
     mask = tile_mask(tiles, *rendering.alpha.shape)
-    parts = (rendering.rgb, rendering.depth, rendering.alpha)
-    others = (onto.rgb, onto.depth, onto.alpha) if onto is not None else tuple(torch.zeros_like(p) for p in parts)
-    rgb = torch.where(mask[..., None], parts[0], others[0])
-    return Rendering(rgb, torch.where(mask, parts[1], others[1]), torch.where(mask, parts[2], others[2]))
+    others = onto.tensors if onto is not None else tuple(torch.zeros_like(image) for image in rendering.tensors)
+    masks = (mask[..., None], mask, mask)
+    return Rendering(*(torch.where(*images) for images in zip(masks, rendering.tensors, others, strict=True)))

@@ -1,28 +1,38 @@
-"""Camera paths through keyframes: the interpolation, and the files that hold them."""
+"""Camera paths: the closed forms of the trajectories, and the interpolation between keyframes."""
 
 from __future__ import annotations
 
-import json
+import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from command import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box_before_wall
+from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, Keyframe, KeyframePath, PathError, interpolate, max_offset, view_matrix
-from spackle.errors import InputError
-from spackle.formats import load_path
-from spackle.formats.camera_files import MAX_PATH_BYTES
+from spackle.camera_path import (
+    TRAJECTORIES,
+    DepthRange,
+    Keyframe,
+    KeyframePath,
+    PathError,
+    extremes,
+    interpolate,
+    max_offset,
+    trajectory,
+    view_matrix,
+)
+from spackle.gaussians import Gaussians
 from spackle.jobs.film import fly
 from spackle.jobs.video_options import VideoOptions
 
+PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
+RANGE = DepthRange(near=2.0, focus=4.0)
 CAMERA = Camera.from_focal(60, 64, 48)
 DEPTHS = DepthRange(near=1.5, focus=4.0)
 TARGET = (0.0, 0.0, 4.0)
@@ -148,110 +158,99 @@ def test_what_happens_between_keys_is_looked_at_too() -> None:
         fly(box_before_wall().base(), CAMERA, slow, 0.3, None, VideoOptions())
 
 
-# Files
+# Trajectories
 
 
-def content(**changes: Any) -> dict[str, Any]:
-    keys = [{"time": 0, "eye": [0, 0, 0], "target": [0, 0, 3]}, {"time": 1.5, "eye": [0.2, 0, 0], "target": [0, 0, 3]}]
-    return {"keyframes": keys} | changes
+def points_of(gaussian_depths: Tensor) -> Gaussians:
+    """Gaussians on the optical axis."""
+    n = len(gaussian_depths)
+    means = torch.zeros(n, 3)
+    means[:, 2] = gaussian_depths
+    return Gaussians(means, torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), torch.ones(n, 3))
 
 
-def with_key(**changes: Any) -> dict[str, Any]:
-    """A file whose second key is changed; None takes a name away."""
-    made = content()
-    key = made["keyframes"][1] | changes
-    made["keyframes"][1] = {name: value for name, value in key.items() if value is not None}
-    return made
+def eyes(path: list[Camera]) -> Tensor:
+    return torch.stack([camera.position for camera in path]).double()
 
 
-def test_a_path_file_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "p.json"
-    file.write_text(json.dumps(with_key(up=[0, -1, 0.1], fov=50) | {"closed": True, "unit": "disparity"}))
-    path = load_path(file)
-    assert path.keys == (
-        Keyframe(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
-        Keyframe(1.5, (0.2, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, -1.0, 0.1), 50.0),
-    )
-    assert (path.closed, path.unit) == (True, "disparity")
+def test_depths_are_quantiles_of_what_stands_in_front() -> None:
+    depths = 3 + 5 * torch.rand(5000, generator=torch.Generator().manual_seed(0))
+    behind = torch.tensor([-1.0, 0.0, math.nan])
+    found = DepthRange.of(points_of(torch.cat([depths, behind])))
+    expected = np.quantile(depths.double().numpy(), [0.001, 0.1])
+    assert [found.near, found.focus] == pytest.approx(expected)
 
 
-BAD: dict[str, tuple[Any, str]] = {
-    "not JSON": ("{", "not JSON"),
-    "deep": ("[" * 100_000, "not JSON"),
-    "a list": ([], "needs a list"),
-    "no list": ({"keyframes": {}}, "needs a list"),
-    "no key": (content(keyframes=[]), "two keyframes, got 0"),
-    "one key": (content(keyframes=content()["keyframes"][:1]), "two keyframes, got 1"),
-    "too many": (content(keyframes=[0] * 10_001), "too many"),
-    "unknown name": (content(loop=1), "unknown name 'loop'"),
-    "closed 1": (content(closed=1), '"closed"'),
-    "unit": (content(unit="feet"), '"unit"'),
-    "unit list": (content(unit=[]), '"unit"'),
-    "no object": (content(keyframes=[1, 2]), "keyframe 0: must be an object"),
-    "NaN": (with_key(eye=[math.nan, 0, 0]), 'keyframe 1: "eye" must be a finite number'),
-    "infinite time": (with_key(time=math.inf), 'keyframe 1: "time" must be a finite number'),
-    "huge": (with_key(eye=[10**400, 0, 0]), 'keyframe 1: "eye"'),
-    "a word": (with_key(eye=["left", 0, 0]), 'keyframe 1: "eye" must hold numbers, not "left"'),
-    "true": (with_key(time=True), 'keyframe 1: "time" must hold numbers, not true'),
-    "two numbers": (with_key(target=[0, 0]), '"target" must be a list of three'),
-    "no eye": (with_key(eye=None), 'keyframe 1: must be an object with "time", "eye"'),
-    "key name": (with_key(roll=3), "keyframe 1: unknown name 'roll'"),
-    "zero look": (with_key(target=[0.2, 0, 0]), "keyframe 1: eye and target coincide"),
-    "up along": (with_key(up=[0.2, 0, -3]), "keyframe 1: up lies along the view"),
-    "no up": (with_key(up=[0, 0, 0]), "keyframe 1: up has no length"),
-    "wide": (with_key(fov=179), "keyframe 1: fov must be from 1 to 170"),
-    "fov 0": (with_key(fov=0), "keyframe 1: fov"),
-    "same time": (with_key(time=0), "times must increase, by a microsecond at least: keyframe 1 is at 0 s"),
-    "hardly later": (with_key(time=1e-300), "times must increase, by a microsecond"),
-    "back in time": (with_key(time=-1), "times must increase"),
-    "twice": ('{"keyframes": [], "keyframes": []}', "'keyframes' is there twice"),
-}
+def test_the_focus_is_never_nearer_than_two_metres() -> None:
+    found = DepthRange.of(points_of(torch.linspace(0.5, 1.5, 101)))
+    assert found.near == pytest.approx(0.501, abs=1e-6)
+    assert found.focus == 2.0
 
 
-@pytest.mark.parametrize("kind", BAD)
-def test_a_bad_path_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
-    made, reason = BAD[kind]
-    file = tmp_path / "bad.json"
-    file.write_text(made if isinstance(made, str) else json.dumps(made))
-    with pytest.raises(InputError) as refusal:
-        load_path(file)
-    assert str(refusal.value).startswith(f"{file}: ")
-    assert reason in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+@pytest.mark.parametrize("depths", [[], [-1.0, 0.0]])
+def test_nothing_in_front_has_no_depths(depths: list[float]) -> None:
+    with pytest.raises(ValueError, match="in front"):
+        DepthRange.of(points_of(torch.tensor(depths)))
 
 
-def test_a_file_that_is_far_too_long_is_not_read(tmp_path: Path) -> None:
-    file = tmp_path / "long.json"
-    with open(file, "wb") as sparse:
-        sparse.truncate(1 << 30)
-    assert MAX_PATH_BYTES < 1 << 30
-    with pytest.raises(InputError, match="too long for a path file"):
-        load_path(file)
-    for name in ("missing.json", "."):
-        with pytest.raises(InputError, match="path file"):
-            load_path(tmp_path / name)
+def test_the_widest_offset_by_hand() -> None:
+    assert max_offset(PHOTO, 0.3, RANGE) == pytest.approx(0.3 * 1.0 * 2.0)
+    tall = PHOTO.K.clone()
+    tall[1, 1] = 250  # W/fx = 0.8, H/fy = 1.2
+    assert max_offset(dataclasses.replace(PHOTO, K=tall), 0.5, RANGE) == pytest.approx(math.sqrt(0.64 + 1.44))
+    assert max_offset(PHOTO.resized(800, 600), 0.3, RANGE) == pytest.approx(0.6)  # resolution plays no part
 
 
-def test_the_command_line_refuses_before_anything_is_loaded(tmp_path: Path) -> None:
-    good, bad = tmp_path / "good.json", tmp_path / "bad.json"
-    good.write_text(json.dumps(content()))
-    bad.write_text(json.dumps(with_key(target=[0.2, 0, 0])))
-    cases = (
-        (("--path", bad), "bad.json: keyframe 1: eye and target coincide"),
-        (("--path", good, "--trajectory", "swipe"), "--trajectory swipe"),
-        (
-            ("--path", good, "--disparity", 0.2),
-            "a camera path of its own: leave --disparity 0.2 out",
+def closed_form(kind: str, offset: float, near: float, frames: int) -> list[tuple[float, float, float]]:
+    """The eye's path, written down once more."""
+
+    def at(index: int, count: int) -> float:
+        return index / (count - 1) if count > 1 else 0.0
+
+    def turn(index: int, count: int) -> float:
+        return 2 * math.pi * at(index, count)
+
+    across = frames // 2
+    forms = {
+        "swipe": lambda k: (offset * (2 * at(k, frames) - 1), 0.0, 0.0),
+        "shake": lambda k: (
+            (offset * math.sin(turn(k, across)), 0.0, 0.0)
+            if k < across
+            else (0.0, offset * math.sin(turn(k - across, frames - across)), 0.0)
         ),
-        (("--path", good, "--cameras", bad), "--cameras"),
-        (("--cameras", bad, "--disparity", 0.3), "gives the views themselves: leave --disparity 0.3 out"),
-        (("--cameras", bad, "--trajectory", "rotate_forward"), "leave --trajectory rotate-forward out"),
-        (("--cameras", bad, "--frames", 9), "leave --frames 9 out"),
-        (("--path", tmp_path / "none.json"), "none.json: no such path file"),
-    )
-    for command in ("predict", "render"):
-        for options, reason in cases:
-            result = run(command, "-i", tmp_path / "nothing", "-o", tmp_path / "out", *options)
-            assert (result.code, len(result.lines)) == (2, 1), result.err
-            assert reason in result.err
-    assert not (tmp_path / "out").exists()
+        "rotate": lambda k: (offset * math.sin(turn(k, frames)), offset * math.cos(turn(k, frames)), 0.0),
+        "rotate_forward": lambda k: (
+            offset * math.sin(turn(k, frames)),
+            0.0,
+            0.15 * near * (1 - math.cos(turn(k, frames))) / 2,
+        ),
+    }
+    return [forms[kind](k) for k in range(frames)]
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("frames", [1, 2, 7, 60])
+def test_paths_have_their_closed_forms(kind: str, frames: int) -> None:
+    path = trajectory(kind, PHOTO, 0.4, RANGE, frames)  # type: ignore[arg-type]
+    assert len(path) == frames
+    for camera in path:
+        uv, _ = camera.project(torch.tensor([0.0, 0.0, RANGE.focus]))
+        assert uv.tolist() == pytest.approx([200, 150], abs=1e-3)
+        assert torch.equal(camera.K, PHOTO.K)
+    expected = torch.tensor(closed_form(kind, 0.8, 2.0, frames), dtype=torch.float64)
+    torch.testing.assert_close(eyes(path), expected, rtol=0, atol=1e-6)
+
+
+def test_the_extremes_are_the_ends_of_a_swipe() -> None:
+    left, right = extremes(PHOTO, 0.5, RANGE)
+    ends = trajectory("swipe", PHOTO, 0.5, RANGE, 31)
+    for camera, end, x in ((left, ends[0], -1.0), (right, ends[-1], 1.0)):
+        assert torch.equal(camera.world_to_camera, end.world_to_camera)
+        assert camera.position.tolist() == pytest.approx([x, 0, 0], abs=1e-6)
+
+
+def test_impossible_paths_are_refused() -> None:
+    with pytest.raises(ValueError, match="rotate_forward"):
+        trajectory("spiral", PHOTO, 0.3, RANGE)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at least one frame"):
+        trajectory("swipe", PHOTO, 0.3, RANGE, frames=0)

@@ -1,4 +1,4 @@
-"""Camera files: round trips and everything that is not a camera."""
+"""Camera and path files: round trips and everything that is not a camera or a path."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import copy
 import json
 import math
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spackle.camera import Camera
+from spackle.camera_path import Keyframe
 from spackle.errors import InputError
-from spackle.formats import load_cameras, save_cameras
+from spackle.formats import load_cameras, load_path, save_cameras
 from spackle.gaussians import quat_to_matrix
 
 GOOD: dict[str, Any] = {
@@ -34,6 +37,14 @@ GOOD: dict[str, Any] = {
 def write(path: Path, content: Any) -> Path:
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
+
+
+def refused(load: Callable[[Path], object], path: Path, says: str) -> None:
+    """In one line that begins with the file's name."""
+    with pytest.raises(InputError, match=says) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
 
 
 def test_reads_the_documented_format(tmp_path: Path) -> None:
@@ -126,27 +137,94 @@ BAD: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("kind", BAD)
-def test_bad_files(tmp_path: Path, kind: str) -> None:
+def test_a_bad_camera_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
     content, says = BAD[kind]
-    path = write(tmp_path / "c.json", content)
-    with pytest.raises(InputError, match=says) as caught:
-        load_cameras(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    refused(load_cameras, write(tmp_path / "c.json", content), says)
+
+
+def path_content(**changes: Any) -> dict[str, Any]:
+    keys = [{"time": 0, "eye": [0, 0, 0], "target": [0, 0, 3]}, {"time": 1.5, "eye": [0.2, 0, 0], "target": [0, 0, 3]}]
+    return {"keyframes": keys} | changes
+
+
+def with_key(**changes: Any) -> dict[str, Any]:
+    """A file whose second key is changed; None takes a name away."""
+    made = path_content()
+    key = made["keyframes"][1] | changes
+    made["keyframes"][1] = {name: value for name, value in key.items() if value is not None}
+    return made
+
+
+def test_a_path_file_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "p.json"
+    file.write_text(json.dumps(with_key(up=[0, -1, 0.1], fov=50) | {"closed": True, "unit": "disparity"}))
+    path = load_path(file)
+    assert path.keys == (
+        Keyframe(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
+        Keyframe(1.5, (0.2, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, -1.0, 0.1), 50.0),
+    )
+    assert (path.closed, path.unit) == (True, "disparity")
+
+
+BAD_PATHS: dict[str, tuple[Any, str]] = {
+    "not JSON": ("{", "not JSON"),
+    "deep": ("[" * 100_000, "not JSON"),
+    "a list": ([], "needs a list"),
+    "no list": ({"keyframes": {}}, "needs a list"),
+    "no key": (path_content(keyframes=[]), "two keyframes, got 0"),
+    "one key": (path_content(keyframes=path_content()["keyframes"][:1]), "two keyframes, got 1"),
+    "too many": (path_content(keyframes=[0] * 10_001), "too many"),
+    "unknown name": (path_content(loop=1), "unknown name 'loop'"),
+    "closed 1": (path_content(closed=1), '"closed"'),
+    "unit": (path_content(unit="feet"), '"unit"'),
+    "unit list": (path_content(unit=[]), '"unit"'),
+    "no object": (path_content(keyframes=[1, 2]), "keyframe 0: must be an object"),
+    "NaN": (with_key(eye=[math.nan, 0, 0]), 'keyframe 1: "eye" must be a finite number'),
+    "infinite time": (with_key(time=math.inf), 'keyframe 1: "time" must be a finite number'),
+    "huge": (with_key(eye=[10**400, 0, 0]), 'keyframe 1: "eye"'),
+    "a word": (with_key(eye=["left", 0, 0]), 'keyframe 1: "eye" must hold numbers, not "left"'),
+    "true": (with_key(time=True), 'keyframe 1: "time" must hold numbers, not true'),
+    "two numbers": (with_key(target=[0, 0]), '"target" must be a list of three'),
+    "no eye": (with_key(eye=None), 'keyframe 1: must be an object with "time", "eye"'),
+    "key name": (with_key(roll=3), "keyframe 1: unknown name 'roll'"),
+    "zero look": (with_key(target=[0.2, 0, 0]), "keyframe 1: eye and target coincide"),
+    "up along": (with_key(up=[0.2, 0, -3]), "keyframe 1: up lies along the view"),
+    "no up": (with_key(up=[0, 0, 0]), "keyframe 1: up has no length"),
+    "wide": (with_key(fov=179), "keyframe 1: fov must be from 1 to 170"),
+    "fov 0": (with_key(fov=0), "keyframe 1: fov"),
+    "same time": (with_key(time=0), "times must increase, by a microsecond at least: keyframe 1 is at 0 s"),
+    "hardly later": (with_key(time=1e-300), "times must increase, by a microsecond"),
+    "back in time": (with_key(time=-1), "times must increase"),
+    "twice": ('{"keyframes": [], "keyframes": []}', "'keyframes' is there twice"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PATHS)
+def test_a_bad_path_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
+    content, says = BAD_PATHS[kind]
+    refused(load_path, write(tmp_path / "p.json", content), re.escape(says))
 
 
 def test_a_nearly_rigid_pose_is_taken(tmp_path: Path) -> None:
     assert len(load_cameras(write(tmp_path / "c.json", pose(0, 0, 1.0003)))) == 1
 
 
-def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such camera file"):
-        load_cameras(tmp_path / "none.json")
+@pytest.mark.parametrize(("load", "kind"), [(load_cameras, "camera file"), (load_path, "path file")])
+def test_files_that_are_not_there_not_text_or_far_too_long(
+    tmp_path: Path, load: Callable[[Path], object], kind: str
+) -> None:
+    refused(load, tmp_path / "none.json", f"no such {kind}")
+    refused(load, tmp_path, f"name of a {kind}")
     (tmp_path / "c.json").write_bytes(b"\xff\xfe\x00{")
-    with pytest.raises(InputError, match="not JSON"):
-        load_cameras(tmp_path / "c.json")
+    refused(load, tmp_path / "c.json", "not JSON")
+    with open(tmp_path / "c.json", "wb") as sparse:
+        sparse.truncate(1 << 30)
+    refused(load, tmp_path / "c.json", f"too long for a {kind}")
+
+
+def test_cameras_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one"):
         save_cameras([], tmp_path / "d.json")
     with pytest.raises(InputError, match="cannot write"):
         save_cameras([Camera.from_focal(5, 4, 4)], tmp_path / "none" / "d.json")
-    assert os.listdir(tmp_path) == ["c.json"]
+    assert not os.listdir(tmp_path)
