@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from holes import CPU, random_network
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import away, box_before_wall, psnr, same_bits, shifted, slanted_plane, wall
@@ -17,13 +18,11 @@ import spackle
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer
 from spackle.render.reference import ReferenceRenderer
-from spackle.residual import Completer, Cues, ResidualNet, hole_area_ratio, hole_mask
+from spackle.residual import Completer, Cues, hole_area_ratio, hole_mask
 from spackle.residual.complete import PASSES
 from spackle.residual.seeds import cell_centers
 
-CPU = CpuRenderer()
 SOURCES = Path(spackle.__file__).parent
 SCENES = {
     "box": box_before_wall(),
@@ -31,16 +30,6 @@ SCENES = {
     "floor": slanted_plane(1.5, 6, 0, width=96, height=72, focal=90),
     "side wall": slanted_plane(1.5, 6, 1, width=96, height=72, focal=90),
 }
-
-
-def random_network(seed: int = 0, size: float = 0.02) -> ResidualNet:
-    """A network that says something about every cell, if nothing sensible."""
-    torch.manual_seed(seed)
-    network = ResidualNet()
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.add_(size * torch.randn_like(parameter))
-    return network
 
 
 @functools.cache
@@ -173,9 +162,9 @@ TWINS = {
     "evaluation/naive_renderer.py": "test_suite.py",
     "fill.py": "test_fill.py",
     "render": "test_render.py",
-    "residual/occlusion_guard.py": "test_residual.py",
-    "residual/hole_features.py": "test_residual.py",
-    "residual/seeds.py": "test_residual.py",
+    "residual/occlusion_guard.py": "test_occlusion_guard.py",
+    "residual/hole_features.py": "test_hole_features.py",
+    "residual/seeds.py": "test_seeds.py",
     "surface.py": "test_surface.py",
 }
 

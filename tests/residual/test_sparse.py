@@ -1,32 +1,127 @@
-"""The network at some cells alone says there what it says when it computes all."""
+"""f_res where it is needed: crops around the holes, and its fine layers at some cells, say what the whole says."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
+from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
+from holes import CPU, CountingNetwork, box_view, features_of, shipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import box_before_wall
+from scenes import Scene, texture
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
+from torch.utils.flop_counter import FlopCounterMode
 
+from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.evaluation.timing import count_flops
-from spackle.render import CpuRenderer
-from spackle.residual import Cues, ResidualNet, make_seeds
+from spackle.residual import Cues, ResidualNet, Seeds, hole_area_ratio
 from spackle.residual import network as residual_network
-from spackle.residual.network import IN_CHANNELS, network_input, predict_deltas, shipped_network
+from spackle.residual.complete import SEEDS_HAR
+from spackle.residual.network import IN_CHANNELS, STRIDE, network_input, predict_deltas
 from spackle.residual.seeds import Rim
-from spackle.residual.sparse import Cells, conv_rows, relu_rows, upsampled
+from spackle.residual.sparse import Cells, Crop, conv_rows, crops_around, relu_rows, upsampled
+
+# Crops
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**31), st.integers(1, 150), st.integers(1, 150), st.integers(0, 6), st.sampled_from([0, 5, 40]))
+def test_each_masked_cell_is_in_one_crop_and_has_its_surroundings(
+    seed: int, height: int, width: int, spots: int, margin: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    for _ in range(spots):
+        y, x = int(rng.integers(height)), int(rng.integers(width))
+        mask[y : y + int(rng.integers(1, 20)), x : x + int(rng.integers(1, 20))] = True
+    times = torch.zeros(height, width, dtype=torch.int32)
+    pairs = crops_around(mask, STRIDE, margin)
+    for inner, outer in pairs:
+        times[inner.slices] += 1
+        assert outer.top % STRIDE == outer.left % STRIDE == 0
+        for low, own, end, full in (
+            (outer.top, inner.top, outer.bottom, height),
+            (outer.left, inner.left, outer.right, width),
+        ):
+            assert low <= max(0, own - margin)
+            assert end == full or end % STRIDE == 0
+        assert outer.bottom >= min(inner.bottom + margin, height)
+        assert outer.right >= min(inner.right + margin, width)
+    assert bool((times[mask] == 1).all())
+    assert bool((times <= 1).all())
+    assert sum(outer.area for _, outer in pairs) <= height * width
+
+
+def test_holes_far_apart_are_looked_at_apart_and_a_full_mask_at_once() -> None:
+    mask = torch.zeros(768, 768, dtype=torch.bool)
+    assert crops_around(mask, STRIDE) == []
+    mask[10:20, 30:40] = mask[600:640, 700:710] = True
+    pairs = crops_around(mask, STRIDE)
+    assert len(pairs) == 2
+    assert sum(outer.area for _, outer in pairs) < 0.1 * mask.numel()
+    assert crops_around(~mask, STRIDE) == [(Crop(0, 0, 768, 768),) * 2]
+
+
+def test_a_frame_of_holes_is_cut_into_its_sides() -> None:
+    mask = torch.zeros(768, 768, dtype=torch.bool)
+    mask[:, :12] = mask[:10, :400] = mask[758:, :400] = True
+    mask[160:310, 190:230] = mask[270:420, 560:615] = True
+    pairs = crops_around(mask, STRIDE)
+    assert len(pairs) >= 5
+    assert sum(outer.area for _, outer in pairs) < 0.52 * mask.numel()
 
 
 @pytest.fixture(scope="module")
-def network() -> ResidualNet:
-    shipped = shipped_network()
-    assert shipped is not None
-    return shipped
+def view() -> tuple[Cues, Seeds, Rim]:
+    """A board before the left end of a long wall, seen from the side."""
+    height, width = 96, 640
+    depth = torch.full((height, width), 4.0)
+    depth[20:70, 40:90] = 2.0
+    scene = Scene(texture(height, width), depth, Camera.from_focal(500, width, height))
+    base = scene.base()
+    return features_of(base, extremes(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera)
+
+
+def test_crops_give_what_the_whole_picture_gives(view: tuple[Cues, Seeds, Rim]) -> None:
+    mask = view[0].mask
+    whole, cropped = CountingNetwork(shipped()), CountingNetwork(shipped())
+    one = predict_deltas(whole, *view, "fp32", dense=True)
+    other = predict_deltas(cropped, *view, "fp32")
+    assert whole.cells == mask.numel()
+    assert 0 < cropped.cells < 0.8 * whole.cells
+    assert bool(one.any(-1)[::47, ::53].all())  # dense deltas are those of every cell
+    torch.testing.assert_close(other[mask], one[mask], rtol=0, atol=0.01)
+    assert float((other - one)[mask].abs().mean()) < 1e-3
+    bf16 = predict_deltas(shipped(), *view, "bf16")
+    assert float((other - one)[mask].abs().mean()) < 0.1 * float((bf16 - other)[mask].abs().mean())
+
+
+def test_an_empty_mask_costs_the_network_nothing(view: tuple[Cues, Seeds, Rim]) -> None:
+    cues, seeds, rim = view
+    counting = CountingNetwork(shipped())
+    predict_deltas(counting, dataclasses.replace(cues, mask=torch.zeros_like(cues.mask)), seeds, rim)
+    assert counting.cells == 0
+
+
+def test_specks_of_a_path_are_the_seeds_alone_and_great_holes_the_networks() -> None:
+    subject, wide = box_view(0.3, width=160, height=120)
+    _, little = box_view(0.006, width=160, height=120)
+    counting = CountingNetwork(shipped())
+    subject = dataclasses.replace(subject, network=counting)  # type: ignore[arg-type]
+    holes = [hole_area_ratio(CPU.render(subject.base, camera).alpha) for camera in (wide, little)]
+    assert holes[1] < SEEDS_HAR < holes[0]
+    for camera, exact, asked in ((little, False, False), (little, True, True), (wide, False, True)):
+        counting.cells = 0
+        assert len(subject.complete_scene([camera], exact=exact)) > 0
+        assert bool(counting.cells) == asked
+
+
+# Some cells
 
 
 def some_cells(height: int, width: int, share: float, seed: int) -> Tensor:
@@ -43,9 +138,6 @@ def table_of(grid: Tensor, cells: Cells) -> Tensor:
 
 def close(found: Tensor, expected: Tensor, tolerance: float) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance * float(expected.abs().max()))
-
-
-# The pieces
 
 
 @settings(deadline=None, max_examples=30)
@@ -72,15 +164,13 @@ def test_cells_grow_to_all_sides_and_stay_in_the_grid() -> None:
     assert grown.nonzero().tolist() == [[row, column] for row in range(3) for column in range(1, 6)]
 
 
-# The network
-
-
 @pytest.mark.parametrize("few", [0.0, 0.45, 2.0])  # all by convolutions, as it comes, all by rows
 @pytest.mark.parametrize(("height", "width", "share"), [(37, 53, 0.002), (64, 48, 0.03), (1, 1, 1.0), (20, 90, 0.4)])
 def test_some_cells_get_the_deltas_that_all_would_get(
-    network: ResidualNet, monkeypatch: pytest.MonkeyPatch, height: int, width: int, share: float, few: float
+    monkeypatch: pytest.MonkeyPatch, height: int, width: int, share: float, few: float
 ) -> None:
     monkeypatch.setattr(residual_network, "FEW", few)
+    network = shipped()
     features = torch.randn(1, IN_CHANNELS, height, width, generator=torch.Generator().manual_seed(1))
     mask = some_cells(height, width, share, 2)
     with torch.no_grad():
@@ -93,31 +183,32 @@ def test_some_cells_get_the_deltas_that_all_would_get(
     assert float((found - dense).abs().mean()) <= 0.5 * float(lost)
 
 
-def test_few_cells_cost_little_more_than_the_encoder(network: ResidualNet) -> None:
+def operations(call: Callable[[], object]) -> int:
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        call()
+    return counter.get_total_flops()
+
+
+def test_few_cells_cost_little_more_than_the_encoder() -> None:
     features, mask = torch.randn(1, IN_CHANNELS, 128, 128), torch.zeros(128, 128, dtype=torch.bool)
     mask[60:64, 60:80] = True
-    with torch.no_grad():
-        costs = [count_flops(call) for call in (lambda: network.deltas_at(features, mask), lambda: network(features))]
-        assert costs[0] < 0.55 * costs[1]
-        assert count_flops(lambda: network.deltas_at(features, torch.ones_like(mask))) == costs[1]
+    whole = operations(lambda: shipped()(features))
+    assert operations(lambda: shipped().deltas_at(features, mask)) < 0.55 * whole
+    assert operations(lambda: shipped().deltas_at(features, torch.ones_like(mask))) == whole
 
 
-def test_a_view_is_predicted_at_its_masked_cells_alone(network: ResidualNet, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = box_before_wall()
-    base = scene.base()
-    camera = extremes(scene.camera, 0.2, DepthRange.of(base))[1]
-    cues = Cues.of(CpuRenderer().render(base, camera))
-    seeds = make_seeds(cues, camera, scene.camera)
-    rim = Rim.of(cues, seeds, camera, scene.camera)
+def test_a_view_is_predicted_at_its_masked_cells_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    completer, camera = box_view()
+    cues, seeds, rim = features_of(completer.base, camera, completer.photo_camera)
     with torch.no_grad():
-        plain = network(network_input(cues, seeds, rim))[0].permute(1, 2, 0)
-    found = predict_deltas(network, cues, seeds, rim, "fp32")
+        plain = shipped()(network_input(cues, seeds, rim))[0].permute(1, 2, 0)
+    found = predict_deltas(shipped(), cues, seeds, rim, "fp32")
     assert cues.mask.any()
     close(found[cues.mask], plain[cues.mask], 1e-5)
     assert not found[~cues.mask].any()
     monkeypatch.setattr(ResidualNet, "deltas_at", None)
     with pytest.raises(TypeError):
-        predict_deltas(network, cues, seeds, rim, "fp32")
-    twin = copy.copy(network)
+        predict_deltas(shipped(), cues, seeds, rim, "fp32")
+    twin = copy.copy(shipped())
     twin.compiled = True  # of such a one, `forward` is what is compiled
     close(predict_deltas(twin, cues, seeds, rim, "fp32")[cues.mask], plain[cues.mask], 1e-5)

@@ -1,0 +1,76 @@
+"""Views with holes in them, and networks to fill them, that the residual's tests share."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from scenes import box_before_wall
+from torch import Tensor, nn
+
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
+from spackle.color import linear_to_srgb
+from spackle.gaussians import Gaussians
+from spackle.render import CpuRenderer
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, Cues, ResidualNet, Seeds, make_seeds
+from spackle.residual.network import shipped_network
+from spackle.residual.seeds import Rim
+
+CPU = CpuRenderer()
+
+
+def random_view(seed: int, height: int, width: int) -> Rendering:
+    """A rendering as it may come: holes, veils and solid pixels; depth 0 where alpha is 0."""
+    generator = torch.Generator().manual_seed(seed)
+    kind = torch.randint(0, 4, (height, width), generator=generator)
+    veil = torch.rand(height, width, generator=generator)
+    alpha = torch.where(kind == 0, 0.0, torch.where(kind == 1, veil, 0.96 + 0.039 * veil))
+    rgb = linear_to_srgb(alpha[..., None] * torch.rand(height, width, 3, generator=generator))
+    depth = torch.where(alpha > 0, 0.5 + 20 * torch.rand(height, width, generator=generator), 0.0)
+    return Rendering(rgb, depth, alpha)
+
+
+def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int = 72) -> tuple[Completer, Camera]:
+    """A box before a wall, and a view that looks behind the box."""
+    scene = box_before_wall(width=width, height=height, focal=width * 80 // 96)
+    completer = Completer(scene.base(), scene.camera, CPU)
+    return completer, extremes(scene.camera, disparity, DepthRange.of(completer.base))[side]
+
+
+def features_of(base: Gaussians | Rendering, camera: Camera, photo_camera: Camera) -> tuple[Cues, Seeds, Rim]:
+    """What f_res is given of a view: of Gaussians, or of a rendering."""
+    cues = Cues.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
+    seeds = make_seeds(cues, camera, photo_camera)
+    return cues, seeds, Rim.of(cues, seeds, camera, photo_camera)
+
+
+def random_network(seed: int = 0, size: float = 0.02) -> ResidualNet:
+    """A network whose last layers are not zero, so that everything in it matters, if nothing sensible."""
+    torch.manual_seed(seed)
+    network = ResidualNet()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(size * torch.randn_like(parameter))
+    return network
+
+
+@functools.cache
+def shipped() -> ResidualNet:
+    network = shipped_network()
+    assert network is not None
+    return network
+
+
+class CountingNetwork(nn.Module):
+    """A network that keeps how many cells it was shown."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network, self.cells = network, 0
+
+    def forward(self, features: Tensor) -> Tensor:
+        self.cells += features[0, 0].numel()
+        out: Tensor = self.network(features)
+        return out

@@ -1,0 +1,110 @@
+"""Composition: what each channel of a delta does to a seed's Gaussian."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import pytest
+import torch
+from scenes import shifted
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.gaussians import Gaussians
+from spackle.residual import Seeds
+from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
+from spackle.residual.seeds import OPACITY
+
+
+def flat_seeds(count: int) -> tuple[Seeds, Camera]:
+    """Seeds all over a picture, their colours off black and white."""
+    generator = torch.Generator().manual_seed(0)
+    camera = shifted(Camera.from_focal(60, 64, 48), 0.4)
+    uv = torch.rand(count, 2, generator=generator) * torch.tensor([64.0, 48.0])
+    inverse = 0.1 + torch.rand(count, generator=generator)
+    slope = 0.01 * (torch.rand(count, 2, generator=generator) - 0.5)
+    return Seeds(uv, inverse, slope, 0.1 + 0.8 * torch.rand(count, 3, generator=generator)), camera
+
+
+def moved(channels: Sequence[int], by: float) -> tuple[Gaussians, Gaussians, Seeds, Camera]:
+    """Seeds without deltas, and with one delta."""
+    seeds, camera = flat_seeds(20)
+    deltas = torch.zeros(20, DELTA_CHANNELS)
+    deltas[:, list(channels)] = by
+    return compose(seeds, None, camera), compose(seeds, deltas, camera), seeds, camera
+
+
+def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
+    seeds, camera = flat_seeds(50)
+    none, zeros = compose(seeds, None, camera), compose(seeds, torch.zeros(50, DELTA_CHANNELS), camera)
+    for one, other in zip(none.tensors, zeros.tensors, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    uv, z = camera.project(none.means)
+    torch.testing.assert_close(uv, seeds.uv, rtol=0, atol=1e-3)
+    torch.testing.assert_close(z, 1 / seeds.inverse_depth)
+    torch.testing.assert_close(none.colors, srgb_to_linear(seeds.rgb))
+    assert torch.equal(none.opacities, torch.full((50,), OPACITY))
+
+
+def test_black_and_white_seeds_survive_the_sigmoid_within_a_step_of_8_bits() -> None:
+    seeds, camera = flat_seeds(2)
+    seeds = dataclasses.replace(seeds, rgb=torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
+    found = linear_to_srgb(compose(seeds, torch.zeros(2, DELTA_CHANNELS), camera).colors)
+    assert float((found - seeds.rgb).abs().max()) <= COLOR_MARGIN * 1.01
+
+
+@pytest.mark.parametrize(("channel", "step"), [(0, (1.5, 0.0)), (1, (0.0, -2.0))])
+def test_the_first_two_channels_move_a_gaussian_on_the_image(channel: int, step: tuple[float, float]) -> None:
+    _, after, seeds, camera = moved([channel], sum(step))
+    uv, z = camera.project(after.means)
+    torch.testing.assert_close(uv, seeds.uv + torch.tensor(step), rtol=0, atol=1e-3)
+    torch.testing.assert_close(z, 1 / seeds.inverse_depth, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("by", [-20.0, -1.0, 1.0, 20.0])
+def test_the_third_channel_moves_it_along_its_ray_and_never_behind_the_eye(by: float) -> None:
+    before, after, seeds, camera = moved([2], by)
+    uv, z = camera.project(after.means)
+    torch.testing.assert_close(uv, seeds.uv, rtol=0, atol=1e-2)
+    assert float(z.min()) > 0
+    assert bool(((z < camera.project(before.means)[1]) == (by > 0)).all())  # inverse depth: more is nearer
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_scales_change_by_a_bounded_factor_each_axis_alone(axis: int) -> None:
+    for by, low, high in ((-1e4, 0.2499, 0.2501), (-0.01, 0.98, 0.995), (0.01, 1.005, 1.02), (1e4, 3.999, 4.001)):
+        before, after, _, _ = moved([3 + axis], by)
+        factor = after.scales / before.scales
+        assert low < float(factor[:, axis].min()) <= float(factor[:, axis].max()) < high
+        others = [k for k in range(3) if k != axis]
+        torch.testing.assert_close(factor[:, others], torch.ones(20, 2), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("by", [-1e4, -1.0, 1.0, 1e4])
+def test_colour_and_opacity_stay_within_bounds_whatever_the_delta(by: float) -> None:
+    before, after, _, _ = moved(range(10, 14), by)
+    for one, other in ((before.colors, after.colors), (before.opacities, after.opacities)):
+        assert 0 <= float(other.min()) <= float(other.max()) <= 1
+        assert bool(((other > one) == (by > 0)).all())
+
+
+def test_a_gaussian_depends_on_its_own_seed_and_delta_and_not_on_which_others_were_chosen() -> None:
+    seeds, camera = flat_seeds(40)
+    deltas = 0.5 * torch.randn(40, DELTA_CHANNELS, generator=torch.Generator().manual_seed(1))
+    chosen = seeds.inverse_depth > seeds.inverse_depth.median()
+    whole, part = compose(seeds, deltas, camera).select(chosen), compose(seeds.select(chosen), deltas[chosen], camera)
+    for one, other in zip(whole.tensors, part.tensors, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    none = seeds.select(torch.zeros(40, dtype=torch.bool))
+    assert len(compose(none, None, camera)) == len(compose(none, torch.zeros(0, DELTA_CHANNELS), camera)) == 0
+
+
+def test_gradients_reach_every_delta() -> None:
+    seeds, camera = flat_seeds(8)
+    deltas = torch.zeros(8, DELTA_CHANNELS, requires_grad=True)
+    found = compose(seeds, deltas, camera)
+    generator = torch.Generator().manual_seed(0)
+    torch.stack([(t * torch.rand(t.shape, generator=generator)).sum() for t in found.tensors]).sum().backward()
+    assert deltas.grad is not None
+    assert bool((deltas.grad.isfinite() & (deltas.grad != 0)).all())

@@ -1,0 +1,127 @@
+"""Aux Gaussians slide behind what other views show, and the eye that asked for them sees no difference."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from holes import CPU, box_view, random_view
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import away, same_bits, shifted
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.residual import hole_mask
+from spackle.residual.occlusion_guard import (
+    CLEARANCE,
+    MAX_REACH_PX,
+    REACH,
+    STEPS,
+    WINDOW_PX,
+    OcclusionGuard,
+    push_behind,
+)
+
+PROPERTY = settings(deadline=None, max_examples=40)
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def plain_push(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> tuple[list[float], list[int]]:
+    """The factors and the survivors of `push_behind`, one Gaussian at a time."""
+
+    def blocked(point: Tensor, covariance: Tensor) -> bool:
+        for guard in guards:
+            camera = guard.camera.to(dtype=torch.float64)
+            local, (uv, z) = camera.to_camera(point), camera.project(point)
+            if float(z) <= 0:
+                continue
+            rotation = camera.world_to_camera[:3, :3]
+            spread = rotation @ covariance @ rotation.T
+            reach = []
+            for axis in (0, 1):
+                row = torch.zeros(3, dtype=torch.float64)
+                row[axis], row[2] = 1 / z, -local[axis] / z**2
+                deviation = float(camera.K[axis, axis] * (row @ spread @ row).clamp_min(0).sqrt())
+                reach.append(min(REACH * deviation + 1, MAX_REACH_PX))
+            (u, v), (height, width) = uv.tolist(), guard.depth.shape
+            if not (-reach[0] <= u <= width + reach[0] and -reach[1] <= v <= height + reach[1]):
+                continue
+            across, down = (math.ceil(max(r - WINDOW_PX, 0) / (2 * WINDOW_PX)) for r in reach)
+            for j, i in itertools.product(range(-down, down + 1), range(-across, across + 1)):
+                row_, column = math.floor(v + 2 * WINDOW_PX * j), math.floor(u + 2 * WINDOW_PX * i)
+                seen = guard.depth[min(max(row_, 0), height - 1), min(max(column, 0), width - 1)]
+                if float(z) < float(seen) * (1 + CLEARANCE):
+                    return True
+        return False
+
+    factors, kept = [], []
+    covariances = aux.covariances().double()
+    for index, mean in enumerate(aux.means.double()):
+        for step in range(STEPS):
+            factor = 1 / (1 - step / STEPS)
+            if not blocked(eye.double() + factor * (mean - eye.double()), factor**2 * covariances[index]):
+                factors.append(factor)
+                kept.append(index)
+                break
+    return factors, kept
+
+
+def random_aux(count: int, seed: int) -> Gaussians:
+    """Gaussians all around the origin, some behind it."""
+    generator = torch.Generator().manual_seed(seed)
+    means = 6 * torch.randn(count, 3, generator=generator)
+    quats, scales = torch.randn(count, 4, generator=generator), torch.rand(count, 3, generator=generator)
+    return Gaussians(means, quats, scales, torch.rand(count, generator=generator), torch.rand(count, 3))
+
+
+@PROPERTY
+@given(SEEDS)
+def test_pushing_matches_a_plain_loop(seed: int) -> None:
+    aux, generator = random_aux(30, seed), torch.Generator().manual_seed(seed)
+    camera = Camera.from_focal(20, 16, 12)
+    cameras = [camera, shifted(camera, 1.5), away(camera)]
+    depths = [8 * torch.rand(12, 16, generator=generator) for _ in cameras]
+    guards = [OcclusionGuard(c, d * (d > 3)) for c, d in zip(cameras, depths, strict=True)]
+    eye = torch.randn(3, generator=generator)
+    factors, kept = plain_push(aux, eye, guards)
+    found, factor = push_behind(aux, eye, guards), torch.tensor(factors)[:, None]
+    assert len(found) == len(kept)
+    torch.testing.assert_close(found.means, eye + factor * (aux.means[kept] - eye), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.scales, aux.scales[kept] * factor, rtol=1e-4, atol=0)
+    for name in ("quats", "opacities", "colors"):
+        assert torch.equal(getattr(found, name), getattr(aux, name)[kept])
+
+
+@PROPERTY
+@given(SEEDS, st.tuples(st.integers(1, 90), st.integers(1, 30)))
+def test_a_guard_is_the_farthest_depth_in_a_window_and_none_over_holes(seed: int, size: tuple[int, int]) -> None:
+    view = random_view(seed, *size)
+    guard = OcclusionGuard.of(view, Camera.from_focal(20, size[1], size[0]))
+    seen = torch.where(hole_mask(view.alpha), 0.0, view.depth)[None, None]
+    assert torch.equal(guard.depth, max_pool2d(seen, 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0, 0])
+
+
+def test_pushing_changes_nothing_for_the_eye_that_asked() -> None:
+    completer, camera = box_view()
+    aux = completer.complete_view(camera, [])
+    pushed = push_behind(aux, camera.position, [completer.photo_guard()])
+    assert len(pushed) == len(aux)
+    assert bool((camera.to_camera(pushed.means)[:, 2] > camera.to_camera(aux.means)[:, 2] + 0.1).any())
+    torch.testing.assert_close(camera.project(pushed.means)[0], camera.project(aux.means)[0], rtol=0, atol=1e-2)
+    one, other = CPU.render(aux, camera), CPU.render(pushed, camera)
+    torch.testing.assert_close(other.alpha, one.alpha, rtol=0, atol=0.05)
+
+
+def test_without_guards_or_gaussians_or_in_front_of_the_camera_nothing_is_pushed() -> None:
+    aux, eye = random_aux(5, 0), torch.zeros(3)
+    assert same_bits(push_behind(aux, eye, []), aux)
+    guard = OcclusionGuard(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))
+    assert len(push_behind(Gaussians.empty(), eye, [guard])) == 0
+    behind = dataclasses.replace(random_aux(1, 0), means=torch.tensor([[0.1, 0.2, -3.0]]))
+    assert same_bits(push_behind(behind, eye, [guard]), behind)
