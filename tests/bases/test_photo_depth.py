@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import struct
 import time
 import zlib
@@ -84,9 +83,6 @@ def test_heic_with_apples_words(tmp_path: Path) -> None:
     assert depth.K is not None
     assert depth.K.tolist() == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
     assert depth.path == tmp_path / "portrait.xyz"
-
-
-def test_heic_with_apples_depth_in_metres(tmp_path: Path) -> None:
     depth = found(tmp_path, portraits.heic(codes(), apple_xmp("fdep", (0.5, 8.0), "absolute")))
     same(depth, 0.5 + 7.5 * codes().astype(np.float64) / 255)
     assert (depth.quantity, depth.K) == ("depth", None)
@@ -279,11 +275,8 @@ def test_disparity_beyond_the_horizon_is_far_not_unknown(tmp_path: Path) -> None
     assert float(depth.depth.max()) == pytest.approx(1 / (2.55 / 255 / 2))
     assert depth.depth[0, 0] == depth.depth.max()
     assert float(depth.depth.min()) == pytest.approx(1 / 2.45)
-
-
-def test_depth_that_is_not_above_zero_is_unknown(tmp_path: Path) -> None:
     depth = found(tmp_path, portraits.gdepth_jpeg(png(codes()), Range(0, 8, "RangeLinear")))
-    assert torch.equal(depth.valid, torch.from_numpy(codes() > 0))
+    assert torch.equal(depth.valid, torch.from_numpy(codes() > 0))  # depth that is not above zero is unknown
     assert torch.equal(depth.valid, depth.depth > 0)
 
 
@@ -354,24 +347,6 @@ def test_depth_in_a_heic_lifts_as_the_same_depth_beside_it(tmp_path: Path) -> No
     assert one.notes == other.notes
 
 
-def test_disparity_in_a_photo_lifts_as_the_same_disparity_beside_it(tmp_path: Path) -> None:
-    path = portraits.write(tmp_path / "portrait.heic", portraits.heic(codes(), apple_xmp(matrix=LENS)))
-    inside, photo = load_photo_depth(path), load_photo(path)
-    assert inside is not None
-    np.save(tmp_path / "disparity.npy", codes())
-    step = 2.5 / 255
-    scene = {"disparity": "disparity.npy", "focal_px": 35.0, "cx": 10.0, "cy": 15.0, "doffs_px": 0.5 / step}
-    (tmp_path / "scene.json").write_text(json.dumps(scene | {"baseline_m": 1 / step / 35}))
-    beside = load_depth(tmp_path / "disparity.npy")
-    assert inside.K is not None
-    assert beside.K is not None
-    assert beside.quantum == pytest.approx(inside.quantum)
-    beside.K[1, 1] = 25.0  # a calibrated pair has one focal length
-    one, other = (RgbdBase(depth).predict(photo) for depth in (inside, beside))
-    for a, b in zip(one.gaussians.tensors, other.gaussians.tensors, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-
-
 # Photos without depth.
 
 
@@ -398,18 +373,16 @@ def test_photos_without_depth(tmp_path: Path) -> None:
         "start.heic": b"\0\0\0\x18ftypheic" + bytes(20),
         "other.txt": b"neither a photo nor anything else",
     }
+    odd = portraits.with_segments(portraits.jpeg(codes()), portraits.xmp_segment(b"<<<not XML"))
+    odd_photo = portraits.with_segments(portraits.jpeg(picture()), portraits.xmp_segment(b"<<"))
+    files["odd.jpg"] = portraits.multi_picture(odd_photo, odd)
+    other_picture, link = portraits.heic(codes(), apple_xmp()), b"auxl" + struct.pack(">HHH", 2, 1, 1)
+    assert other_picture.count(link) == 1
+    files["other.heic"] = other_picture.replace(link, link[:-1] + b"\3")  # a map, but of another picture
     for name, data in files.items():
         assert load_photo_depth(portraits.write(tmp_path / name, data)) is None, name
     for name in ("photo.png", "photo.webp", "photo.tif"):
         assert load_photo_depth(write_photo(tmp_path / name)) is None, name
-
-
-def test_a_further_picture_that_is_no_depth_map_is_passed_over_however_odd_its_xmp(tmp_path: Path) -> None:
-    odd = portraits.with_segments(portraits.jpeg(codes()), portraits.xmp_segment(b"<<<not XML"))
-    photo = portraits.multi_picture(
-        portraits.with_segments(portraits.jpeg(picture()), portraits.xmp_segment(b"<<")), odd
-    )
-    assert load_photo_depth(portraits.write(tmp_path / "odd.jpg", photo)) is None
 
 
 def test_missing_and_empty_files(tmp_path: Path) -> None:
@@ -419,38 +392,21 @@ def test_missing_and_empty_files(tmp_path: Path) -> None:
             load_photo_depth(tmp_path / name)
 
 
-def test_a_depth_map_of_another_picture_in_the_file_is_not_the_photos(tmp_path: Path) -> None:
-    data, link = portraits.heic(codes(), apple_xmp()), b"auxl" + struct.pack(">HHH", 2, 1, 1)
-    assert data.count(link) == 1
-    other = data.replace(link, link[:-1] + b"\3")
-    assert load_photo_depth(portraits.write(tmp_path / "other.heic", other)) is None
-
-
 # Depth maps that are broken.
 
 
-@pytest.mark.parametrize("flat", [0, 7, 255])
-def test_a_map_with_one_value_is_refused(tmp_path: Path, flat: int) -> None:
-    image = np.full((24, 32), flat, np.uint8)
-    for data in (
-        portraits.heic(image, apple_xmp()),
-        portraits.apple_jpeg(image),
-        portraits.gdepth_jpeg(png(image)),
-        portraits.dynamic_jpeg(png(image)),
-    ):
-        refused(tmp_path, data, "the same value everywhere")
-
-
-def test_another_crop_is_refused(tmp_path: Path) -> None:
-    square = codes(32, 32)
-    for data in (
-        portraits.heic(square, apple_xmp()),
-        portraits.apple_jpeg(square),
-        portraits.gdepth_jpeg(png(square)),
-        portraits.dynamic_jpeg(png(square)),
-    ):
-        refused(tmp_path, data, "has 32×32 pixels but the photo 64×48, another crop")
-    refused(tmp_path, portraits.gdepth_jpeg(png(codes(24, 32))), "has 24×32 pixels")
+@pytest.mark.parametrize(
+    ("image", "why"),
+    [
+        *((np.full((24, 32), flat, np.uint8), "the same value everywhere") for flat in (0, 7, 255)),
+        (codes(32, 32), "has 32×32 pixels but the photo 64×48, another crop"),
+        (codes(24, 32), "has 24×32 pixels"),
+    ],
+)
+def test_a_map_with_one_value_or_of_another_crop_is_refused(tmp_path: Path, image: NDArray[Any], why: str) -> None:
+    gdepth, dynamic = portraits.gdepth_jpeg(png(image)), portraits.dynamic_jpeg(png(image))
+    for data in (portraits.heic(image, apple_xmp()), portraits.apple_jpeg(image), gdepth, dynamic):
+        refused(tmp_path, data, why)
     found(tmp_path, portraits.gdepth_jpeg(png(codes(133, 100))))  # within 1 %
 
 
@@ -499,10 +455,6 @@ def test_apples_range_that_is_missing(tmp_path: Path) -> None:
 )
 def test_androids_ranges_that_mean_nothing(tmp_path: Path, make: Callable[..., bytes], said: Range, why: str) -> None:
     refused(tmp_path, make(png(codes()), said), why)
-
-
-@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
-def test_androids_range_that_is_missing(tmp_path: Path, make: Callable[..., bytes]) -> None:
     data = make(png(codes()), Range(near=0.123))
     for missing in (b":Near", b":Format"):
         refused(tmp_path, data.replace(missing, missing[:2] + b"x" * (len(missing) - 2)), "missing|the format ''")

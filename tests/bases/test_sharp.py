@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,6 +130,9 @@ def test_group_norm_is_exact_over_half_a_million_pixels(channels_last: bool) -> 
 def test_without_deltas_gaussians_lie_on_the_nearest_depth_of_their_cells_with_its_colour() -> None:
     torch.manual_seed(0)
     image, depth = torch.rand(1, 3, 8, 8), 2 + torch.rand(1, 2, 8, 8)
+    for extreme in (1e-8, 1e9):  # stays finite
+        odd = compose(make_start(image, torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4))
+        assert all(bool(torch.isfinite(t).all()) for t in odd.tensors)
     gaussians = compose(make_start(image, depth), torch.zeros(14, 2, 4, 4))
     z = depth.reshape(2, 4, 2, 4, 2).amin((2, 4)).flatten()
     torch.testing.assert_close(gaussians.means[:, 2], z, rtol=5e-3, atol=0)  # farther than it is by 0.1 % a unit
@@ -139,13 +143,6 @@ def test_without_deltas_gaussians_lie_on_the_nearest_depth_of_their_cells_with_i
     torch.testing.assert_close(gaussians.colors, mean.repeat(2, 1), rtol=1e-4, atol=1e-5)
     assert torch.equal(gaussians.opacities, torch.full((32,), 0.5))
     assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(32, 4))
-
-
-def test_a_depth_of_nearly_nothing_or_far_away_stays_finite() -> None:
-    image = torch.rand(1, 3, 8, 8)
-    for depth in (1e-8, 1e9):
-        gaussians = compose(make_start(image, torch.full((1, 2, 8, 8), depth)), torch.zeros(14, 2, 4, 4))
-        assert all(bool(torch.isfinite(t).all()) for t in gaussians.tensors)
 
 
 def test_the_photo_is_stretched_to_the_square_with_corners_on_corners() -> None:
@@ -233,20 +230,11 @@ def test_auto_is_bf16_on_ampere_and_later(
     assert multiplies_bf16(torch.device("cuda")) is native
 
 
-def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-
-
-def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-
-
 @pytest.mark.parametrize("device", ["cuda", "cuda:0", "banana", "ban\x1b[31mana\n", "meta", "mps", ""])
 def test_a_device_that_is_not_there_is_one_line_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
-    no_cuda(monkeypatch)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr("spackle.bases.sharp.base.load_network", lambda *args: pytest.fail("read"))
     with pytest.raises(spackle.InputError, match="give cpu") as caught:
         SharpBase.load(tmp_path / "any.pt", device=device)
@@ -254,9 +242,10 @@ def test_a_device_that_is_not_there_is_one_line_before_anything_is_read(
 
 
 def test_a_device_that_is_there_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    no_cuda(monkeypatch)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert pick_device(None) == pick_device("cpu") == pick_device(CPU) == CPU
-    two_gpus(monkeypatch)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert (pick_device(None), pick_device("cpu")) == (torch.device("cuda"), CPU)
     assert pick_device("cuda:1") == torch.device("cuda:1")
     with pytest.raises(spackle.InputError, match="the last CUDA device is cuda:1"):
@@ -280,9 +269,6 @@ def test_too_little_memory_is_one_line(kind: str) -> None:
     with pytest.raises(spackle.InputError, match=r"^not enough memory .*: try this, or close other programs$"):  # noqa: SIM117
         with enough_memory("try this"):
             raise SHORTAGES[kind]
-
-
-def test_other_errors_are_not_taken_for_too_little_memory() -> None:
     with pytest.raises(RuntimeError, match="shapes"), enough_memory():
         raise RuntimeError("shapes do not fit")
 
@@ -307,22 +293,21 @@ def too_much_for_a_device(network: SharpNetwork, *device: object, **layout: obje
 
 
 @pytest.mark.parametrize(
-    ("kind", "method", "failing"),
-    [(Tensor, "clone", too_much), (Tensor, "float", too_much), (SharpNetwork, "to", too_much_for_a_device)],
+    ("kind", "method", "failing", "advice"),
+    [
+        (Tensor, "clone", too_much, "try --precision bf16, or close"),
+        (Tensor, "float", too_much, "try --precision bf16, or close"),
+        (SharpNetwork, "to", too_much_for_a_device, "try --precision bf16, or close"),
+        (torch, "load", too_much, "close"),  # to map the file
+    ],
 )
 def test_too_little_memory_to_load_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type, method: str, failing: Callable[..., object]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any, method: str, failing: Callable[..., object], advice: str
 ) -> None:
     path = write_tiny(tmp_path / "w.pt")
     monkeypatch.setattr(kind, method, failing)
-    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --precision bf16, or close"):
+    with pytest.raises(spackle.InputError, match=f"not enough memory for the network: {advice}"):
         SharpBase.load(path, precision="fp32", device="cpu")
-
-
-def test_too_little_memory_to_map_the_file_is_no_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "load", too_much)
-    with pytest.raises(spackle.InputError, match="not enough memory for the network"):
-        SharpBase.load(write_tiny(tmp_path / "w.pt"), device="cpu")
 
 
 def test_the_callers_autocast_stays_outside() -> None:
@@ -351,23 +336,15 @@ def _own_tf32_switches() -> Iterator[None]:
     torch.backends.cuda.matmul.fp32_precision, torch.backends.cudnn.conv.fp32_precision = matmul, conv
 
 
-def allow_by_the_older_switch() -> None:
-    torch.backends.cuda.matmul.allow_tf32 = True
-
-
-def allow_by_the_newer_switch() -> None:
-    torch.backends.cuda.matmul.fp32_precision = "tf32"
-
-
-def allow_everywhere() -> None:
-    torch.backends.fp32_precision = "tf32"
-
-
 @pytest.mark.usefixtures("_own_tf32_switches")
-@pytest.mark.parametrize("allow", [allow_by_the_older_switch, allow_by_the_newer_switch, allow_everywhere])
-def test_tf32_is_off_on_a_gpu_and_then_as_the_caller_had_it(allow: Callable[[], None]) -> None:
+@pytest.mark.parametrize(
+    ("switch", "value"),
+    [("cuda.matmul.allow_tf32", True), ("cuda.matmul.fp32_precision", "tf32"), ("fp32_precision", "tf32")],
+)
+def test_tf32_is_off_on_a_gpu_and_then_as_the_caller_had_it(switch: str, value: object) -> None:
     """The switches exist without a GPU too."""
-    allow()
+    *path, name = switch.split(".")
+    setattr(functools.reduce(getattr, path, torch.backends), name, value)
     before = tf32_switches()
     assert "tf32" in before
     with own_arithmetic(CPU):
@@ -378,13 +355,5 @@ def test_tf32_is_off_on_a_gpu_and_then_as_the_caller_had_it(allow: Callable[[], 
     with pytest.raises(RuntimeError), own_arithmetic(torch.device("cuda")):
         torch.zeros(2) + torch.zeros(3)
     assert tf32_switches() == before
-    if allow is allow_by_the_older_switch:
+    if name == "allow_tf32":
         assert torch.backends.cuda.matmul.allow_tf32  # it refuses to be read where the two disagree
-
-
-def test_the_three_lines_work_with_sharp_too() -> None:
-    photo = Photo(torch.from_numpy(picture()).float() / 255, 60.0, "EXIF", Path("a.jpg"))
-    scene = spackle.predict(photo, base=SharpBase(micro_network()))
-    assert len(scene.base) == gaussians_of(MICRO)
-    with pytest.raises(ValueError, match="the photo's depth, or a base"):
-        spackle.predict(photo, "d.npy", base=SharpBase(micro_network()))  # type: ignore[arg-type]

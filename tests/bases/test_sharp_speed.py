@@ -80,13 +80,12 @@ def test_a_translated_forward_says_the_same(backend: str) -> None:
     assert counters["stats"]["unique_graphs"] - before <= 5  # the blocks, of five windows and of one; and three more
 
 
-def no_compiler(*arguments: object, **options: object) -> Any:
-    raise RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx: (None, 'g++')")
-
-
 def test_without_a_compiler_one_line_says_so_and_the_photo_is_done_all_the_same(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    def no_compiler(*arguments: object, **options: object) -> Any:
+        raise RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx: (None, 'g++')")
+
     plain, base = SharpBase(micro_network()), SharpBase(micro_network(), compiled=True)
     monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
     with caplog.at_level(logging.WARNING, "spackle"):
@@ -229,10 +228,7 @@ def test_between_photo_and_scene_a_gpu_is_waited_for_once(far_away: FarAway) -> 
 def test_a_look_into_the_gpu_would_be_an_error(far_away: FarAway, look: Callable[[Tensor], object]) -> None:
     with pytest.raises(RuntimeError):
         look(torch.ones((), device="meta"))
-
-
-def test_small_tensors_that_go_up_would_be_seen(far_away: FarAway) -> None:
-    there = torch.ones(3, device="meta")
+    there = torch.ones(3, device="meta")  # and small tensors that go up would be seen
     there.new_tensor([1.0, 2.0]), torch.tensor([1.0], device="meta"), torch.eye(3).to(there)
     assert far_away.up == [(2,), (1,), (3, 3)]
 

@@ -55,13 +55,6 @@ def test_a_sample_that_faces_the_camera_by_hand() -> None:
     assert quat_to_matrix(found.quats)[0, :, 2].abs().tolist() == pytest.approx([0, 0, 1], abs=1e-9)
 
 
-def test_a_rectangular_pixel_makes_an_ellipse() -> None:
-    camera = Camera.from_focal(100, 64, 48).to(dtype=torch.float64)
-    camera.K[1, 1] = 50.0
-    found = one_sample(camera, double(32.0, 24.0).squeeze(0), 0.5, (0, 0), 1.0)
-    torch.testing.assert_close(found.covariances()[0], torch.diag(double(0.02, 0.04, THICKNESS * 0.02).squeeze(0) ** 2))
-
-
 @PROPERTY
 @given(SLOPES, SLOPES, st.floats(2, 62), st.floats(2, 46), st.floats(0.1, 2), st.floats(0.2, 3))
 def test_from_its_camera_every_sample_is_a_round_blob(
@@ -118,20 +111,13 @@ def test_a_slope_never_crosses_a_depth_edge() -> None:
         assert not slope[..., 1].any()
         down = surface_slope(inverse[:, None].expand(20, 3))
         torch.testing.assert_close(down[..., 1], expected[:, None].expand(20, 3))
-
-
-def test_a_ragged_rim_faces_the_camera() -> None:
-    """A steep slope that only one side confirms would stand out as a whisker from the side."""
-    inverse = torch.where(torch.arange(20) < 10, 1.0 + 0.009 * torch.arange(20), 0.3).expand(3, 20)
-    slope = surface_slope(inverse)
+    ragged = torch.where(torch.arange(20) < 10, 1.0 + 0.009 * torch.arange(20), 0.3).expand(3, 20)
+    slope = surface_slope(ragged)  # a steep slope that one side alone confirms would stand out as a whisker
     assert (slope[:, :9, 0] > 0).all()
     assert not slope[:, 9, 0].any()
-
-
-def test_a_lone_pixel_between_two_edges_faces_the_camera() -> None:
-    inverse = torch.ones(5, 5)
-    inverse[2, 2] = 2.0
-    assert not surface_slope(inverse).any()
+    lone = torch.ones(5, 5)
+    lone[2, 2] = 2.0
+    assert not surface_slope(lone).any()
 
 
 def plain_slope(row: list[float]) -> list[float]:
@@ -183,21 +169,14 @@ def test_a_flying_pixel_joins_the_nearer_side(hanging: float, side: float, turne
     assert torch.equal(found, clean.T if turned else clean)
 
 
-def test_clean_edges_thin_things_and_flat_walls_do_not_fly() -> None:
-    edge = torch.tensor([1.0, 1.0, 0.2, 0.2]).expand(4, 4)
-    pole = torch.tensor([0.2, 0.2, 1.0, 0.2, 0.2]).expand(4, 5)
-    gap = torch.tensor([1.0, 1.0, 0.2, 1.0, 1.0]).expand(4, 5)
-    for image in (edge, pole, gap, torch.full((4, 4), 0.5), torch.full((1, 1), 0.5)):
+def test_clean_edges_thin_things_borders_and_flat_walls_do_not_fly() -> None:
+    """A pixel at the border has no neighbour on one side, so it cannot lie between two."""
+    rows = [[1.0, 1.0, 0.2, 0.2], [0.2, 0.2, 1.0, 0.2, 0.2], [1.0, 1.0, 0.2, 1.0, 1.0], [0.5] * 4, [0.5]]
+    rows += [[1.0, 0.2, 0.2, 0.2], [0.2, 1.0, 1.0, 1.0]]
+    for row in [*rows, *(row[::-1] for row in rows)]:
+        image = torch.tensor(row).expand(4, len(row))
         assert torch.equal(attach_flying_pixels(image), image)
-
-
-@pytest.mark.parametrize("row", [[1.0, 0.2, 0.2, 0.2], [0.2, 1.0, 1.0, 1.0]])
-@pytest.mark.parametrize("flipped", [False, True])
-def test_a_pixel_at_the_border_does_not_fly(row: list[float], flipped: bool) -> None:
-    """It has no neighbour on one side, so it cannot lie between two."""
-    image = torch.tensor(row[::-1] if flipped else row).expand(4, 4)
-    assert torch.equal(attach_flying_pixels(image), image)
-    assert torch.equal(attach_flying_pixels(image.T), image.T)
+        assert torch.equal(attach_flying_pixels(image.T), image.T)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -260,6 +239,14 @@ def test_rounding_is_undone_on_a_plane(slope_px: float) -> None:
     assert float(found.diff(dim=1)[:, middle].max()) < 0.5 * quantum
 
 
+def test_steps_of_several_quanta_stay_and_unknown_pixels_do_not_pull() -> None:
+    edge = torch.tensor([0.5] * 6 + [0.45] * 6).expand(4, 12)
+    assert torch.allclose(undo_quantisation(edge, torch.ones(4, 12, dtype=torch.bool), 0.01), edge, atol=1e-6)
+    stored, valid = torch.full((4, 9), 0.5), torch.ones(4, 9, dtype=torch.bool)
+    stored[:, 4], valid[:, 4] = 0.49, False
+    torch.testing.assert_close(undo_quantisation(stored, valid, 0.01), stored, rtol=0, atol=1e-6)
+
+
 @PROPERTY
 @given(IMAGES, st.floats(0.001, 0.1))
 def test_what_was_rounded_still_rounds_to_the_same_step(image: tuple[int, int, int, float], quantum: float) -> None:
@@ -268,18 +255,3 @@ def test_what_was_rounded_still_rounds_to_the_same_step(image: tuple[int, int, i
     found = undo_quantisation(stored, valid, quantum, sweeps=30)
     assert float((found - stored).abs().max()) <= quantum / 2 * (1 + 1e-4)
     assert torch.equal(found[~valid], stored[~valid])
-
-
-def test_steps_of_several_quanta_are_edges_and_stay() -> None:
-    quantum = 0.01
-    stored = torch.tensor([0.5] * 6 + [0.45] * 6).expand(4, 12)
-    assert torch.allclose(undo_quantisation(stored, torch.ones(4, 12, dtype=torch.bool), quantum), stored, atol=1e-6)
-
-
-def test_unknown_pixels_do_not_pull_on_known_ones() -> None:
-    quantum, stored = 0.01, torch.full((4, 9), 0.5)
-    stored[:, 4] = 0.49
-    valid = torch.ones(4, 9, dtype=torch.bool)
-    valid[:, 4] = False
-    found = undo_quantisation(stored, valid, quantum)
-    torch.testing.assert_close(found, stored, rtol=0, atol=1e-6)
