@@ -1,85 +1,126 @@
-"""Complete the right view of stereo pairs by the seeds alone, and compare with the true right photo: a Markdown table.
+"""Completed views of stereo pairs beside the true right photo: seeds, trained weights, 2D inpainting; Markdown tables.
 
-    python benchmarks/stereo_pairs.py FOLDER
+    python benchmarks/stereo_pairs.py FOLDER [--residual FILE] [--features squeezenet_v1.0.npz] [--pictures OUT]
 
 FOLDER holds one folder a scene: a left and a right photo, a disparity map and a `scene.json` that names them and gives
-disparity_scale, focal_px, cx, cy, doffs_px and baseline_m (see `spackle.bases.depth_map.load_depth`). Needs OpenCV
-for the 2D inpainting beside it: pip install opencv-python-headless.
+disparity_scale, focal_px, cx, cy, doffs_px and baseline_m (see `spackle.training.sources.load_pair`). The first table
+completes the right camera's view: HAR, PSNR in the hole (beside Telea's inpainting: pip install
+opencv-python-headless) and outside of it, PSNR at the photo's own camera, with --features the perceptual distance in
+the hole (`spackle.training.distance.hole_distance`). The second completes whole swipes in one scene and looks at their
+ends: HAR before and after, and PSNR at the photo's camera.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
-from spackle import complete, get_renderer, hole_area_ratio, hole_mask
+from spackle import Completer, Gaussians, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.lift import lift
+from spackle.formats import save_png
+from spackle.inpaint.opencv import OpenCV
+from spackle.residual import ResidualNet
+from spackle.residual.network import SHIPPED, load_residual
 from spackle.scene import scene_path
-from spackle.training.losses import hole_psnr
+from spackle.training.features import FeatureNet, load_features
+from spackle.training.losses import hole_distance, hole_psnr
 from spackle.training.sources import load_pair
 
-DISPARITY = 0.3
+DISPARITIES = (0.3, 0.4, 0.5)
+FRAMES = 60
 TELEA_RADIUS = 3
-COLUMNS = ["scene", "HAR before", "after / before", "hole: Telea", "hole: Spackle"]
-COLUMNS += ["outside: before", "outside: after", "photo", f"photo, scene ±{DISPARITY:g}", "worst end, scene"]
+COLUMNS = ["HAR before", "HAR after / before: seeds", "trained", "hole: Telea", "seeds", "trained", "outside: base"]
+COLUMNS += ["seeds", "trained", "photo: seeds", "trained"]
+SWIPES = [f"{d:g}: {what}" for d in DISPARITIES for what in ("HAR before", "after", "worst end", "photo")]
 
 
-def telea(image: Tensor, hole: Tensor) -> Tensor:
-    """OpenCV's inpainting of an 8-bit render."""
-    pixels, mask = (image.numpy() * 255).round().astype(np.uint8), hole.numpy().astype(np.uint8)
-    return torch.from_numpy(cv2.inpaint(pixels, mask, TELEA_RADIUS, cv2.INPAINT_TELEA).astype(np.float32) / 255)
+class Scene:
+    """A pair, lifted, with a completer for each way of filling."""
+
+    def __init__(self, folder: Path, network: ResidualNet) -> None:
+        self.name, self.renderer = folder.name, get_renderer()
+        left, self.right, depth, self.camera, self.beside = load_pair(folder)
+        self.base = lift(left, depth, self.camera).gaussians
+        self.photo = self.renderer.render(self.base, self.camera).rgb
+        ways = {"seeds": None, "trained": network}
+        self.ways = {name: Completer(self.base, self.camera, self.renderer, net) for name, net in ways.items()}
+
+    def pair(self, features: FeatureNet | None, pictures: Path | None) -> list[float]:
+        """Numbers of the right camera's view."""
+        before = self.renderer.render(self.base, self.beside)
+        hole, har = hole_mask(before.alpha), hole_area_ratio(before.alpha)
+        found = [way.completed_view(self.beside, rendering=before) for way in self.ways.values()]
+        views = [view.rgb for _, view in found]
+        filled = [OpenCV("this").inpaint(before.rgb, hole, TELEA_RADIUS), *views]
+        numbers = [har, *(hole_area_ratio(view.alpha) / har for _, view in found)]
+        numbers += [hole_psnr(rgb, self.right, hole) for rgb in filled]
+        numbers += [hole_psnr(rgb, self.right, ~hole) for rgb in (before.rgb, *views)]
+        numbers += [self.photo_psnr(aux) for aux, _ in found]
+        if features is not None:
+            numbers += [hole_distance(features, rgb, self.right, hole) for rgb in views]
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            save_png(torch.cat([before.rgb, *views, self.right], dim=1), pictures / f"{self.name}.png")
+        return numbers
+
+    def swipes(self) -> list[float]:
+        """Numbers of the ends of swipes, each completed in one scene with the trained weights."""
+        numbers = []
+        for disparity in DISPARITIES:
+            path = scene_path(self.base, self.camera, "swipe", disparity, FRAMES)
+            aux = self.ways["trained"].complete_scene(path)
+            sets = ([self.base], [self.base, aux])
+            before, after = (
+                [hole_area_ratio(self.renderer.render(part, end).alpha) for end in (path[0], path[-1])] for part in sets
+            )
+            worst = max(closed / opened for opened, closed in zip(before, after, strict=True))
+            numbers += [sum(before) / 2, sum(after) / 2, worst, self.photo_psnr(aux)]
+        return numbers
+
+    def photo_psnr(self, aux: Gaussians) -> float:
+        """Of the completed scene at the photo's own camera, against the base's render there."""
+        view = self.renderer.render([self.base, aux], self.camera).rgb
+        return hole_psnr(view, self.photo, torch.ones(view.shape[:2], dtype=torch.bool))
+
+
+def print_table(columns: Sequence[str], scenes: Sequence[Scene], measure: Callable[[Scene], list[float]]) -> None:
+    """Markdown, each row as soon as it is there, and the mean of each column."""
+    print(f"\n| scene | {' | '.join(columns)} |\n|---{'|---' * len(columns)}|", flush=True)
+    rows: list[list[float]] = []
+    for scene in scenes:
+        rows.append(measure(scene))
+        print_row(scene.name, rows[-1])
+    mean: Tensor = torch.tensor(rows, dtype=torch.float64).mean(0)
+    print_row("mean", mean.tolist())
+
+
+def print_row(name: str, values: Sequence[float]) -> None:
+    print(f"| {name} | {' | '.join(f'{v:.4f}' if v < 1 else f'{v:.2f}' for v in values)} |", flush=True)
 
 
 @torch.no_grad()
-def measure(folder: Path) -> list[float]:
-    """One row of the table, without the name."""
-    left, right, depth, camera, beside = load_pair(folder)
-    prediction, renderer = lift(left, depth, camera), get_renderer()
-    scene = complete(prediction, [beside], exact=True, network=None)
-    before, after = renderer.render(scene.base, beside), scene.render(beside)
-    hole, photo = hole_mask(before.alpha), renderer.render(scene.base, camera).rgb
-    path = scene_path(scene.base, camera, "swipe", DISPARITY)
-    swipe = complete(prediction, path, network=None)
-    ends = [(renderer.render(scene.base, end).alpha, swipe.render(end).alpha) for end in (path[0], path[-1])]
-    har, everywhere = hole_area_ratio(before.alpha), torch.ones_like(hole)
-    return [
-        har,
-        hole_area_ratio(after.alpha) / har,
-        hole_psnr(telea(before.rgb, hole), right, hole),
-        hole_psnr(after.rgb, right, hole),
-        hole_psnr(before.rgb, right, ~hole),
-        hole_psnr(after.rgb, right, ~hole),
-        hole_psnr(scene.render(camera).rgb, photo, everywhere),
-        hole_psnr(swipe.render(camera).rgb, photo, everywhere),
-        max(hole_area_ratio(closed) / hole_area_ratio(open_) for open_, closed in ends),
-    ]
-
-
-def main(root: Path) -> None:
-    """Print the table, and the mean of every column."""
-    folders = sorted(path.parent for path in root.glob("*/scene.json"))
-    if not folders:
-        sys.exit(f"{root}: no folder with a scene.json in it")
-    print(f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
-    rows = []
-    for folder in folders:
-        rows.append(measure(folder))
-        print_row(folder.name, rows[-1])
-    print_row("mean", [sum(column) / len(rows) for column in zip(*rows, strict=True)])
-
-
-def print_row(name: str, row: list[float]) -> None:
-    """Ratios with their digits, decibels with two."""
-    cells = [f"{row[0]:.3f}", f"{row[1]:.4f}", *(f"{value:.2f}" for value in row[2:-1]), f"{row[-1]:.4f}"]
-    print(f"| {name} | {' | '.join(cells)} |", flush=True)
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--residual", type=Path, default=SHIPPED)
+    parser.add_argument("--features", type=Path, help="SqueezeNet 1.0's weights")
+    parser.add_argument("--pictures", type=Path, help="folder for base, seeds, trained and truth side by side")
+    parser.add_argument("--no-swipes", action="store_true", help="the first table alone, in a minute or two")
+    chosen = parser.parse_args()
+    features = None if chosen.features is None else load_features("squeezenet", chosen.features)
+    network = load_residual(chosen.residual)
+    scenes = [Scene(path.parent, network) for path in sorted(chosen.folder.glob("*/scene.json"))]
+    if not scenes:
+        parser.error(f"{chosen.folder}: no folder with a scene.json in it")
+    more = [] if features is None else ["distance: seeds", "trained"]
+    print_table([*COLUMNS, *more], scenes, lambda scene: scene.pair(features, chosen.pictures))
+    if not chosen.no_swipes:
+        print_table(SWIPES, scenes, Scene.swipes)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    main()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib.util
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -252,3 +253,17 @@ def test_bad_options_are_one_line(words: tuple[str, ...], message: str, tmp_path
     assert (done.code, len(done.lines)) == (2, 1)
     assert message in done.err
     assert not (tmp_path / "out").exists()
+
+
+def test_operators_that_exist_are_not_declared_again(tmp_path: Path) -> None:
+    path = Path(__file__).parents[2] / "benchmarks" / "sharp.py"
+    spec = importlib.util.spec_from_file_location("benchmark_of_sharp", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    (tmp_path / "_meta_registrations.py").write_text('@register_meta("roi")\n@register_fake("torchvision::nms")\n')
+    with torch.library._scoped_library("spackle_test", "DEF") as library:
+        library.define("nms(Tensor x) -> Tensor")
+        assert module.declare_operators(tmp_path, "spackle_test") == ["roi"]
+        assert module.declare_operators(tmp_path, "spackle_test") == []

@@ -34,18 +34,17 @@ MAX_RUNS = 1000
 
 
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
-    """Time a dataset, or go on with that.
+    """Time a dataset, or go on with that; "complete", or "stopped" where Ctrl-C came.
+
+    Writes bench.json, bench.md, bench.tex and images/ into `output`. The folder belongs to one machine: times of two do
+    not go together.
 
     Args:
-        options: which images and views, which base; the views are those of an evaluation without metrics.
+        options: of an evaluation without metrics, whose views are timed.
         runs: how often everything behind the base is timed.
         base_runs: how often the base is timed; None: once for SHARP, which takes long, else `runs` times.
-        output: a folder; bench.json, bench.md, bench.tex and images/ go there. It belongs to one machine: times of
-            two do not go together.
+        output: a folder.
         reporter: tells which images fail, and with -v each image's figures.
-
-    Returns:
-        "complete", or "stopped" where Ctrl-C came.
 
     Raises:
         InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
@@ -102,14 +101,7 @@ def _measure(
 
 
 def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], device: torch.device, warm: bool) -> ImageCost:
-    """All settings of an image.
-
-    Args:
-        case: the image.
-        tools: what all images share.
-        config: how often what is timed.
-        device: of the base's network.
-        warm: something was predicted before in this process.
+    """All settings of an image; `device` is the base's; `warm`: something was predicted before in this process.
 
     Raises:
         InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
@@ -117,8 +109,8 @@ def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], device:
     """
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
     loaded = load_case(dataclasses.replace(case, seconds=()))
-    opened = tools.open(loaded)
-    base = time_base(lambda: opened.predict(loaded.full)[0], config["base_runs"], device, warm)
+    opened = tools.open(loaded).load(loaded.full)  # a network is loaded before the clock starts
+    base = time_base(lambda: opened.predict()[0], config["base_runs"], device, warm)
     try:
         views = large_views(base.prediction, tools.options.disparities)
     except ValueError as error:
@@ -171,12 +163,7 @@ def check_runs(runs: int, base_runs: int | None) -> None:
 
 
 def check_choice(suite: bool, given: Collection[str]) -> None:
-    """InputError where neither a dataset nor the suite was asked for, or options of both.
-
-    Args:
-        suite: whether --suite was given.
-        given: the options that were given, by their long names.
-    """
+    """InputError where the options `given`, by their long names, ask for no dataset and no suite, or for both."""
     of_dataset = ("--dataset", "--root", "--limit", "--disparity")
     of_suite = ("--only", "--compile", "--windows", "--side")
     if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.checkpoint import unused_shapes
@@ -34,7 +34,7 @@ STAGES = {
 }
 BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
 EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
-COLD_S = 10.0  # a first prediction that takes longer counts: what it warms up is little of that
+COLD_S = 10.0  # of a first prediction that takes longer, as SHARP's does, compiling kernels is a small part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ def count_parameters() -> Parameters:
     """Count in the networks themselves, without weights: SHARP 702.31 M, the residual 8.02 M."""
     with torch.device("meta"):
         used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
-    return Parameters(used + sum(math.prod(shape) for shape in unused_shapes(FULL).values()), used, residual)
+    return Parameters(used + sum(map(math.prod, unused_shapes(FULL).values())), used, residual)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,12 +137,8 @@ class Efficiency:
 
     def plain(self) -> dict[str, Any]:
         """Ready for JSON: everything, and the medians beside it."""
-        names = list(self.measured[0].views[0].figures())
-        spreads = [
-            {"setting": setting, "figure": name} | dataclasses.asdict(self.spread(setting, name))
-            for setting in self.settings
-            for name in names
-        ]
+        keys = itertools.product(self.settings, self.measured[0].views[0].figures())
+        spreads = [{"setting": s, "figure": name} | dataclasses.asdict(self.spread(s, name)) for s, name in keys]
         problems = {image.name: image.problem for image in self.images if image.problem is not None}
         images = [image.plain() for image in self.images]
         return {"config": dict(self.config), "problems": problems, "spreads": spreads, "images": images}
@@ -158,11 +154,7 @@ class TimedBase:
 
 
 def time_base(predict: Callable[[], BasePrediction], runs: int, device: torch.device, warm: bool) -> TimedBase:
-    """Predict a photo so many times.
-
-    The first prediction of a process (`warm` is false) compiles kernels and fills caches. It does not count, unless it
-    takes more than `COLD_S`, as SHARP's does on a processor.
-    """
+    """Predict so many times; the first one in a process (not `warm`) counts only if it takes more than `COLD_S`."""
     prediction, first = timed(predict, device)
     counts = warm or first > COLD_S
     seconds = [first] if counts else []
@@ -178,18 +170,9 @@ class _LappedRenderer:
     renderer: Renderer
     lap: Lap
 
-    def render(
-        self,
-        gaussians: Gaussians | Sequence[Gaussians],
-        camera: Camera,
-        *,
-        eps2d: float = 0.0,
-        tiles: Tensor | None = None,
-        onto: Rendering | None = None,
-    ) -> Rendering:
-        """See `Renderer.render`."""
+    def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
         self.lap("completion")
-        drawn = self.renderer.render(gaussians, camera, eps2d=eps2d, tiles=tiles, onto=onto)
+        drawn = self.renderer.render(gaussians, camera, **options)
         self.lap("rerender")
         return drawn
 
@@ -218,18 +201,7 @@ def time_view(
     device: torch.device,
     precision: Precision = "auto",
 ) -> ViewCost:
-    """The cost of one view: `runs` times after one time that does not count.
-
-    Args:
-        base: of the photo.
-        setting: what the tables call the view.
-        camera: the view.
-        renderer: draws everything.
-        network: of the residual; None: the seeds alone fill the holes.
-        runs: that count.
-        device: of the base's network.
-        precision: of the residual's network.
-    """
+    """The cost of one view, which the tables call by `setting`; `device` is the base's, `precision` the residual's."""
     prediction, added = base.prediction, 0
     completer = Completer(prediction.gaussians, prediction.camera, renderer, network, precision=precision)
 

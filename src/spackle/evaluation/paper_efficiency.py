@@ -21,38 +21,19 @@ class PaperTime:
     spackle_fps: float
 
 
-# tab:expanded_efficiency_gaussian_overhead, as published: S1, S2, S3.
-TIMES: dict[str, tuple[PaperTime, PaperTime, PaperTime]] = {
-    "Middlebury": (
-        PaperTime(6410.3, 1449.4, -3.3, 0.671, 0.691),  # does not fit itself: see ODD
-        PaperTime(1448.8, 1452.7, 0.8, 0.695, 0.689),
-        PaperTime(1448.4, 1476.4, 2.5, 0.695, 0.679),
-    ),
-    "Booster": (
-        PaperTime(1427.8, 1451.4, 1.9, 0.703, 0.691),
-        PaperTime(1427.6, 1456.1, 2.3, 0.703, 0.689),
-        PaperTime(1427.9, 1471.6, 3.3, 0.703, 0.682),
-    ),
-    "WildRGBD": (
-        PaperTime(1419.8, 1443.8, 1.9, 0.709, 0.697),
-        PaperTime(1419.6, 1449.3, 2.3, 0.709, 0.694),
-        PaperTime(1419.6, 1459.5, 3.0, 0.709, 0.689),
-    ),
-    "Tanks": (
-        PaperTime(1404.1, 1519.5, 8.4, 0.716, 0.661),
-        PaperTime(1403.9, 1566.8, 11.8, 0.716, 0.641),
-        PaperTime(1403.9, 1607.5, 14.7, 0.716, 0.625),
-    ),
-    "ETH3D": (
-        PaperTime(1371.2, 1450.1, 5.8, 0.730, 0.691),
-        PaperTime(1371.0, 1490.4, 8.8, 0.730, 0.673),
-        PaperTime(1370.9, 1533.4, 11.9, 0.730, 0.654),
-    ),
-    "LLFF": (
-        PaperTime(1360.8, 1405.3, 3.3, 0.735, 0.712),
-        PaperTime(1360.6, 1424.1, 4.7, 0.735, 0.703),
-        PaperTime(1360.5, 1447.3, 6.4, 0.735, 0.692),
-    ),
+# tab:expanded_efficiency_gaussian_overhead, as published: the fields of a `PaperTime` at S1, then at S2, then at S3.
+# Middlebury's first row contradicts itself: see ODD.
+ROWS = """
+Middlebury  6410.3 1449.4 -3.3 0.671 0.691  1448.8 1452.7  0.8 0.695 0.689  1448.4 1476.4  2.5 0.695 0.679
+Booster     1427.8 1451.4  1.9 0.703 0.691  1427.6 1456.1  2.3 0.703 0.689  1427.9 1471.6  3.3 0.703 0.682
+WildRGBD    1419.8 1443.8  1.9 0.709 0.697  1419.6 1449.3  2.3 0.709 0.694  1419.6 1459.5  3.0 0.709 0.689
+Tanks       1404.1 1519.5  8.4 0.716 0.661  1403.9 1566.8 11.8 0.716 0.641  1403.9 1607.5 14.7 0.716 0.625
+ETH3D       1371.2 1450.1  5.8 0.730 0.691  1371.0 1490.4  8.8 0.730 0.673  1370.9 1533.4 11.9 0.730 0.654
+LLFF        1360.8 1405.3  3.3 0.735 0.712  1360.6 1424.1  4.7 0.735 0.703  1360.5 1447.3  6.4 0.735 0.692
+"""
+TIMES: dict[str, tuple[PaperTime, ...]] = {
+    title: tuple(PaperTime(*map(float, numbers[k : k + 5])) for k in (0, 5, 10))
+    for title, *numbers in map(str.split, ROWS.strip().splitlines())
 }
 ODD = ("Middlebury", 0.3)  # the entry whose numbers do not go together
 ODD_MARK = "†"

@@ -67,11 +67,8 @@ class SuiteOptions:
         check_runs(self.runs, self.base_runs)
         if not (SIDES[0] <= self.pixels <= SIDES[1] and self.pixels % 2 == 0):
             raise InputError(f"--side must be an even number between {SIDES[0]} and {SIDES[1]}, got {self.pixels}")
-        base, device = self.base, self.base.device
-        if device not in ("auto", "cpu", "cuda"):
-            raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")
-        if device == "cuda" and not torch.cuda.is_available():
-            raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
+        base = self.base
+        get_renderer("cpu" if base.device == "auto" else base.device)
         if base.named != "sharp":
             raise InputError(f"--base {base.name}: the suite times no other base than sharp: leave the option out")
         for option, file in (("--residual", self.residual), ("-c", base.checkpoint)):
@@ -92,16 +89,10 @@ class SuiteOptions:
 
 
 def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
-    """Time everything that can be timed here, or go on with that.
+    """Time everything that can be timed here, or go on with that; "complete", or "stopped" where Ctrl-C came.
 
-    Args:
-        options: what, how often.
-        output: a folder; suite.json, suite.md and sections/ go there. It belongs to one machine, one commit and one set
-            of options but for `only` and SHARP's: times of two do not go together.
-        reporter: tells what was measured, and what could not be.
-
-    Returns:
-        "complete", or "stopped" where Ctrl-C came.
+    Writes suite.json, suite.md and sections/ into `output`. The folder belongs to one machine, one commit and one set
+    of options but for `only` and SHARP's: times of two do not go together.
 
     Raises:
         InputError: options or a folder that cannot be used; another suite in `output`.
@@ -192,15 +183,12 @@ def _configuration(options: SuiteOptions) -> dict[str, Any]:
 def commit() -> str:
     """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
     git = ["git", "-C", str(Path(spackle.__file__).parent)]
-    try:
-        tracked = subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True)
-        found = subprocess.run(
-            [*git, "describe", "--always", "--dirty=+", "--exclude=*"], capture_output=True, text=True
-        )
-    except OSError:  # no git
+    try:  # a project that this package is only installed into does not track it
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
+        found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
+        return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    ours = tracked.returncode == 0 and found.returncode == 0  # not that of a project it is installed into
-    return found.stdout.strip() if ours else "unknown"
 
 
 def _head(config: Mapping[str, Any]) -> str:
@@ -211,12 +199,7 @@ def _head(config: Mapping[str, Any]) -> str:
 
 
 def suite_tables(found: Mapping[str, Section], not_run: Mapping[str, str]) -> list[Table]:
-    """A table for each section that was run, and a line for each that was not.
-
-    Args:
-        found: by the sections' names.
-        not_run: why, by the names of the others.
-    """
+    """A table for each section that was run, and a line for each that was not, with the reason."""
     tables = []
     for name, one in found.items():
         facts = ", ".join(f"{key} {_fact(value)}" for key, value in one.facts.items() if value is not None)

@@ -38,42 +38,31 @@ from spackle.residual.seeds import Rim
 LIMIT_RUNS = 7  # at least: the best run counts
 MATRIX_SIDE, COPY_MB = 2048, 256
 PRODUCT, COPY = "matrix product, {}", "copy of memory"
-DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
-
 RENDER_STAGES = ("project", "sort", "bin", "blend")
 CALL, NAIVE_RATIO = "whole call: RGB, depth, alpha", "naive over ours"
 TWIN_ERROR = 1e-5  # between the two renderers, on average
 BAND, BAND_SETS = 0.05, 3  # what is redrawn: a band of the picture this wide, in so many sets
 GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
-
-HOLES = 0.05  # of the completed view
-HALVINGS, CLOSE = 14, 0.01  # of the search for that view, and its relative tolerance
+HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of the completed view; of the search for it, and its relative tolerance
 RENDER, SHIELD, NETWORK, ADDED = "base render of the view", "photo's shield, once a photo", "network", "added time"
 PLACE, REDRAW, IN_RENDERS = "mask, seeds, network, placing", "redraw", "added time over base render"
-
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
 LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
 SCENE, SCRATCH = "one scene: photo to video", "frame by frame: photo to video"
 EACH, SHIELDS = "frames rendered and completed, each by itself", "the photo's shield, for each of them"
 SCENE_RATIO, KEPT_RATIO = "frame by frame over one scene", "the same, the photo's shield made once"
-
 FORWARD, UNPROJECT, SAVE, WHOLE = "forward", "unprojection", "save as PLY", "photo to scene"
 
 
 def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
-    """Products of square matrices, 2·side³ operations each, and copies, each byte of which is read and written.
+    """Products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written; best runs.
 
-    Args:
-        runs: that count, but at least `LIMIT_RUNS`.
-        device: to measure.
-        share: of the full sizes.
+    `share` is of the full sizes.
     """
-    runs, side = max(runs, LIMIT_RUNS), round(share * MATRIX_SIDE)
-    rows, generator = [], torch.Generator().manual_seed(0)
-    for name, dtype in DTYPES.items():
-        a, b = (torch.rand(side, side, generator=generator).to(device, dtype) for _ in range(2))
-        multiply = functools.partial(torch.mm, a, b, out=torch.empty_like(a))
-        times = _time_calls(runs, {"": multiply}, device)[""]
+    runs, side, rows = max(runs, LIMIT_RUNS), round(share * MATRIX_SIDE), []
+    for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
+        a, b = (torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype) for k in range(2))
+        times = _time_calls(runs, {"": functools.partial(torch.mm, a, b, out=torch.empty_like(a))}, device)[""]
         rows.append(Timing(PRODUCT.format(name), tuple(2 * side**3 / (ms / MS) / 1e9 for ms in times), "GFLOP/s"))
     source = torch.zeros(round(share * COPY_MB * 2**20) // 4, device=device)
     times = _time_calls(runs, {"": functools.partial(torch.ones_like(source).copy_, source)}, device)[""]
@@ -100,14 +89,12 @@ def renderer_section(runs: int, side: int) -> Section:
     difference = float((CpuRenderer().render(scene, camera).rgb - naive_render(scene, camera)).abs().mean())
     if not difference < TWIN_ERROR:
         raise RuntimeError(f"the two renderers disagree: rgb differs by {difference} on average")
-    times = measure(
-        runs,
-        {
-            "ours": lambda lap: render_in_laps(scene, camera, lap),
-            "call": lambda _: CpuRenderer().render(scene, camera),
-            "naive": lambda lap: naive_render(scene, camera, lap),
-        },
-    )
+    tasks: dict[str, Task] = {
+        "ours": lambda lap: render_in_laps(scene, camera, lap),
+        "call": lambda _: CpuRenderer().render(scene, camera),
+        "naive": lambda lap: naive_render(scene, camera, lap),
+    }
+    times = measure(runs, tasks)
     rows = [Timing(stage, times["ours", stage]) for stage in RENDER_STAGES]
     least = float(len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES)  # read once, written once
     rows.append(Timing(CALL, times["call", TOTAL], bytes=least))
@@ -171,16 +158,7 @@ def completion_section(
     network: ResidualNet | None,
     device: torch.device = CPU,
 ) -> Section:
-    """One view, 5 % of which are holes, beside the base's render of it.
-
-    Args:
-        runs: that count.
-        base: the photo's Gaussians.
-        photo_camera: the photo's.
-        renderer: draws everything.
-        network: None: the seeds alone fill the holes.
-        device: of the renderer.
-    """
+    """One view, 5 % of which are holes, beside the base's render of it; without a network the seeds fill the holes."""
     disparity, camera = find_view(base, photo_camera, renderer)
     completer = Completer(base, photo_camera, renderer, network)
     before = renderer.render(base, camera)
@@ -236,23 +214,14 @@ def video_section(
     frames: int = FRAMES,
     device: torch.device = CPU,
 ) -> Section:
-    """A photo to an MP4 along `rotate_forward`, completed as one scene, and frame by frame.
+    """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate_forward`: as one scene, and frame by frame.
 
     Frame by frame, each is rendered and completed from scratch, its shield included, and shares nothing with the others
-    but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both.
-
-    Args:
-        runs: that count, but at most `VIDEO_RUNS`.
-        lift: the photo to Gaussians.
-        renderer: draws everything.
-        network: None: the seeds alone fill the holes.
-        frames: of the video.
-        device: of the renderer.
+    but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most `VIDEO_RUNS`.
     """
     prediction, aux = lift(), Gaussians.empty()
-    path = trajectory(
-        "rotate_forward", prediction.camera.even(), DISPARITY, DepthRange.of(prediction.gaussians), frames
-    )
+    depths = DepthRange.of(prediction.gaussians)
+    path = trajectory("rotate_forward", prediction.camera.even(), DISPARITY, depths, frames)
     completer = Completer(prediction.gaussians, prediction.camera, renderer, network)
 
     def scene(lap: Lap) -> None:

@@ -42,7 +42,7 @@ class Timing:
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """The rows of one section of the suite."""
+    """One section of the suite."""
 
     rows: tuple[Timing, ...]
     facts: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # sizes and settings, ready for JSON
@@ -61,13 +61,8 @@ class Section:
 def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
     """Milliseconds of each task (its stage "total") and of its stages, each of which it ends by calling its argument.
 
-    The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up.
-
-    Args:
-        runs: runs that count. One run before them, which compiles and warms up, does not.
-        tasks: by their names.
-        device: a stage ends when this device has done its work.
-        warm: the tasks ran before, so the first run counts too.
+    The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up. A stage ends
+    when the device has done its work. One run more, which compiles and warms up, comes first, unless they are `warm`.
     """
     times: dict[tuple[str, str], list[float]] = {}
     for run in range(1 if warm else 0, runs + 1):
@@ -109,13 +104,12 @@ def timed(call: Callable[[], T], device: torch.device = CPU) -> tuple[T, float]:
 
 def count_flops(call: Callable[[], Any]) -> float:
     """Operations of the products, convolutions and attention in a call: two for each multiplication and addition."""
-    attention = getattr(torch.ops.aten, "_scaled_dot_product_flash_attention_for_cpu", None)
-    extra = {} if attention is None else {attention: _attention}  # PyTorch counts it on GPUs alone
-    with FlopCounterMode(display=False, custom_mapping=extra) as counter:
+
+    def attention(query: Any, key: Any, value: Any, *rest: Any, **more: Any) -> Any:
+        return sdpa_flop_count(query, key, value)  # type: ignore[no-untyped-call]
+
+    # PyTorch counts attention on GPUs alone.
+    mapping = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: attention}
+    with FlopCounterMode(display=False, custom_mapping=mapping) as counter:
         call()
     return float(counter.get_total_flops())
-
-
-def _attention(query: Any, key: Any, value: Any, *rest: Any, out_shape: Any = None, **more: Any) -> int:
-    operations: int = sdpa_flop_count(query, key, value)  # type: ignore[no-untyped-call]
-    return operations
