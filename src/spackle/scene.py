@@ -1,4 +1,4 @@
-"""A photo's completed scene, and the three-line way to it."""
+"""A photo's completed scene, and the way to it: open a base, predict, complete."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from spackle.bases.open import BaseSettings, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajectory
+from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.formats.video import check_video
@@ -24,11 +25,33 @@ from spackle.image import Photo, load_photo
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
-from spackle.residual.network import shipped_network
+from spackle.residual.network import SHIPPED, load_residual, shipped_network
 
 PATH_FRAMES = 60
 LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
+Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or the paper's one for each
+
+
+@dataclasses.dataclass(frozen=True)
+class ResidualChoice:
+    """What fills the holes, as --residual names it."""
+
+    named: str | None = None  # a file, "seeds", "none", or None for the shipped weights if there are any
+
+    @property
+    def weights(self) -> str:
+        """For reports: "shipped", a file, "seeds" or "none"."""
+        return self.named or ("shipped" if SHIPPED.is_file() else "seeds")
+
+    @property
+    def file(self) -> Path | None:
+        """Where the weights lie; None without a network."""
+        return SHIPPED if self.weights == "shipped" else None if self.weights in ("seeds", "none") else Path(self.weights)
+
+    def load(self) -> ResidualNet | None:
+        """The network, if any; InputError for a file that cannot be used."""
+        return None if self.file is None else load_residual(self.file)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +61,16 @@ class Scene:
     base: Gaussians  # what the photo shows; never changed
     aux: Gaussians  # what completion added
     camera: Camera  # the photo's
+    by_view: tuple[Gaussians, ...] | None = None  # in view mode: the aux Gaussians of each completed view
 
     @property
     def gaussians(self) -> Gaussians:
         """Everything, the base first."""
         return Gaussians.cat([self.base, self.aux])
+
+    def of_view(self, index: int) -> list[Gaussians]:
+        """The sets that a completed view is drawn with."""
+        return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     def path(
         self, kind: TrajectoryKind = "rotate_forward", disparity: float = 0.3, frames: int = PATH_FRAMES
@@ -139,16 +167,36 @@ def complete(
     prediction: BasePrediction,
     cameras: Sequence[Camera],
     *,
+    mode: Mode = "scene",
     exact: bool = False,
     network: ResidualNet | Shipped | None = "shipped",
     renderer: Renderer | None = None,
+    precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
-    """One scene for all views of a path: see `Completer.complete_scene`, and `predict` for the network."""
+    """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `Completer.complete_scene`.
+
+    Args:
+        prediction: of a base.
+        cameras: the views.
+        mode: "view" fills each view by itself, as the paper does, and leaves `Scene.aux` empty.
+        exact: the views are these and no others between them; for scene mode.
+        network: see `predict`.
+        renderer: the CPU's where None.
+        precision: of the network.
+        progress: called with views done and their number.
+    """
     chosen = shipped_network() if network == "shipped" else network
-    completer = Completer(prediction.gaussians, prediction.camera, renderer or get_renderer(), chosen)
-    aux = completer.complete_scene(cameras, exact=exact, progress=progress)
-    return Scene(prediction.gaussians, aux, prediction.camera)
+    base, camera = prediction.gaussians, prediction.camera
+    completer = Completer(base, camera, renderer or get_renderer(), chosen, precision=precision)
+    if mode == "scene":
+        return Scene(base, completer.complete_scene(cameras, exact=exact, progress=progress), camera)
+    guards, by_view = [completer.photo_guard()], []
+    for index, view in enumerate(cameras):
+        by_view.append(completer.complete_view(view, guards))
+        if progress:
+            progress(index + 1, len(cameras))
+    return Scene(base, Gaussians.empty(), camera, tuple(by_view))
 
 
 def scene_path(

@@ -20,7 +20,7 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
 from spackle.formats import atomic_path, save_ply, save_png, save_video
-from spackle.jobs.report import write_report
+from spackle.app.report import write_report
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer

@@ -1,28 +1,31 @@
-"""`spackle export`: a scene file to the formats that other viewers read."""
+"""`spackle export`: a scene file to the formats that other viewers read, and to what the page shows."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
 from rich.filesize import decimal
 
+from spackle.app.render import DEFAULT_SIZE
+from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import atomic_path, check_writable
 from spackle.formats.ply import read_header
-from spackle.formats.scene_files import SCENE_WRITERS, SceneFile
+from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, at_origin
 from spackle.formats.spz import LARGEST, spz_grid
+from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.progress import Reporter
+from spackle.viewer import PageScene, page_scene, single_html
 
 
 def _html(scene: SceneFile, path: Path) -> None:
-    from spackle.jobs.options import PredictOptions
-    from spackle.jobs.view_scene import page_of
-    from spackle.viewer.page import single_html
-
-    path.write_bytes(single_html(page_of(scene, PredictOptions())))
+    path.write_bytes(single_html(page_of(scene)))
 
 
 WRITERS: dict[str, Callable[[SceneFile, Path], object]] = {**SCENE_WRITERS, ".html": _html}
@@ -92,3 +95,52 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
             reach = f"{LARGEST / 2**bits:,.0f} m"
             reporter.say(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
     reporter.result({**result, "drawn_nearer": far})
+
+
+def page_of(scene: SceneFile, focal_px: float | None = None, fov: float | None = None) -> PageScene:
+    """A loaded scene, of ours or of others: where no camera is stored, a usual lens looks along z.
+
+    Raises:
+        InputError: a scene that cannot be seen from its camera.
+    """
+    path, gaussians, camera = scene.path, scene.gaussians, _lens(scene.camera, focal_px, fov)
+    if not at_origin(camera):
+        gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin
+        camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+    count = len(gaussians) if scene.base_count is None else scene.base_count
+    base, aux = gaussians.select(slice(0, count)), gaussians.select(slice(count, None))
+    try:
+        return page_scene(name_of(path), base, aux, camera, scene.disparity)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{name_of(path)}: ')}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
+
+
+def name_of(path: Path) -> str:
+    """What people call a scene: the folder's name where every scene has the same one."""
+    path = path.absolute()
+    return path.parent.name if path.name in ("scene.ply", "base.ply") and path.parent.name else path.stem
+
+
+def _lens(stored: Camera | None, focal_px: float | None, fov: float | None) -> Camera:
+    """The stored camera; a lens that a person gives beats it, and without either it is as `spackle render` has it."""
+    width, height = (stored.width, stored.height) if stored else DEFAULT_SIZE
+    focal = _given_focal(focal_px, fov, width)
+    if focal is None and stored is not None:
+        return stored
+    camera = Camera.from_focal(focal or film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)
+    return camera if stored is None else dataclasses.replace(camera, world_to_camera=stored.world_to_camera)
+
+
+def _given_focal(focal_px: float | None, fov: float | None, width: int) -> float | None:
+    """In pixels, as a person gave it; InputError where it makes no sense."""
+    if focal_px is not None and fov is not None:
+        raise InputError("--focal-px and --fov are given together: give one of them")
+    if focal_px is not None and not (math.isfinite(focal_px) and focal_px > 0):
+        raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
+    if fov is None:
+        return focal_px
+    if not 0 < fov < 180:
+        raise InputError(f"--fov must lie between 0 and 180 degrees, got {fov:g}")
+    return width / 2 / math.tan(math.radians(fov) / 2)

@@ -1,4 +1,4 @@
-"""What is said about a prediction once it is done."""
+"""report.json: what is said of a photo's results once they are there, and what an earlier run said."""
 
 from __future__ import annotations
 
@@ -8,48 +8,35 @@ from pathlib import Path
 from typing import Any
 
 import spackle
-from spackle.bases.open import Choice
-from spackle.bases.protocol import BasePrediction
-from spackle.camera_path import spelled
+from spackle.app.complete import CompletedPhoto, PhotoCompleter
 from spackle.formats import atomic_path
-from spackle.image import Photo
-from spackle.jobs.options import PredictOptions
-from spackle.jobs.setup import Tools
-from spackle.jobs.views import Completed
-
-
-def focal_source(photo: Photo, prediction: BasePrediction) -> str:
-    """Who said what the focal length is: an option, the photo, the base's calibration, or nobody."""
-    return prediction.lens_source or photo.focal_source
+from spackle.trajectory import spelled
 
 
 def make_report(
-    photo: Photo,
-    prediction: BasePrediction,
-    choice: Choice,
-    completed: Completed,
-    options: PredictOptions,
-    tools: Tools,
+    done: CompletedPhoto,
+    completer: PhotoCompleter,
     holes: list[dict[str, float | str]],
     video: dict[str, object] | None,
     request: str,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """Counts, holes, times and sources of one photo, ready for JSON."""
-    base, aux = len(completed.base), len(completed.aux)
-    given = options.cameras or options.path
+    photo, prediction, choice, path = done.photo, done.prediction, done.choice, completer.path
+    base, aux, weights = len(done.scene.base), len(done.scene.aux), completer.residual.weights
+    given = path.cameras or path.path
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
         "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
         "focal_px": round(prediction.camera.focal[0], 3),
-        "focal_source": focal_source(photo, prediction),
+        "focal_source": prediction.lens_source or photo.focal_source,
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
-        "residual": {"weights": tools.residual},
+        "residual": {"weights": weights},
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
-        "mode": options.mode,
-        "views": given.name if given else spelled(options.trajectory),
-        "disparity": None if given else options.disparity,
+        "mode": completer.mode,
+        "views": given.name if given else spelled(path.trajectory),
+        "disparity": None if given else path.disparity,
         "video": video,
         "hole_area_ratio": holes,
         "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
@@ -57,18 +44,16 @@ def make_report(
     }
     if choice.passed_over:
         report["base"]["passed_over"] = list(choice.passed_over)
-    if tools.residual == "seeds":
+    if weights == "seeds":
         report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
-    if completed.saved_view is not None:
-        report["scene_ply_view"] = completed.saved_view  # the view whose aux Gaussians scene.ply holds
+    if done.saved_view is not None:
+        report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
     return report
 
 
 def is_done(folder: Path, results: Sequence[str], request: str) -> bool:
     """Whether an earlier run with the same files and options has finished, and its results are there still."""
-    if not all((folder / name).is_file() for name in results):
-        return False
-    return _earlier(folder).get("request") == request
+    return all((folder / name).is_file() for name in results) and _earlier(folder).get("request") == request
 
 
 def base_before(folder: Path) -> str | None:

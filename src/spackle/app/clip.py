@@ -1,0 +1,368 @@
+"""`spackle predict -i clip.mp4`: each frame seen from a camera that moves, its depth and its filled holes kept calm."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import spackle
+from spackle.app.complete import PhotoCompleter
+from spackle.app.report import write_report
+from spackle.app.video import PathOptions, VideoOptions
+from spackle.bases.open import BaseSettings, Choice, all_finite
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, focal_length, resize_photo
+from spackle.opencv import OpenCV
+from spackle.output_folder import results_folder
+from spackle.device import Precision
+from spackle.progress import Reporter, Step
+from spackle.render import Renderer
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, ResidualNet, hole_area_ratio, hole_mask
+from spackle.residual.occlusion_guard import OcclusionGuard
+from spackle.residual.temporal import (
+    CompletedFrame,
+    DepthAlignment,
+    Flow,
+    FrameMemory,
+    align_depth,
+    flicker,
+    pixel_grid,
+    propagate_colors,
+    sample,
+    track,
+)
+from spackle.scene import Mode
+from spackle.trajectory import DepthRange, TrajectoryKind, spelled, view_at
+
+FILES = ("video.mp4", "report.json")
+# Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
+NAME = "{:06d}"
+FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
+
+
+def check_clip_options(base: BaseSettings, path: PathOptions, mode: Mode, render: bool) -> None:
+    """InputError for an option that a clip has no use for."""
+    for option, file in (("--cameras", path.cameras), ("--path", path.path)):
+        if file is not None:
+            raise InputError(
+                f"{option} {file}: not for a clip: its camera follows a trajectory, once through the clip; "
+                "leave the option out"
+            )
+    if mode != "scene":
+        raise InputError(f"--mode {mode}: not for a clip: each of its frames is one view; leave it out")
+    if not render:
+        raise InputError("--no-render: not for a clip: its video is all that there is to write; leave it out")
+    if base.depth is not None and not (isinstance(base.depth, Path) and base.depth.is_dir()):
+        raise InputError(
+            f"--depth {base.depth}: a clip takes a folder with a map for each frame: {NAME.format(0)}.npy and so on"
+        )
+    video, plain = path.video, VideoOptions(format=path.video.format)
+    for choice in dataclasses.fields(plain):
+        if getattr(video, choice.name) != getattr(plain, choice.name):
+            raise InputError(f"--{choice.name}: not for a clip: its video is as the clip is; leave the option out")
+    if video.suffix != ".mp4":
+        raise InputError(f"--format {video.format}: a clip becomes an mp4, with its sound; leave the option out")
+    OpenCV("a clip, whose motion has to be followed,")
+
+
+def predict_clip(
+    path: Path, folder: Path, completer: PhotoCompleter, lens: Mapping[str, float | None], reporter: Reporter
+) -> None:
+    """One clip to `folder`: video.mp4 with as many frames, and report.json; `lens` as `load_photo` takes it.
+
+    Raises:
+        InputError: a clip, a frame or a depth map that cannot be used, or a folder that cannot be written to.
+    """
+    seconds: dict[str, float] = {}
+    with results_folder(folder, FILES):
+        with reporter.stage("read", seconds) as step:
+            clip = read_clip(path, completer.path.frames, step)
+        focal = focal_length(path, clip.width, clip.height, {}, **lens)
+        if clip.hdr:
+            reporter.say(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
+        run = _Run(clip, focal, completer, reporter)
+        (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the video
+        with reporter.stage("frames", seconds) as step:
+            run.write(folder / "video.mp4", step)
+        report = run.report(seconds)
+        write_report(report, folder / "report.json")
+    reporter.say(f"{path.name}: {_summary(report)} -> {folder}")
+    reporter.result({"folder": folder, **report})
+
+
+class _Run:
+    """The work on one clip."""
+
+    def __init__(
+        self, clip: Clip, focal: tuple[float, str], completer: PhotoCompleter, reporter: Reporter
+    ) -> None:
+        self._clip, self._focal, self._setting, self._reporter = clip, focal, completer, reporter
+        choices = ClipChoices(
+            completer.path.trajectory,
+            completer.path.disparity,
+            len(clip),
+            steady=completer.settings.depth is None,  # what was measured is not bent
+            fill=completer.residual.weights != "none",
+            network=completer.network,
+            precision=completer.settings.precision,
+        )
+        self._completer = ClipCompleter(choices, completer.renderer, OpenCV("a clip").flow)
+        self._base = completer.base
+        self._first: tuple[Photo, BasePrediction, Choice] | None = None
+        self._notes: list[dict[str, Any]] = []
+        self._sound = False
+
+    def write(self, path: Path, step: Step) -> None:
+        """All frames, one after the other, into a video."""
+        frames = clip_frames(self._clip)
+        with ClipWriter(path, self._clip) as writer:
+            for index in range(len(self._clip)):
+                with self._completer.timed("decode"):
+                    rgb = next(frames)
+                drawn = self._draw(Photo(rgb, *self._focal, self._clip.path / NAME.format(index)))
+                with self._completer.timed("encode"):
+                    writer.add(drawn.view.rgb)
+                self._notes.append(_note(drawn))
+                step(index + 1, len(self._clip))
+        self._sound = writer.sound
+        if self._clip.audio and not self._sound:
+            self._reporter.say(
+                f"{self._clip.path.name}: its sound ({self._clip.audio}) does not go into an mp4: left out"
+            )
+
+    def _draw(self, photo: Photo) -> Drawn:
+        """A frame's completed view."""
+        with self._completer.timed("base"):
+            prediction = self._predict(photo)
+        small = resize_photo(photo)
+        try:
+            drawn = self._completer.add(small.rgb, prediction)
+        except ValueError as error:
+            raise InputError(f"{photo.path}: no camera path: {error}: check depth and focal length") from error
+        if not all_finite(drawn.gaussians[1]):
+            raise InputError(f"{photo.path}: a view too extreme to complete: give a smaller --disparity")
+        return drawn
+
+    def _predict(self, photo: Photo) -> BasePrediction:
+        """A frame's Gaussians, by the base that the first frame got."""
+        prediction, choice = self._base.load(photo, log=self._reporter.say).predict()
+        if self._first is None:
+            self._base, self._first = self._base.only(choice), (photo, prediction, choice)
+            name, focal = self._clip.path.name, prediction.camera.focal[0]
+            if choice.news:
+                self._reporter.say(f"{name}: {choice.news}")
+            self._reporter.say(
+                f"{name}: {len(self._clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
+                f"for each, focal length {focal:.0f} px ({prediction.lens_source or photo.focal_source})"
+            )
+        return prediction
+
+    def report(self, seconds: dict[str, float]) -> dict[str, Any]:
+        """Counts, holes, flicker and times, ready for JSON."""
+        assert self._first is not None
+        (photo, prediction, choice), clip, notes = self._first, self._clip, self._notes
+        stages = {name: round(value, 3) for name, value in self._completer.seconds.items()}
+        before, after = ([note["holes"][side] for note in notes] for side in (0, 1))
+        camera = prediction.camera
+        report: dict[str, Any] = {
+            "spackle": spackle.__version__,
+            "clip": {
+                "file": clip.path.name,
+                "width": clip.width,
+                "height": clip.height,
+                "frames": len(clip),
+                "fps": round(float(clip.rate), 3),
+                "seconds": round(float(clip.seconds), 3),
+                "cuts": [index for index, note in enumerate(notes) if note["cut"]],
+                "sound": {"codec": clip.audio, "copied": self._sound} if clip.audio else None,
+            },
+            "video": {"width": camera.width + camera.width % 2, "height": camera.height + camera.height % 2},
+            "focal_px": round(camera.focal[0], 3),
+            "focal_source": prediction.lens_source or photo.focal_source,
+            "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
+            "residual": {"weights": self._setting.residual.weights},
+            "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # for each frame, on the mean
+            "views": spelled(self._setting.path.trajectory),
+            "disparity": self._setting.path.disparity,
+            "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
+            "flicker": _flicker(notes),
+            "seconds": {**seconds, "by_stage": stages, "total": round(sum(seconds.values()), 3)},
+        }
+        if choice.passed_over:
+            report["base"]["passed_over"] = list(choice.passed_over)
+        return report
+
+
+def _note(drawn: Drawn) -> dict[str, Any]:
+    """What is remembered of a frame."""
+    holes = (hole_area_ratio(drawn.before.alpha), hole_area_ratio(drawn.view.alpha))
+    return {"holes": holes, "aux": len(drawn.gaussians[1]), "cut": drawn.cut, **drawn.flicker}
+
+
+def _flicker(notes: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Means over the frames, in units of 1/255; None where no frame has any."""
+    found = {name: [note[name] for note in notes if name in note] for name in FIGURES}
+    return {name: round(255 * _mean(values), 3) if values else None for name, values in found.items()}
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _summary(report: dict[str, Any]) -> str:
+    """A report in one line."""
+    holes, figures, clip = report["hole_area_ratio"], report["flicker"], report["clip"]
+    calm = ""
+    if figures["carried"] is not None:
+        calm = f", flicker in holes {figures['alone']:.1f} -> {figures['carried']:.1f}"
+    return (
+        f"{clip['frames']} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}{calm}, "
+        f"{report['seconds']['total']:.1f} s"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipChoices:
+    """What stays the same for all frames."""
+
+    trajectory: TrajectoryKind
+    disparity: float
+    frames: int  # of the clip, and so of the path
+    steady: bool = True  # hold the base's depth to that of the frame before
+    fill: bool = True  # fill holes
+    network: ResidualNet | None = None
+    precision: Precision = "auto"
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """A frame that is done."""
+
+    camera: Camera
+    gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
+    view: Rendering  # of all of them
+    before: Rendering  # of the base's
+    alone: Rendering  # completed without the past
+    cut: bool = False  # nothing of the frame before was found again
+    flicker: dict[str, float] = dataclasses.field(default_factory=dict)  # what can be told of FIGURES
+
+    @property
+    def hole(self) -> Tensor:
+        """[H, W] bool: not covered by the base."""
+        return hole_mask(self.before.alpha)
+
+
+# Mean change from the frame before along the motion found, in sRGB of 0..1: of what both frames show, and of holes in
+# both, completed each frame by itself and as drawn.
+FIGURES = ("seen", "alone", "carried")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Past:
+    """What is kept of a frame for the next one."""
+
+    rgb: Tensor  # [H, W, 3] the input
+    inverse_depth: Tensor  # [H, W] as the base said it, 0 where unknown
+    stretch: DepthAlignment
+    depths: DepthRange  # of the path
+    memory: FrameMemory | None = None
+    drawn: Drawn | None = None
+
+
+class ClipCompleter:
+    """Takes the frames in their order and completes the view of each; one frame is kept in memory."""
+
+    def __init__(self, choices: ClipChoices, renderer: Renderer, flow: Flow) -> None:
+        self.seconds: dict[str, float] = {}
+        self._choices, self._renderer, self._flow = choices, renderer, flow
+        self._past: _Past | None = None
+        self._count = 0
+
+    @torch.no_grad()
+    def add(self, rgb: Tensor, prediction: BasePrediction) -> Drawn:
+        """The next frame.
+
+        Args:
+            rgb: [H, W, 3] sRGB at the size of the prediction's camera.
+            prediction: of the frame, in the frame of its camera.
+
+        Raises:
+            ValueError: depths and focal length allow no path.
+        """
+        with self.timed("depth"):
+            base, shield, now, past = self._steadied(rgb, prediction)
+        choices, even = self._choices, prediction.camera.even()
+        camera = view_at(choices.trajectory, even, choices.disparity, now.depths, self._count, choices.frames)
+        with self.timed("complete"):
+            before, aux = self._renderer.render(base, camera), Gaussians.empty()
+            alone = before
+            if choices.fill:
+                network, precision = choices.network, choices.precision
+                completer = Completer(base, prediction.camera, self._renderer, network, precision=precision)
+                aux, alone = completer.completed_view(camera, [shield], rendering=before)
+        drawn, memory = Drawn(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
+        if choices.fill:
+            with self.timed("carry"):
+                memory_before = None if past is None else past.memory
+                frame = propagate_colors(base, aux, camera, self._renderer, (before, alone), memory_before, self._flow)
+                drawn, memory = _carried(drawn, frame, past), frame.memory
+        self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
+        self._count += 1
+        return drawn
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the block's time to a stage's seconds."""
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def _steadied(
+        self, rgb: Tensor, prediction: BasePrediction
+    ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
+        """The base with its depth held to the past, what the photo shows of it, what to keep, and the shot's past."""
+        seen = self._renderer.render(prediction.gaussians, prediction.camera)
+        known = ~hole_mask(seen.alpha) & (seen.depth > 0)
+        inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
+        past, stretch = self._past, DepthAlignment()
+        if past is not None:
+            found = track(rgb, past.rgb, self._flow)
+            if not found.same_shot():
+                past = None
+            elif self._choices.steady:
+                stretch = past.stretch.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
+        base = stretch.of_gaussians(prediction.gaussians)
+        shield = OcclusionGuard.of(dataclasses.replace(seen, depth=stretch.of_depth(seen.depth)), prediction.camera)
+        depths = DepthRange.of(base)
+        if past is not None:
+            depths = past.depths.towards(depths, FOLLOW)
+        return base, shield, _Past(rgb, inverse_depth, stretch, depths), past
+
+
+def _carried(drawn: Drawn, frame: CompletedFrame, past: _Past | None) -> Drawn:
+    """What was drawn, with the colours of the past."""
+    drawn = dataclasses.replace(drawn, gaussians=(drawn.gaussians[0], frame.aux), view=frame.view)
+    if past is None or past.drawn is None or frame.flow is None:
+        return drawn
+    earlier, hole = past.drawn, drawn.hole
+    was = sample(earlier.hole[..., None].float(), pixel_grid(frame.flow) + frame.flow)[..., 0]
+    both, neither = hole & (was > 0.999), ~hole & (was < 0.001)
+    pairs = {
+        "seen": (drawn.view, earlier.view, neither),
+        "alone": (drawn.alone, earlier.alone, both),
+        "carried": (drawn.view, earlier.view, both),
+    }
+    figures = {name: flicker(one.rgb, other.rgb, frame.flow, chosen) for name, (one, other, chosen) in pairs.items()}
+    return dataclasses.replace(drawn, flicker={name: value for name, value in figures.items() if value is not None})

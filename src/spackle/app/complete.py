@@ -1,0 +1,216 @@
+"""A loaded photo to a completed scene in memory: the base, the views that its holes are filled for, the completion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spackle.app.video import FrameMaker, PathOptions, video_problem
+from spackle.bases.open import BaseSettings, Choice, all_finite, open_base
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import save_gray_png, save_png, save_video
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, resize_photo
+from spackle.keyframes import PathError
+from spackle.progress import Reporter, Step
+from spackle.render import Renderer, get_renderer
+from spackle.residual import hole_area_ratio, hole_mask
+from spackle.scene import Mode, ResidualChoice, Scene, complete
+from spackle.trajectory import DepthRange, extremes
+
+MOST_CHECKED = 16  # views at keyframes whose holes are measured
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedViews:
+    """Views to complete."""
+
+    cameras: list[Camera]
+    checked: dict[str, int]  # name → index: views whose holes go into the report
+    frames: list[tuple[int, ...]]  # of the video: each a view, or the left eye's and the right eye's
+    stills: int  # so many views, the first ones, are drawn as pictures, too
+    maker: FrameMaker
+
+    @staticmethod
+    def of(path: list[Camera], others: dict[str, Camera], maker: FrameMaker, stills: bool) -> PlannedViews:
+        """The views of a path by a frame's eyes, and others to look at. All have holes to fill."""
+        middles = path if stills and maker.stereo else []  # the pictures show what is between the eyes
+        eyes = [maker.eyes(camera) for camera in path]
+        cameras = [*middles, *(eye for pair in eyes for eye in pair), *others.values()]
+        first, each = len(middles), len(eyes[0])
+        frames = [tuple(range(first + k * each, first + (k + 1) * each)) for k in range(len(path))]
+        last = len(cameras) - len(others)
+        checked = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(path))}
+        return PlannedViews(cameras, checked, frames, len(path) if stills else 0, maker)
+
+    def widest_checked(self, photo_camera: Camera) -> tuple[str, int]:
+        """Name and index of the checked view that is farthest from the photo's."""
+
+        def distance(item: tuple[str, int]) -> float:
+            return float((self.cameras[item[1]].position.double() - photo_camera.position.double()).norm())
+
+        return max(self.checked.items(), key=distance)
+
+
+@dataclasses.dataclass(frozen=True)
+class CompletedPhoto:
+    """What became of a photo."""
+
+    photo: Photo  # at its working size
+    prediction: BasePrediction
+    choice: Choice
+    views: PlannedViews
+    scene: Scene
+    saved_view: str | None  # in view mode: the view that `scene.aux` belongs to
+
+
+class PhotoCompleter:
+    """Completes photos: base, residual, cameras and renderer are set up once for all of them.
+
+    Raises:
+        InputError: an option that cannot be used, whatever the photo.
+    """
+
+    def __init__(self, base: BaseSettings, residual: ResidualChoice, path: PathOptions, mode: Mode = "scene") -> None:
+        base.check()
+        path.check()
+        self.settings, self.residual, self.path, self.mode = base, residual, path, mode
+        self.network = residual.load()
+        self.given_views = path.load_cameras()
+        self.base = open_base(base)
+        self.keyframes = path.load_keyframes()
+        self.renderer = get_renderer(base.device)
+
+    def check_video(self) -> None:
+        """InputError where the given views make no video."""
+        if self.given_views and (problem := video_problem(self.given_views)):
+            raise InputError(
+                f"{self.path.cameras}: {problem}, so they make no video: add --no-render for pictures only"
+            )
+
+    def complete(self, photo: Photo, reporter: Reporter, seconds: dict[str, float]) -> CompletedPhoto:
+        """A photo, given at its full size, to its completed scene.
+
+        Raises:
+            InputError: a photo or depth map that cannot be used.
+        """
+        with reporter.stage("prepare", seconds):
+            base = self.base.load(photo, log=reporter.say)
+        with reporter.stage("base", seconds) as step:
+            prediction, choice = base.predict(step)
+        photo = resize_photo(photo)
+        self._tell(photo, prediction, choice, reporter)
+        views = self._plan(photo.path, prediction)
+        with reporter.stage("complete", seconds) as step:
+            scene, saved_view = self._fill(prediction, views, step)
+            if not all_finite(scene.aux):
+                raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
+        return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
+
+    def _tell(self, photo: Photo, prediction: BasePrediction, choice: Choice, reporter: Reporter) -> None:
+        """Which base it was, and what it took."""
+        name = photo.path.name
+        if choice.news:
+            reporter.say(f"{name}: {choice.news}")
+        reporter.say(
+            f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
+            f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
+        )
+        if missing := float(prediction.notes.get("depth_filled", 0)):
+            reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+        if self.settings.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
+            reporter.say(
+                f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}"
+            )
+
+    def _plan(self, photo: Path, prediction: BasePrediction) -> PlannedViews:
+        """The given views; or a path, and where its holes are measured: at its two extremes, or at its keyframes."""
+        gaussians, video = prediction.gaussians, self.path.video
+        if self.given_views:
+            maker = FrameMaker.of(video, gaussians, self.given_views, photo)
+            return PlannedViews.of(self.given_views, {}, maker, stills=True)
+        try:
+            path = self.path.fly(gaussians, prediction.camera, self.keyframes)
+            others = self._checked(gaussians, prediction.camera.even())
+        except PathError as error:
+            raise InputError(f"{self.path.path}: {error}") from error
+        except ValueError as error:
+            raise InputError(f"{photo}: no camera path: {error}: check the depth map and the focal length") from error
+        return PlannedViews.of(path, others, FrameMaker.of(video, gaussians, path, photo), stills=False)
+
+    def _checked(self, gaussians: Gaussians, camera: Camera) -> dict[str, Camera]:
+        """The views whose holes are reported, by their names."""
+        depths, far = DepthRange.of(gaussians), self.path.disparity
+        if self.keyframes is None:
+            return dict(zip((f"{-far:g}", f"+{far:g}"), extremes(camera, far, depths), strict=True))
+        keys = self.keyframes.key_cameras(camera, depths)
+        step = math.ceil(len(keys) / MOST_CHECKED)
+        return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}
+
+    def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, str | None]:
+        """Fill the holes of all views, as --mode and --residual say; in view mode, which view the scene's file holds."""
+        if self.residual.weights == "none":
+            return Scene(prediction.gaussians, Gaussians.empty(), prediction.camera), None
+        scene = complete(
+            prediction,
+            views.cameras,
+            mode=self.mode,
+            exact=self.given_views is not None,
+            network=self.network,
+            renderer=self.renderer,
+            precision=self.settings.precision,
+            progress=step,
+        )
+        if scene.by_view is None:
+            return scene, None
+        # One file holds one view's Gaussians: those of the widest view that the report names.
+        name, widest = views.widest_checked(prediction.camera)
+        return dataclasses.replace(scene, aux=scene.by_view[widest]), name
+
+
+def save_views_video(path: Path, views: PlannedViews, scene: Scene, renderer: Renderer, step: Step) -> None:
+    """The views of the video's frames, all of one size; InputError for a file that cannot be written."""
+
+    def frames() -> Iterator[Tensor]:
+        for index, frame in enumerate(views.frames):
+            with torch.no_grad():
+                eyes = [renderer.render(scene.of_view(k), views.maker.sized(views.cameras[k])) for k in frame]
+                yield views.maker.frame(eyes)
+            step(index + 1, len(views.frames))
+
+    save_video(frames(), path, views.maker.options.rate, views.maker.options.loop)
+
+
+def picture_files(count: int) -> list[str]:
+    """What `save_pictures` writes for so many views."""
+    return [f"{index:04d}{kind}.png" for index in range(count) for kind in ("", "_base", "_mask")]
+
+
+@torch.no_grad()
+def save_pictures(folder: Path, views: PlannedViews, scene: Scene, renderer: Renderer, step: Step) -> None:
+    """Each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
+    for index, camera in enumerate(views.cameras[: views.stills]):
+        before = renderer.render(scene.base, camera)
+        save_png(renderer.render(scene.of_view(index), camera).rgb, folder / f"{index:04d}.png")
+        save_png(before.rgb, folder / f"{index:04d}_base.png")
+        save_gray_png(hole_mask(before.alpha).to(torch.float32), folder / f"{index:04d}_mask.png")
+        step(index + 1, views.stills)
+
+
+@torch.no_grad()
+def measure_holes(views: PlannedViews, scene: Scene, renderer: Renderer) -> list[dict[str, float | str]]:
+    """HAR of the checked views (eq. 11), before and after completion."""
+    rows: list[dict[str, float | str]] = []
+    for name, index in views.checked.items():
+        camera = views.cameras[index]
+        before = hole_area_ratio(renderer.render(scene.base, camera).alpha)
+        after = hole_area_ratio(renderer.render(scene.of_view(index), camera).alpha)
+        rows.append({"view": name, "before": before, "after": after})
+    return rows

@@ -1,0 +1,221 @@
+"""`spackle predict`: photos to scenes, videos and reports. Read `predict_all`, then `predict_one`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections import Counter
+from pathlib import Path
+
+import spackle
+from spackle.app.clip import check_clip_options, predict_clip
+from spackle.app.complete import (
+    CompletedPhoto,
+    PhotoCompleter,
+    measure_holes,
+    picture_files,
+    save_pictures,
+    save_views_video,
+)
+from spackle.app.report import base_before, is_done, make_report, summary, write_report
+from spackle.app.video import PathOptions
+from spackle.bases.depth_maps import DepthMap, calibrations_beside
+from spackle.bases.lite.base import LiteBase
+from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase, find_depth
+from spackle.bases.sharp import SharpBase
+from spackle.digest import digest_of, fingerprint
+from spackle.errors import InputError
+from spackle.formats import save_ply
+from spackle.formats.clip import is_clip
+from spackle.image import PHOTO_SUFFIXES, Photo, load_photo
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
+from spackle.scene import Mode, ResidualChoice
+
+FILES = ("base.ply", "scene.ply", "report.json")  # and the video
+IRRELEVANT = ("name", "low_memory", "windows", "compiled")  # change only last bits, or stand in other words there
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictOptions:
+    """The choices of `spackle predict`."""
+
+    base: BaseSettings = BaseSettings()
+    residual: ResidualChoice = ResidualChoice()
+    path: PathOptions = PathOptions()
+    render: bool = True  # write a video
+    mode: Mode = "scene"
+    focal_px: float | None = None
+    focal_mm: float | None = None
+    fov: float | None = None
+    overwrite: bool = False  # in a folder, do again what is done already
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """What a photo's folder gets, besides views/."""
+        return (*FILES, self.video_file) if self.render else FILES
+
+    @property
+    def video_file(self) -> str:
+        return f"video{self.path.video.suffix}"
+
+    @property
+    def lens(self) -> dict[str, float | None]:
+        """What a person said of the lens, as `load_photo` takes it."""
+        return {"focal_px": self.focal_px, "focal_mm": self.focal_mm, "fov": self.fov}
+
+
+def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
+    """Work through a photo, a clip or a folder of photos; returns the number of photos that failed.
+
+    Raises:
+        InputError: a single photo, a clip, or an option, that cannot be used.
+    """
+    found = find_photos(photos)
+    if is_clip(photos):
+        check_clip_options(options.base, options.path, options.mode, options.render)
+    completer = open_completer(options)
+    if is_clip(photos):
+        with results_folder(output):
+            predict_clip(photos, output / found[0][1], completer, options.lens, reporter)
+        return 0
+    shared = shared_digest(options, completer.base)
+    wanted = [*options.files, *(f"views/{name}" for name in picture_files(len(completer.given_views or [])))]
+    failed = 0
+    with results_folder(output):
+        for path, name in found:
+            try:
+                request = request_of(path, options.base.depth, shared)
+                if path != photos and not options.overwrite and is_done(output / name, wanted, request):
+                    reporter.say(f"{path.name}: done already (--overwrite does it again)")
+                    reporter.result({"folder": output / name, "done_already": True})
+                    continue
+                predict_one(path, output / name, options, completer, reporter, request)
+            except InputError as error:
+                if path == photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
+                    raise
+                failed += 1
+                reporter.say(f"error: {error}")
+                reporter.result({"folder": output / name, "error": str(error)})
+    if failed:
+        reporter.say(f"{failed} of {len(found)} photos failed")
+    return failed
+
+
+def predict_one(
+    path: Path, folder: Path, options: PredictOptions, completer: PhotoCompleter, reporter: Reporter, request: str
+) -> None:
+    """One photo to `folder`: base.ply, scene.ply, a video, report.json, and views/ with --cameras.
+
+    Nothing is written before all is computed.
+
+    Raises:
+        InputError: a photo or depth map that cannot be used, or a folder that cannot be written to.
+    """
+    seconds: dict[str, float] = {}
+    with reporter.stage("load", seconds):
+        photo = load_photo(path, **options.lens)
+    with contextlib.ExitStack() as folders:
+        folders.enter_context(results_folder(folder, options.files))
+        if completer.given_views:
+            pictures = picture_files(len(completer.given_views))
+            folders.enter_context(results_folder(folder / "views", pictures))
+        done = completer.complete(photo, reporter, seconds)
+        _warn_of_lite(done, folder, options.base, reporter)
+        scene, views, renderer = done.scene, done.views, completer.renderer
+        with reporter.stage("write", seconds):
+            (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
+            reach = None if options.path.cameras or options.path.path else options.path.disparity
+            for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
+                save_ply(part, folder / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)
+        video = None
+        if options.render:
+            video = views.maker.note(options.video_file, views.cameras[views.frames[0][0]], len(views.frames))
+            with reporter.stage("video", seconds) as step:
+                save_views_video(folder / options.video_file, views, scene, renderer, step)
+        if completer.given_views:
+            with reporter.stage("views", seconds) as step:
+                save_pictures(folder / "views", views, scene, renderer, step)
+        with reporter.stage("measure", seconds):
+            holes = measure_holes(views, scene, renderer)
+        report = make_report(done, completer, holes, video, request, seconds)
+        write_report(report, folder / "report.json")
+    reporter.say(f"{path.name}: {summary(report)} -> {folder}")
+    reporter.result({"folder": folder, **report})
+
+
+def open_completer(options: PredictOptions) -> PhotoCompleter:
+    """What all photos share; InputError for an option that cannot be used, whatever the photo."""
+    completer = PhotoCompleter(options.base, options.residual, options.path, options.mode)
+    video = options.path.video
+    for option, value in {"--format": video.format, "--fps": video.fps, "--loop": video.loop}.items():
+        if value is not None and not options.render:
+            raise InputError(f"{option} {value}: is for the video, and --no-render writes none: leave one of them out")
+    if options.render:
+        completer.check_video()
+    return completer
+
+
+def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
+    """A line where SHARP's results are about to give way to rough ones, because its weights are damaged or gone."""
+    if base.named == AUTO and done.choice.base == LiteBase.name and base_before(folder) == SharpBase.name:
+        file = base.files.get("checkpoint")
+        reporter.say(
+            f"{done.photo.path.name}: warning: {folder} was made by sharp and is made again by lite: "
+            f"{done.choice.why}{'' if file is None else f' ({file})'}"
+        )
+
+
+def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
+    """A digest of all that the photos have in common: the version, the options, and what their files hold.
+
+    Raises:
+        InputError: one of the files is missing.
+    """
+    settings, residual, path = options.base, options.residual, options.path
+    named = settings.named if settings.folder is None else "hf"  # its files tell, wherever they lie
+    own: dict[str, object] = {"spackle": spackle.__version__, "base": named, "residual": residual.weights}
+    own |= {"render": options.render, "mode": options.mode, **options.lens}
+    fields = {**dataclasses.asdict(settings), **dataclasses.asdict(path)}
+    choices = {name: value for name, value in fields.items() if not isinstance(value, Path) and name not in IRRELEVANT}
+    files = {"calibration": settings.calib, "camera file": path.cameras, "path file": path.path}
+    files["weights"] = residual.file
+    prints = [file and fingerprint(file, kind) for kind, file in files.items()]
+    return digest_of([choices | own, base.fingerprints, *prints])
+
+
+def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
+    """A digest of all that the result of one photo depends on.
+
+    Raises:
+        InputError: the photo or its depth map is missing.
+    """
+    files = [fingerprint(photo, "photo")]
+    if isinstance(depth, Path):
+        depth = find_depth(depth, photo)
+        files.append(fingerprint(depth, "depth map"))
+        files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
+    return digest_of([shared, *files])
+
+
+def find_photos(path: Path) -> list[tuple[Path, str]]:
+    """A photo, or the photos of a folder in order of their names, each with the name of its results.
+
+    Raises:
+        InputError: nothing there, or a folder without photos.
+    """
+    if not os.path.isdir(path):
+        return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
+    try:
+        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
+    if not photos:
+        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
+    stems = Counter(photo.stem.casefold() for photo in photos)
+    names = {photo.name.casefold() for photo in photos}
+    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
+    return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]

@@ -1,0 +1,126 @@
+"""`spackle render`: a scene file to a video."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import mimetypes
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spackle.app.video import FrameMaker, PathOptions, cover, video_problem
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.formats import load_ply, load_ply_camera, save_png, save_video
+from spackle.formats.video import FORMATS, is_video_name
+from spackle.gaussians import Gaussians
+from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.keyframes import PathError
+from spackle.output_folder import results_folder
+from spackle.progress import Reporter
+from spackle.render import get_renderer
+
+DEFAULT_SIZE = (1280, 720)
+
+
+def render_scene(
+    scene: Path, output: Path, path: PathOptions, focal_px: float | None, device: str, reporter: Reporter
+) -> None:
+    """Draw a PLY along a path: the video `output`, or `output`/STEM.mp4 (with --cameras also PNGs).
+
+    Args:
+        scene: the file.
+        output: a folder, or a name that ends as videos do.
+        path: the cameras and the video; its size is the stored camera's where None.
+        focal_px: in pixels of the video, in place of the stored camera's lens.
+        device: where to render.
+        reporter: says what has been drawn.
+
+    Raises:
+        InputError: a scene, a camera file or an output that cannot be used.
+    """
+    single = is_video_name(output)
+    if single:
+        path = dataclasses.replace(path, video=path.video.for_file(output))
+    elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
+        raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
+    path.check()
+    if path.cameras is not None and focal_px is not None:
+        raise InputError(f"--focal-px: the views of --cameras {path.cameras} have lenses of their own: leave it out")
+    renderer = get_renderer(device)
+    seconds: dict[str, float] = {}
+    with reporter.stage("load", seconds):
+        views = path.load_cameras()
+        gaussians = load_ply(scene)
+        cameras = views or _fly(scene, gaussians, path, focal_px, reporter)
+        # A path has the video's size already.
+        maker = FrameMaker.of(dataclasses.replace(path.video, size=None), gaussians, cameras, scene)
+    target = output if single else output / f"{scene.stem}{path.video.suffix}"
+    names = [f"{index:04d}.png" for index in range(len(cameras))] if views and not single else []
+    problem = video_problem(cameras)
+    if problem and not names:
+        hint = "give a folder with -o for pictures only" if views else "give --size"
+        raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
+    with results_folder(target.parent, [*names, target.name]), reporter.stage("video", seconds) as step:
+
+        def frames() -> Iterator[Tensor]:
+            """The frames of the video, each also saved as a picture, where these are wanted."""
+            for index, camera in enumerate(cameras):
+                with torch.no_grad():
+                    frame = maker.frame([renderer.render([gaussians], eye) for eye in maker.eyes(camera)])
+                if names:
+                    save_png(frame, target.parent / names[index])
+                yield frame
+                step(index + 1, len(cameras))
+
+        if problem:
+            for _ in frames():
+                pass
+        else:
+            save_video(frames(), target, path.video.rate, path.video.loop)
+    result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds["video"]}
+    if problem:
+        reporter.say(f"{path.cameras}: {problem}: pictures only, no video")
+        reporter.result({"folder": output, **result})
+        return
+    reporter.say(
+        f"{scene.name}: {len(gaussians):,} Gaussians, {len(cameras)} frames in {seconds['video']:.1f} s -> {target}"
+    )
+    reporter.result({"file": target, **result})
+
+
+def _fly(
+    scene: Path, gaussians: Gaussians, path: PathOptions, focal_px: float | None, reporter: Reporter
+) -> list[Camera]:
+    """The cameras of the path around the photo's place; InputError where the scene cannot be looked at from there."""
+    stored, keyframes = load_ply_camera(scene), path.load_keyframes()
+    try:
+        camera = _photo_camera(stored, path.video.size, focal_px)
+        cameras = path.fly(gaussians, camera, keyframes)
+    except InputError:
+        raise
+    except PathError as error:
+        raise InputError(f"{path.path}: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{scene}: no camera path: {error}: give views with --cameras") from error
+    if stored is None and focal_px is None:
+        reporter.say(
+            f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at {camera.width}×{camera.height} "
+            "(--focal-px, --size)"
+        )
+    return cameras
+
+
+def _photo_camera(stored: Camera | None, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
+    """The stored camera, changed as the options say; else a lens of 30 mm."""
+    width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
+    if focal_px is not None:
+        if not (math.isfinite(focal_px) and focal_px > 0):
+            raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
+        return Camera.from_focal(focal_px, width, height)
+    if stored is not None:
+        return cover(stored, width, height)
+    return Camera.from_focal(film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)

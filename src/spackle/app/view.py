@@ -1,0 +1,214 @@
+"""`spackle view`: a scene, or a photo that becomes one, on a page of this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from spackle.app.complete import PhotoCompleter
+from spackle.app.export import page_of
+from spackle.app.video import PathOptions
+from spackle.bases.open import AUTO, BaseSettings
+from spackle.errors import InputError
+from spackle.formats.scene_files import SceneFile
+from spackle.image import Photo, check_file, load_photo
+from spackle.progress import Reporter, Step
+from spackle.scene import ResidualChoice
+from spackle.signals import asked_to_stop
+from spackle.viewer import PageScene, page_files, page_scene
+from spackle.viewer.server import HOST, ViewerServer
+from spackle.viewer.work import Tell
+
+LOOK = 0.05  # seconds between two looks whether somebody wants to stop
+MAGIC = b"ply"
+WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
+OPEN_TO_ALL = (
+    "warning: everybody in the network can see this photo at --host {host}, send photos of their own and use this "
+    "machine to complete them; the connection is not encrypted"
+)
+ELSEWHERE = ("192.0.2.1", 9)  # an address of documentation: asking for the way there sends nothing
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewOptions:
+    """The choices of `spackle view`."""
+
+    base: BaseSettings = BaseSettings()
+    disparity: float = 0.3  # how far photos are completed
+    focal_px: float | None = None  # of the scene or the photo
+    fov: float | None = None
+    host: str = HOST
+    port: int = 0  # any that is free
+    browser: bool = True  # open one
+
+    def completer(self, base: BaseSettings) -> PhotoCompleter:
+        """Completes photos by a base; InputError for an option that cannot be used."""
+        return PhotoCompleter(base, ResidualChoice(), PathOptions(disparity=self.disparity))
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a file claims to be a scene, by its name or by its first bytes.
+
+    Raises:
+        InputError: there is no such file, or nothing in it.
+    """
+    check_file(path, "photo or scene")
+    if path.suffix.lower() in WRITTEN_ONLY:
+        raise InputError(f"{path}: {path.suffix} files are written, not read: give the scene.ply that it was made of")
+    with open(path, "rb") as file:
+        return path.suffix.lower() == ".ply" or file.read(len(MAGIC)) == MAGIC
+
+
+def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
+    """Show a scene or a photo until somebody stops it; False where work is left over that cannot be interrupted.
+
+    Raises:
+        InputError: a file that is neither, or an option that cannot be used.
+    """
+    uploads = Uploads(options, reporter)
+    begin = _first(target, options, uploads, reporter)
+    with asked_to_stop(alone=True) as stopped:
+        server = ViewerServer(page_files(), uploads.complete, host=options.host, port=options.port, log=reporter.detail)
+        try:
+            server.start()
+            begin(server)
+            announce(server, target.name, reporter, browser=options.browser)
+            while not stopped():
+                time.sleep(LOOK)
+        finally:
+            ended = server.close()
+    return ended
+
+
+def _first(
+    target: Path, options: ViewOptions, uploads: Uploads, reporter: Reporter
+) -> Callable[[ViewerServer], object]:
+    """What the server begins with: a scene that it shows, or a photo that it works on."""
+    seconds: dict[str, float] = {}
+    depth = options.base.depth
+    if is_scene(target):
+        if depth is not None:
+            raise InputError(f"--depth {depth}: {target.name} is a scene already: leave the option out")
+        with reporter.stage("load", seconds):
+            scene = page_of(SceneFile.load(target), options.focal_px, options.fov)
+        return lambda server: server.show(scene)
+    completer = options.completer(options.base)
+    if depth is None:
+        uploads.completer = completer  # it holds the network
+    with reporter.stage("load", seconds):
+        photo = load_photo(target, focal_px=options.focal_px, fov=options.fov)
+        if depth is not None:
+            completer.base.load(photo)  # what is wrong with a depth map is known before a page opens
+
+    def complete_first(tell: Tell) -> PageScene:
+        return complete_for_page(photo, target.name, completer, Teller(reporter, tell))
+
+    return lambda server: server.work(complete_first)
+
+
+def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller: Teller) -> PageScene:
+    """A loaded photo to what the page shows; what goes wrong is said here too."""
+    seconds: dict[str, float] = {}
+    try:
+        scene = completer.complete(photo, teller, seconds).scene
+        with teller.stage("page", seconds):
+            return page_scene(name, scene.base, scene.aux, scene.camera, completer.path.disparity)
+    except InputError as error:
+        Reporter.say(teller, f"error: {error}")  # the page is told as the job ends
+        raise
+
+
+class Uploads:
+    """Completes photos that the page sends; what was said of the first photo alone does not hold for them."""
+
+    def __init__(self, options: ViewOptions, reporter: Reporter) -> None:
+        """InputError: an option that cannot be used."""
+        base = options.base
+        name = AUTO if base.name == "rgbd" else base.name
+        self._options, self._reporter = options, reporter
+        self._base = dataclasses.replace(base, name=name, depth=None, calib=None)
+        self._base.check()
+        PathOptions(disparity=options.disparity).check()
+        self.completer: PhotoCompleter | None = None
+
+    def complete(self, path: Path, name: str, tell: Tell) -> PageScene:
+        """As the server wants it: one at a time."""
+        teller = Teller(self._reporter, tell, path, name)
+        self.completer = self.completer or self._options.completer(self._base)
+        seconds: dict[str, float] = {}
+        with teller.stage("load", seconds):
+            photo = load_photo(path)
+        return complete_for_page(photo, name, self.completer, teller)
+
+
+class Teller(Reporter):
+    """Tells the page what the terminal is told."""
+
+    def __init__(self, reporter: Reporter, tell: Tell, path: Path | None = None, name: str = "") -> None:
+        """`path` is a file of ours that people know by `name`."""
+        super().__init__(reporter.verbose, reporter.console)
+        self._tell, self._path, self._name = tell, path, name
+
+    def say(self, line: str) -> None:
+        if self._path is not None:
+            line = line.replace(str(self._path), self._name).replace(self._path.name, self._name)
+        super().say(line)
+        self._tell({"line": line})
+
+    def detail(self, line: str) -> None:
+        """For the terminal alone."""
+        if self.verbose:
+            super().say(line)
+
+    @contextlib.contextmanager
+    def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
+        """As ever; a total of 0 means that it is not known."""
+        self._tell({"stage": name, "done": 0, "total": 0})
+        with super().stage(name, seconds) as step:
+
+            def advance(done: int, total: int) -> None:
+                step(done, total)
+                self._tell({"stage": name, "done": done, "total": total})
+
+            yield advance
+
+
+def announce(server: ViewerServer, name: str, reporter: Reporter, *, browser: bool) -> None:
+    """Say where to look, warn where strangers can look too, and open a browser where there is one."""
+    if not server.local:
+        reporter.say(OPEN_TO_ALL.format(host=server.host))
+        reporter.say(f"{name}: from other machines {server.url_at(address_in_network(server.host))}")
+    reporter.say(f"{name}: {server.url} (Ctrl-C ends)")
+    reporter.result({"url": server.url})
+    if browser and not has_screen():
+        reporter.say("no screen here: open that page yourself; from another machine through `ssh -L`")
+    elif browser:
+        # Some browsers come back only when they are closed.
+        threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True, name="browser").start()
+
+
+def has_screen() -> bool:
+    """Whether a browser would have a window; one of text would take the terminal away."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+
+
+def address_in_network(host: str) -> str:
+    """The address by which others reach this machine, listening at `host`."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect(ELSEWHERE)
+            return str(probe.getsockname()[0])
+    except OSError:  # no network
+        return socket.gethostname()
