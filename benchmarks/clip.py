@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spackle.app.clip import ClipChoices, ClipCompleter, Drawn
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
@@ -27,7 +28,6 @@ from spackle.color import srgb_to_linear
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
-from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 import spackle
+from spackle.app.demo import load_motorcycle
 from spackle.bases.lift import lift
 from spackle.formats import save_gray_png, save_png
-from spackle.jobs.demo import load_motorcycle
 
 
 def psnr(image: Tensor, truth: Tensor, where: Tensor) -> float:

@@ -16,8 +16,10 @@ from safetensors.torch import load_file, save_file
 from sharp_weights import write_tiny
 from stand_in import StandIn, base_of, predict, refuses, write_lite
 
+from spackle.app.predict import PredictOptions, shared_digest
+from spackle.app.video import PathOptions
 from spackle.bases.hf import HfBase
-from spackle.bases.open import KINDS
+from spackle.bases.open import KINDS, BaseSettings, open_base
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
@@ -25,9 +27,7 @@ from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.evaluation.setup import EvaluateOptions
 from spackle.image import Photo
-from spackle.jobs.bases import base_files, public_name, says_of
-from spackle.jobs.options import PredictOptions
-from spackle.jobs.request import shared_digest
+from spackle.scene import ResidualChoice
 
 
 @pytest.fixture(scope="module")
@@ -142,13 +142,14 @@ def write_model(folder: Path) -> Path:
 
 def test_a_models_folder_counts_by_its_files_and_not_by_its_place(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
-    files = base_files(f"hf:{folder}", None)
-    assert set(files) == {"config.json", "model.safetensors"}
-    assert public_name(f"hf:{folder}") == "hf:small"
-    assert public_name("hf:me/small") == "hf:me/small"
+    settings = BaseSettings(f"hf:{folder}")
+    assert set(settings.files) == {"config.json", "model.safetensors"}
+    assert settings.public_name == "hf:small"
+    assert BaseSettings("hf:me/small").public_name == "hf:me/small"
 
     def digest(model: object) -> str:
-        return shared_digest(PredictOptions(base=f"hf:{model}", residual="none"))
+        settings = BaseSettings(f"hf:{model}")
+        return shared_digest(PredictOptions(settings, ResidualChoice("none"), PathOptions()), open_base(settings))
 
     before = digest(folder)
     elsewhere = shutil.copytree(folder, tmp_path / "two")
@@ -250,11 +251,11 @@ def test_tables_call_weights_apples_where_they_came_from_apple(tmp_path: Path) -
     file, record = tmp_path / "my_sharp.pt", tmp_path / "my_sharp.pt.json"
     file.write_bytes(b"weights")
     unknown = "a network of SHARP's shape, from the photo alone, by weights of unknown origin: my_sharp.pt"
-    assert says_of("sharp", file) == unknown
+    assert BaseSettings("sharp", checkpoint=file).says == unknown
     for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].says)):
         record.write_text(json.dumps({"url": url, "size": 7, "sha256": sha256(file)}))
-        assert says_of("sharp", file) == says
-    assert says_of("lite", file) == KINDS["lite"].says
+        assert BaseSettings("sharp", checkpoint=file).says == says
+    assert BaseSettings("lite", checkpoint=file).says == KINDS["lite"].says
 
 
 def test_a_benchmark_of_a_model_times_it_each_run(tmp_path: Path, stereo: Path, hub: list[dict[str, Any]]) -> None:

@@ -282,7 +282,7 @@ def test_the_seeds_alone_can_be_had_and_fill_the_holes_where_no_weights_came_wit
     report = report_of(tmp_path / "asked" / "photo")
     assert report["residual"]["weights"] == "seeds"
     assert "no trained weights" in report["residual"]["note"]
-    monkeypatch.setattr("spackle.jobs.options.SHIPPED", tmp_path / "none.safetensors")
+    monkeypatch.setattr("spackle.scene.SHIPPED", tmp_path / "none.safetensors")
     predict(*write_pair(tmp_path), tmp_path / "without")
     seeds, without = (tmp_path / name / "photo" / "scene.ply" for name in ("asked", "without"))
     assert seeds.read_bytes() == without.read_bytes()
@@ -526,7 +526,7 @@ def test_no_old_report_vouches_for_new_files(
         raise KeyboardInterrupt
 
     predict(*pair, tmp_path)
-    monkeypatch.setattr("spackle.jobs.predict.save_plan_video", interrupted)
+    monkeypatch.setattr("spackle.app.predict.save_views_video", interrupted)
     assert run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path, "--disparity", "0.5", *SHORT).code == 130
     assert names_in(tmp_path / "photo") == FILES - {"report.json"}
 
@@ -943,10 +943,10 @@ def test_a_process_succeeds_and_fails(tmp_path: Path, pair: tuple[Path, Path]) -
 
 
 def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*args: object) -> None:
+    def interrupted(*args: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spackle.jobs.predict.complete", interrupted)
+    monkeypatch.setattr("spackle.app.complete.complete", interrupted)
     result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", *SHORT)
     assert result.code == 130
     assert result.lines[-1] == "interrupted"

@@ -11,13 +11,13 @@ import torch
 from scenes import box_before_wall
 from torch import Tensor
 
+from spackle.app.clip import ClipChoices, ClipCompleter, Drawn
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
-from spackle.jobs.clip_frames import ClipChoices, ClipCompleter, Drawn
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, hole_mask
 from spackle.residual.temporal import (

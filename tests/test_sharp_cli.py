@@ -12,12 +12,12 @@ from photos import picture, read_ply, write_photo
 from PIL import Image
 from sharp_weights import gaussians_of, tiny_weights, write_tiny
 
+from spackle.app import predict
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.layers import TINY
 from spackle.device import pick_dtype
 from spackle.image import Photo
-from spackle.jobs import predict
 
 QUICK = ("--no-render", "--residual", "none")
 
@@ -138,7 +138,7 @@ def test_weights_that_change_before_they_are_read_stop_the_whole_folder(
         torch.save(changed, weights)
         return load_photo(*args, **options)
 
-    monkeypatch.setattr("spackle.jobs.predict.load_photo", replace_weights)
+    monkeypatch.setattr("spackle.app.predict.load_photo", replace_weights)
     arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     result = run(*arguments)
     assert result.code == 2
@@ -159,7 +159,7 @@ def test_weights_that_go_while_a_folder_is_worked_on_are_not_missed(
         weights.unlink(missing_ok=True)
         write_report(*args)
 
-    monkeypatch.setattr("spackle.jobs.predict.write_report", remove_weights)
+    monkeypatch.setattr("spackle.app.predict.write_report", remove_weights)
     arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
     assert names_in(tmp_path / "out") == {"a", "b"}

@@ -41,7 +41,7 @@ _HOMES = {
     "LiteBase": "spackle.bases.lite.base",
     "Photo": "spackle.image",
     "Renderer": "spackle.render",
-    "Rendering": "spackle.rendering",
+    "Rendering": "spackle.render.protocol",
     "Scene": "spackle.scene",
     "SharpBase": "spackle.bases.sharp",
     "complete": "spackle.scene",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from spackle.downloads import hold
 from spackle.errors import InputError
-from spackle.formats import check_writable
+from spackle.formats import atomic_path, check_writable
 
 LOCK = ".lock"
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
@@ -89,3 +91,9 @@ def make_folder(path: Path) -> None:
         raise InputError(f"{path}: cannot create this output folder: {reason}; choose another with -o") from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{path}: this output folder is not writable; choose another with -o")
+
+
+def write_report(report: dict[str, Any], path: Path) -> None:
+    """Write a report as JSON, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -47,7 +47,9 @@ class ResidualChoice:
     @property
     def file(self) -> Path | None:
         """Where the weights lie; None without a network."""
-        return SHIPPED if self.weights == "shipped" else None if self.weights in ("seeds", "none") else Path(self.weights)
+        return (
+            SHIPPED if self.weights == "shipped" else None if self.weights in ("seeds", "none") else Path(self.weights)
+        )
 
     def load(self) -> ResidualNet | None:
         """The network, if any; InputError for a file that cannot be used."""

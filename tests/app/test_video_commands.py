@@ -19,10 +19,9 @@ from scenes import box_before_wall, psnr
 from torch import Tensor
 
 import spackle
+from spackle.app.video import PathOptions, VideoOptions, cover
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES
-from spackle.jobs.film import cover, fly
-from spackle.jobs.video_options import VideoOptions
 from spackle.render import CpuRenderer
 from spackle.scene import scene_path
 from spackle.stereo import Stereo
@@ -61,7 +60,7 @@ def test_a_looped_path_does_not_show_its_first_view_twice(kind: str) -> None:
 def test_a_video_that_starts_again_gets_a_looped_path_and_a_single_one_does_not() -> None:
     scene = box_before_wall()
     for options, looped in ((VideoOptions(), 0), (VideoOptions(loop=2), 1), (VideoOptions(format="gif"), 1)):
-        path = fly(scene.base(), scene.camera, "rotate", 0.3, 8, options)
+        path = PathOptions("rotate", frames=8, video=options).fly(scene.base(), scene.camera, None)
         step = float((path[-1].position - path[0].position).norm())
         assert (step > 0.01) == looped
 

@@ -31,9 +31,9 @@ from rich.console import Console
 from sites import Site, serve
 
 from spackle import cli
+from spackle.app.weights import get_weights
 from spackle.downloads import WEIGHTS, Record, check_recorded, download, installed, transfer, weights_folder
 from spackle.errors import InputError
-from spackle.jobs.weights import get_weights
 from spackle.progress import Reporter
 
 CONTENT = random.Random(5).randbytes(1_000_003)

@@ -24,6 +24,7 @@ from plain_scenes import (
 from rich.console import Console
 from scenes import box_before_wall, motorcycle, motorcycle_base, psnr, shifted, slanted_plane
 
+from spackle.app.export import WRITERS, export_scene
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
@@ -35,7 +36,6 @@ from spackle.formats.sog import codebook, encode_sog
 from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LIMIT, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_to_matrix
-from spackle.jobs.export import WRITERS, export_scene
 from spackle.progress import Reporter
 from spackle.render import CpuRenderer
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scenes import box_before_wall
 from torch import Tensor
 
+from spackle.app.video import PathOptions
 from spackle.camera import Camera
 from spackle.camera_path import (
     TRAJECTORIES,
@@ -28,8 +29,6 @@ from spackle.camera_path import (
     view_matrix,
 )
 from spackle.gaussians import Gaussians
-from spackle.jobs.film import fly
-from spackle.jobs.video_options import VideoOptions
 
 PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
 RANGE = DepthRange(near=2.0, focus=4.0)
@@ -155,7 +154,7 @@ def test_what_happens_between_keys_is_looked_at_too() -> None:
         over.cameras(CAMERA, 3, DEPTHS)
     slow = KeyframePath((KEYS[0], Keyframe(1e6, (1, 0, 0), TARGET)))
     with pytest.raises(PathError, match="--frames"):
-        fly(box_before_wall().base(), CAMERA, slow, 0.3, None, VideoOptions())
+        PathOptions().fly(box_before_wall().base(), CAMERA, slow)
 
 
 # Trajectories

@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box_before_wall, cast, psnr, wall
 
+from spackle.app.video import FrameMaker, VideoOptions
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange
 from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
-from spackle.jobs.film import make_film
-from spackle.jobs.video_options import VideoOptions
 from spackle.render import CpuRenderer
 from spackle.scene import scene_path
 from spackle.stereo import DUBOIS_LEFT, DUBOIS_RIGHT, LAYOUTS, Stereo, anaglyph, default_ipd
@@ -146,7 +145,7 @@ def test_one_scale_serves_all_views_of_a_video() -> None:
     path = scene_path(base, scene.camera, "rotate_forward", 0.3, 5)
     scale = DepthColors.over(base, path)
     assert (scale.near, scale.far) == pytest.approx((2.0, 6.0), rel=0.25)
-    film = make_film(VideoOptions(show="depth"), base, path, Path("x"))
+    film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))
     for camera in path:
         frame = film.frame([CPU.render(base, camera)])
         box, corner = frame[36, 48].sum(), frame[2, 48].sum()
@@ -160,7 +159,7 @@ def test_a_still_thing_keeps_its_colour_while_the_camera_moves_past_it() -> None
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
     path = scene_path(base, scene.camera, "swipe", 0.3, 4)
-    film = make_film(VideoOptions(show="depth"), base, path, Path("x"))
+    film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))
     for camera in path:
         view = CPU.render(base, camera)
         frame = film.frame([view])

@@ -14,18 +14,18 @@ from torch import Tensor
 
 import spackle
 from spackle.app.complete import PhotoCompleter
-from spackle.app.report import write_report
 from spackle.app.video import PathOptions, VideoOptions
 from spackle.bases.open import BaseSettings, Choice, all_finite
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, TrajectoryKind, spelled, view_at
+from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, focal_length, resize_photo
-from spackle.opencv import OpenCV
-from spackle.output_folder import results_folder
-from spackle.device import Precision
+from spackle.inpaint.opencv import OpenCV
+from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
@@ -44,7 +44,6 @@ from spackle.residual.temporal import (
     track,
 )
 from spackle.scene import Mode
-from spackle.trajectory import DepthRange, TrajectoryKind, spelled, view_at
 
 FILES = ("video.mp4", "report.json")
 # Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
@@ -105,9 +104,7 @@ def predict_clip(
 class _Run:
     """The work on one clip."""
 
-    def __init__(
-        self, clip: Clip, focal: tuple[float, str], completer: PhotoCompleter, reporter: Reporter
-    ) -> None:
+    def __init__(self, clip: Clip, focal: tuple[float, str], completer: PhotoCompleter, reporter: Reporter) -> None:
         self._clip, self._focal, self._setting, self._reporter = clip, focal, completer, reporter
         choices = ClipChoices(
             completer.path.trajectory,

@@ -14,16 +14,15 @@ from spackle.app.video import FrameMaker, PathOptions, video_problem
 from spackle.bases.open import BaseSettings, Choice, all_finite, open_base
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.camera_path import DepthRange, PathError, extremes
 from spackle.errors import InputError
 from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, resize_photo
-from spackle.keyframes import PathError
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.scene import Mode, ResidualChoice, Scene, complete
-from spackle.trajectory import DepthRange, extremes
 
 MOST_CHECKED = 16  # views at keyframes whose holes are measured
 
@@ -155,7 +154,7 @@ class PhotoCompleter:
         return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}
 
     def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, str | None]:
-        """Fill the holes of all views, as --mode and --residual say; in view mode, which view the scene's file holds."""
+        """Fill the holes, as --mode and --residual say; in view mode also says which view the scene's file holds."""
         if self.residual.weights == "none":
             return Scene(prediction.gaussians, Gaussians.empty(), prediction.camera), None
         scene = complete(

@@ -18,9 +18,9 @@ from spackle.app.complete import (
     save_pictures,
     save_views_video,
 )
-from spackle.app.report import base_before, is_done, make_report, summary, write_report
+from spackle.app.report import base_before, is_done, make_report, summary
 from spackle.app.video import PathOptions
-from spackle.bases.depth_maps import DepthMap, calibrations_beside
+from spackle.bases.depth_map import DepthMap, calibrations_beside
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase, find_depth
 from spackle.bases.sharp import SharpBase
@@ -28,8 +28,8 @@ from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
-from spackle.image import PHOTO_SUFFIXES, Photo, load_photo
-from spackle.output_folder import results_folder
+from spackle.image import PHOTO_SUFFIXES, load_photo
+from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter
 from spackle.scene import Mode, ResidualChoice
 
@@ -41,9 +41,9 @@ IRRELEVANT = ("name", "low_memory", "windows", "compiled")  # change only last b
 class PredictOptions:
     """The choices of `spackle predict`."""
 
-    base: BaseSettings = BaseSettings()
-    residual: ResidualChoice = ResidualChoice()
-    path: PathOptions = PathOptions()
+    base: BaseSettings
+    residual: ResidualChoice
+    path: PathOptions
     render: bool = True  # write a video
     mode: Mode = "scene"
     focal_px: float | None = None

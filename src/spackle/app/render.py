@@ -13,12 +13,12 @@ from torch import Tensor
 
 from spackle.app.video import FrameMaker, PathOptions, cover, video_problem
 from spackle.camera import Camera
+from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_png, save_video
 from spackle.formats.video import FORMATS, is_video_name
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
-from spackle.keyframes import PathError
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
@@ -53,9 +53,9 @@ def render_scene(
     renderer = get_renderer(device)
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
-        views = path.load_cameras()
+        views, keyframes = path.load_cameras(), path.load_keyframes()
         gaussians = load_ply(scene)
-        cameras = views or _fly(scene, gaussians, path, focal_px, reporter)
+        cameras = views or _fly(scene, gaussians, path, keyframes, focal_px, reporter)
         # A path has the video's size already.
         maker = FrameMaker.of(dataclasses.replace(path.video, size=None), gaussians, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
@@ -93,10 +93,15 @@ def render_scene(
 
 
 def _fly(
-    scene: Path, gaussians: Gaussians, path: PathOptions, focal_px: float | None, reporter: Reporter
+    scene: Path,
+    gaussians: Gaussians,
+    path: PathOptions,
+    keyframes: KeyframePath | None,
+    focal_px: float | None,
+    reporter: Reporter,
 ) -> list[Camera]:
     """The cameras of the path around the photo's place; InputError where the scene cannot be looked at from there."""
-    stored, keyframes = load_ply_camera(scene), path.load_keyframes()
+    stored = load_ply_camera(scene)
     try:
         camera = _photo_camera(stored, path.video.size, focal_px)
         cameras = path.fly(gaussians, camera, keyframes)

@@ -9,8 +9,7 @@ from typing import Any
 
 import spackle
 from spackle.app.complete import CompletedPhoto, PhotoCompleter
-from spackle.formats import atomic_path
-from spackle.trajectory import spelled
+from spackle.camera_path import spelled
 
 
 def make_report(
@@ -69,12 +68,6 @@ def _earlier(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return report if isinstance(report, dict) else {}
-
-
-def write_report(report: dict[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(report: dict[str, Any]) -> str:

@@ -13,16 +13,15 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.camera_path import MAX_DISPARITY, DepthRange, KeyframePath, PathError, TrajectoryKind
 from spackle.color import DepthColors
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
-from spackle.keyframes import KeyframePath, PathError
 from spackle.render.protocol import Rendering
 from spackle.scene import PATH_FRAMES, scene_path
 from spackle.stereo import Stereo, StereoLayout, default_ipd
-from spackle.trajectory import MAX_DISPARITY, DepthRange, TrajectoryKind
 
 VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
@@ -73,7 +72,9 @@ class VideoOptions:
             if not value > 0 or (option == "--ipd" and value > MAX_IPD):
                 raise InputError(f"{option} must be a positive number, got {value:g}")
         if self.show == "depth" and self.stereo == "anaglyph":
-            raise InputError("--show depth: an anaglyph mixes the colours that stand for depth: give --stereo sbs or ou")
+            raise InputError(
+                "--show depth: an anaglyph mixes the colours that stand for depth: give --stereo sbs or ou"
+            )
 
     def _blame(self, option: str, loop: int | None) -> None:
         """InputError that names an option for what the format refuses."""

@@ -41,7 +41,7 @@ ELSEWHERE = ("192.0.2.1", 9)  # an address of documentation: asking for the way 
 class ViewOptions:
     """The choices of `spackle view`."""
 
-    base: BaseSettings = BaseSettings()
+    base: BaseSettings
     disparity: float = 0.3  # how far photos are completed
     focal_px: float | None = None  # of the scene or the photo
     fov: float | None = None

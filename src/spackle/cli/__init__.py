@@ -8,12 +8,44 @@ import sys
 from typing import Annotated, NoReturn
 
 import typer
+from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from spackle.cli import dataset, demo, evaluate, export, predict, render, train, view, weights
+from spackle.cli import dataset, evaluate, predict, render, train, view, weights
 from spackle.cli.options import INTERRUPTED
-from spackle.cli.overview import Overview
 from spackle.errors import InputError
+
+EXAMPLES = (
+    ("spackle predict -i photo.jpg -o out", "a scene, a video, a report"),
+    ("spackle view photo.jpg", "look at it in the browser"),
+    ("spackle export out/photo/scene.ply -o photo.html", "one file to send"),
+)
+OPTIONS = (
+    ("--install-completion", "Completion for the shell that this is"),
+    ("--version", "Which version this is"),
+    ("-h, --help", "This; after a command, what it takes"),
+)
+WIDTH = 80
+
+
+class Overview(TyperGroup):
+    """A group of commands whose help is one line each, below examples."""
+
+    def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
+        """Write it; whatever the terminal's height, 24 lines of 80 characters show all."""
+        write = formatter.write  # type: ignore[attr-defined]
+        rows = [(name, command) for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))]
+        indent = max(len(name) for name, _ in rows) + 4
+        write(f"{self.help}\n\n")
+        for line, meaning in EXAMPLES:
+            write(f"  {line:<50}{meaning}\n")
+        write("\nCommands:\n")
+        for name, command in rows:
+            write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
+        write("\nOptions:\n")
+        for name, meaning in OPTIONS:
+            write(f"  {name:<22}{meaning}\n")
+
 
 app = typer.Typer(
     name="spackle",
@@ -26,8 +58,15 @@ app = typer.Typer(
 )
 
 
-for group in (predict, render, view, export, demo, train, evaluate, dataset, weights):
-    group.register(app)
+app.command(short_help="Photos, or a clip, to completed scenes and videos")(predict.predict)
+app.command(short_help="A saved scene to a video")(render.render)
+app.command(short_help="Look at a scene, or at a photo that becomes one")(view.view)
+app.command(short_help="A scene for other viewers, or as one page to send")(render.export)
+app.command(short_help="The Middlebury Motorcycle, against its true second photo")(predict.demo)
+train.register(app)
+evaluate.register(app)
+dataset.register(app)
+app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 
 
 def _version(asked: bool) -> None:

@@ -9,10 +9,8 @@ import typer
 
 from spackle.cli.options import (
     INTERRUPTED,
-    Device,
     DeviceOption,
-    PrecisionChoice,
-    Trajectory,
+    PrecisionName,
     VerboseOption,
     trajectory_option,
 )
@@ -41,9 +39,9 @@ def dataset_build(
         Path | None, typer.Option(metavar="FOLDER", help="Depth maps named as the photos, for --base rgbd.")
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
-    precision: Annotated[PrecisionChoice, typer.Option(help="Of the base's network.")] = PrecisionChoice.auto,
+    precision: Annotated[PrecisionName, typer.Option(help="Of the base's network.")] = "auto",
     views: Annotated[int, typer.Option(help="Views of a photo, its own among them.")] = 20,
-    trajectory: Annotated[Trajectory | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
+    trajectory: Annotated[str | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
     disparity: Annotated[
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),
@@ -63,7 +61,7 @@ def dataset_build(
     ] = None,
     threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
     shard_size: Annotated[int, typer.Option(help="Photos of a tar file.")] = 50,
-    device: DeviceOption = Device.auto,
+    device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
@@ -73,10 +71,10 @@ def dataset_build(
     from spackle.dataset.views import ViewChoices
     from spackle.progress import Reporter
 
-    settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision.value, device=device.value)
+    settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
     options = DatasetOptions(
         settings,
-        ViewChoices.named(seed, views, trajectory and trajectory.name, disparity),
+        ViewChoices.named(seed, views, trajectory, disparity),
         images=images,
         sample=sample,
         inpainter=inpainter,

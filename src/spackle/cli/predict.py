@@ -1,39 +1,28 @@
-"""`spackle predict`, as the command line has it."""
+"""`spackle predict` and `spackle demo`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from spackle.cli.options import (
-    CamerasOption,
-    ConvergenceOption,
-    Device,
+    CheckpointOption,
     DeviceOption,
-    DisparityOption,
-    FormatOption,
-    FpsOption,
-    FramesOption,
-    IpdOption,
     JsonOption,
-    LoopOption,
-    ModeChoice,
-    PathOption,
-    PrecisionChoice,
-    ShowChoice,
-    ShowOption,
-    SizeOption,
-    StereoOption,
-    TrajectoryOption,
+    PrecisionName,
     VerboseOption,
-    chosen_way,
-    video_options,
+    with_path_options,
 )
 
+if TYPE_CHECKING:
+    from spackle.app.video import PathOptions
 
+
+@with_path_options
 def predict(
+    *,
     photo: Annotated[
         Path, typer.Option("-i", "--input", metavar="PHOTO_OR_FOLDER", help="A photo, a clip, or a folder.")
     ],
@@ -57,12 +46,10 @@ def predict(
     calib: Annotated[
         Path | None, typer.Option(metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
     ] = None,
-    checkpoint: Annotated[
-        Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), or of lite.")
-    ] = None,
+    checkpoint: CheckpointOption = None,
     precision: Annotated[
-        PrecisionChoice, typer.Option(help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
-    ] = PrecisionChoice.auto,
+        PrecisionName, typer.Option(help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
+    ] = "auto",
     low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for sharp.")] = False,
     windows: Annotated[
         int | None,
@@ -82,23 +69,12 @@ def predict(
         ),
     ] = None,
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
-    trajectory: TrajectoryOption = None,
-    disparity: DisparityOption = None,
-    path: PathOption = None,
-    cameras: CamerasOption = None,
-    frames: FramesOption = None,
-    video_format: FormatOption = None,
-    fps: FpsOption = None,
-    loop: LoopOption = None,
-    size: SizeOption = None,
-    show: ShowOption = ShowChoice.color,
-    stereo: StereoOption = None,
-    ipd: IpdOption = None,
-    convergence: ConvergenceOption = None,
+    path: PathOptions,
     mode: Annotated[
-        ModeChoice, typer.Option(help="scene: one set of Gaussians for all views; view: one for each (the paper's).")
-    ] = ModeChoice.scene,
-    device: DeviceOption = Device.auto,
+        Literal["scene", "view"],
+        typer.Option(help="scene: one set of Gaussians for all views; view: one for each (the paper's)."),
+    ] = "scene",
+    device: DeviceOption = "auto",
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the photo.")] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
@@ -110,39 +86,26 @@ def predict(
 
     A photo alone is enough. With a depth map, or SHARP's weights (`spackle weights get sharp`), geometry is better.
     """
-    from spackle.jobs.options import PredictOptions
-    from spackle.jobs.predict import predict_all
+    from spackle.app.predict import PredictOptions, predict_all
+    from spackle.bases.open import BaseSettings
     from spackle.progress import Reporter
+    from spackle.scene import ResidualChoice
 
-    kind, far = chosen_way(trajectory, disparity, frames, path, cameras)
-    options = PredictOptions(
-        base=base,
-        depth=depth,
-        calib=calib,
-        checkpoint=checkpoint,
-        precision=precision.value,
-        low_memory=low_memory,
-        windows=windows,
-        compiled=compiled,
-        residual=residual,
-        render=render,
-        trajectory=kind,
-        disparity=far,
-        cameras=cameras,
-        path=path,
-        frames=frames,
-        video=video_options(video_format, fps, loop, size, show, stereo, ipd, convergence),
-        mode=mode.value,
-        device=device.value,
-        focal_px=focal_px,
-        focal_mm=focal_mm,
-        fov=fov,
-        overwrite=overwrite,
-    )
+    settings = BaseSettings(base, depth, calib, checkpoint, precision, low_memory, windows, compiled, device)
+    options = PredictOptions(settings, ResidualChoice(residual), path, render, mode, focal_px, focal_mm, fov, overwrite)
     if predict_all(photo, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(short_help="Photos, or a clip, to completed scenes and videos")(predict)
+def demo(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for the results.")] = Path(
+        "demo-output"
+    ),
+    as_json: JsonOption = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Complete the Middlebury Motorcycle photo and compare with the true second photo (needs scikit-image)."""
+    from spackle.app.demo import run_demo
+    from spackle.progress import Reporter
+
+    run_demo(output, Reporter(verbose, as_json=as_json))

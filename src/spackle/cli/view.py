@@ -1,4 +1,4 @@
-"""`spackle view`, as the command line has it."""
+"""`spackle view`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ from typing import Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, Device, DeviceOption, JsonOption, VerboseOption
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(short_help="Look at a scene, or at a photo that becomes one")(view)
+from spackle.cli.options import INTERRUPTED, CheckpointOption, DeviceOption, JsonOption, VerboseOption
 
 
 def view(
@@ -23,13 +18,11 @@ def view(
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
     ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
-    checkpoint: Annotated[
-        Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), or of lite.")
-    ] = None,
+    checkpoint: CheckpointOption = None,
     disparity: Annotated[float, typer.Option(help="How far photos are completed: 0 to 2; 0.3 is large.")] = 0.3,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
-    device: DeviceOption = Device.auto,
+    device: DeviceOption = "auto",
     host: Annotated[
         str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets everybody in the network in.")
     ] = "127.0.0.1",
@@ -39,22 +32,15 @@ def view(
     verbose: VerboseOption = False,
 ) -> None:
     """Look at a scene, or complete a photo and look at that, on a page of this machine. Ctrl-C ends it."""
-    from spackle.jobs.options import PredictOptions
-    from spackle.jobs.view import ViewOptions
-    from spackle.jobs.view import view as view_target
+    from spackle.app.view import ViewOptions
+    from spackle.app.view import view as view_target
+    from spackle.bases.open import BaseSettings
     from spackle.progress import Reporter
 
-    options = PredictOptions(
-        base=base,
-        depth=depth,
-        checkpoint=checkpoint,
-        disparity=disparity,
-        focal_px=focal_px,
-        fov=fov,
-        device=device.value,
-    )
+    settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
+    options = ViewOptions(settings, disparity, focal_px, fov, host, port, browser)
     reporter = Reporter(verbose, as_json=as_json)
-    if view_target(target, ViewOptions(options, host, port, browser), reporter):
+    if view_target(target, options, reporter):
         raise typer.Exit(INTERRUPTED)
     # A step of a network cannot be interrupted, and Python would wait for it, or fall over it, on its way out.
     reporter.console.show_cursor()

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from spackle.cli.options import JsonOption
 
 weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
-
-
-class NetworkSize(str, Enum):
-    """Sizes of SHARP's network."""
-
-    full = "full"
-    tiny = "tiny"
 
 
 @weights.command("get")
@@ -32,7 +24,7 @@ def weights_get(
     as_json: JsonOption = False,
 ) -> None:
     """Download weights and record their SHA-256; a broken download goes on where it stopped."""
-    from spackle.jobs.weights import get_weights
+    from spackle.app.weights import get_weights
     from spackle.progress import Reporter
 
     get_weights(name, output, Reporter(as_json=as_json), url=url, force=force)
@@ -41,13 +33,13 @@ def weights_get(
 @weights.command("make")
 def weights_make(
     output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
-    size: Annotated[NetworkSize, typer.Option(help="The published size, or one for tests.")] = NetworkSize.full,
+    size: Annotated[Literal["full", "tiny"], typer.Option(help="The published size, or one for tests.")] = "full",
 ) -> None:
     """Make random weights of SHARP's shape, the same each time, to try everything without Apple's."""
-    from spackle.jobs.weights import make_weights
+    from spackle.app.weights import make_weights
     from spackle.progress import Reporter
 
-    make_weights(output, size.value, Reporter())
+    make_weights(output, size, Reporter())
 
 
 @weights.command("list")
@@ -55,12 +47,7 @@ def weights_list(as_json: JsonOption = False) -> None:
     """Say which weights are known, and which of them are here."""
     from rich.console import Console
 
-    from spackle.jobs.weights import list_weights
+    from spackle.app.weights import list_weights
     from spackle.progress import Reporter
 
     list_weights(Reporter(as_json=as_json), Console(highlight=False))
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(weights, name="weights", short_help="Weights that others publish: fetch them, list them")

@@ -20,11 +20,11 @@ from spackle.digest import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation import suite_stages as stages
 from spackle.evaluation.bench import check_runs, load_part, write_part
+from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.evaluation.results import begin, write_json, write_text
 from spackle.evaluation.suite_scenes import SIDE, holed_scene
 from spackle.evaluation.table import EMPTY, Line, Table, to_markdown
 from spackle.evaluation.timing import MS, Section, Timing, timed
-from spackle.jobs.demo import load_motorcycle
 from spackle.machine import hardware, versions, without_nan
 from spackle.output_folder import alone_in, results_folder
 from spackle.progress import Reporter

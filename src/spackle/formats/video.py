@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 import av
 import numpy as np
@@ -121,7 +122,7 @@ class VideoWriter:
         self._shape: tuple[int, ...] = ()
         self._stack = contextlib.ExitStack()
 
-    def __enter__(self) -> VideoWriter:
+    def __enter__(self) -> Self:
         self._temporary = self._stack.enter_context(atomic_path(self.path))
         return self
 

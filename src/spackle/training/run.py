@@ -12,9 +12,8 @@ import torch
 from rich.console import Console
 
 from spackle.errors import InputError
-from spackle.jobs.report import write_report
 from spackle.machine import hardware, versions, without_nan
-from spackle.output_folder import alone_in, results_folder
+from spackle.output_folder import alone_in, results_folder, write_report
 from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 from spackle.training.checkpoint import (

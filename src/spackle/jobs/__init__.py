@@ -1,1 +1,0 @@
-"""The work behind the commands: files in, files out, progress on the way."""
