@@ -86,7 +86,7 @@ def test_a_kind_that_is_not_named_is_refused(photo: bytes) -> None:
         for name in ("photo.gif", "photo.svg", "photo", "", "photo.png.exe", "photo.png%00.exe", ".png%2f"):
             reply = send(server, photo, name)
             assert reply.status == 415, name
-            assert ".png" in reply.json["error"] or "png" in reply.json["error"]
+            assert "png" in reply.json["error"]
         assert ask(server, "/photos", "POST", photo).status == 415
 
 
@@ -220,17 +220,13 @@ def test_every_kind_that_is_named_is_taken() -> None:
         ("name=%1b%5b31m%0d%0aa%E2%80%AE.png", "[31ma.png"),
         ("name=%ff.png", "\ufffd.png"),
         ("name=a%3Cb%3E.png", "a<b>.png"),
+        (f"name={200 * 'a'}.png", f"{40 * 'a'}…{36 * 'a'}.png"),
         ("", ""),
         ("&".join(["name=a.png"] * 9), ""),
     ],
 )
 def test_a_name_is_for_people_only(query: str, shown: str) -> None:
     assert shown_name(query) == shown
-
-
-def test_a_long_name_keeps_its_ends() -> None:
-    assert shown_name(f"name={200 * 'a'}.png").endswith("a.png")
-    assert len(shown_name(f"name={200 * 'a'}.png")) <= 81
 
 
 def test_a_name_does_no_harm(photo: bytes) -> None:

@@ -14,21 +14,7 @@ from pathlib import Path
 
 import pytest
 from photos import write_photo
-from viewer_client import (
-    PAGES,
-    QUICK,
-    SECRET,
-    a_scene,
-    answer_of,
-    ask,
-    complete,
-    dial,
-    eventually,
-    get,
-    raw,
-    send,
-    serving,
-)
+from viewer_client import PAGES, QUICK, a_scene, answer_of, ask, complete, dial, eventually, get, raw, send, serving
 
 from spackle.errors import InputError
 from spackle.viewer.handler import TimeoutReader
@@ -64,28 +50,27 @@ def test_the_page_and_the_scene_are_there(server: ViewerServer) -> None:
     assert description == a_scene().description
     layer = ask(server, state["scene"].replace(".json", "/") + description["layers"][0]["file"])
     assert (layer.body, layer.headers["Content-Type"]) == (b"layer", "application/octet-stream")
-
-
-def test_every_answer_says_what_a_browser_may_do_with_it(server: ViewerServer) -> None:
-    for reply in (ask(server), ask(server, "/none"), ask(server, "/", "PUT"), ask(server, "/", Host="evil.example")):
-        assert reply.headers["X-Content-Type-Options"] == "nosniff"
-        assert reply.headers["Referrer-Policy"] == "no-referrer"
-        assert reply.headers["Cache-Control"] == "no-store"
-        assert reply.headers["Cross-Origin-Resource-Policy"] == "same-origin"
-        policy = reply.headers["Content-Security-Policy"]
-        assert "default-src 'none'" in policy
-        assert "frame-ancestors 'none'" in policy
-        assert "unsafe-inline" not in policy
-        assert "*" not in policy
-        assert reply.headers["Server"] == "spackle"  # no versions
-        assert "Access-Control-Allow-Origin" not in reply.headers
-
-
-def test_head_is_get_without_the_body(server: ViewerServer) -> None:
     for path in ("/", "/scene.json", "/scenes/1/base.bin", "/none"):
         head, whole = ask(server, path, "HEAD"), ask(server, path)
         assert head.body == b""
         assert (head.status, head.headers["Content-Length"]) == (whole.status, whole.headers["Content-Length"])
+
+
+def test_every_answer_says_what_a_browser_may_do_with_it(server: ViewerServer) -> None:
+    wanted = {
+        "X-Content-Type-Options": "nosniff",
+        "Referrer-Policy": "no-referrer",
+        "Cache-Control": "no-store",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Server": "spackle",  # no versions
+    }
+    for reply in (ask(server), ask(server, "/none"), ask(server, "/", "PUT"), ask(server, "/", Host="evil.example")):
+        assert wanted.items() <= reply.headers.items()
+        policy = reply.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert not any(loose in policy for loose in ("unsafe-inline", "*"))
+        assert "Access-Control-Allow-Origin" not in reply.headers
 
 
 def test_one_connection_serves_many_requests(server: ViewerServer) -> None:
@@ -106,16 +91,14 @@ def test_a_silent_connection_is_closed(server: ViewerServer) -> None:
             for _ in range(30):  # a byte now and then keeps nothing open
                 dripping.sendall(b"a")
                 time.sleep(0.05)
-        assert answer_of(silent) == b""
-        assert answer_of(dripping) == b""
+        assert answer_of(silent) == answer_of(dripping) == b""
         assert time.monotonic() - start < 3
 
 
 def test_old_scenes_make_room() -> None:
     with serving() as server:
         paths = [server.show(a_scene(str(k))) for k in range(3)]
-        assert [ask(server, path).status for path in paths] == [404, 200, 200]
-        assert ask(server, "/scenes/1/base.bin").status == 404
+        assert [ask(server, path).status for path in (*paths, "/scenes/1/base.bin")] == [404, 200, 200, 404]
         assert ask(server, "/scene.json").json["scene"] == paths[-1]
 
 
@@ -133,41 +116,38 @@ def test_old_scenes_make_room() -> None:
         *("http://localhost/etc/passwd", "http://evil.example/", "file:///etc/passwd", "etc/passwd", "*", "/é"),
     ],
 )
-def test_nothing_but_the_table_is_served(server: ViewerServer, target: str) -> None:
-    answer = raw(server, get(target))
-    head, _, body = answer.partition(b"\r\n\r\n")
-    assert head.split()[1] == b"404", answer
-    assert SECRET.encode() not in body
+def test_nothing_but_the_routes_is_served(server: ViewerServer, target: str) -> None:
+    head, _, body = raw(server, get(target)).partition(b"\r\n\r\n")
+    assert head.split()[1] == b"404"
+    assert b"root:" not in body
     assert set(json.loads(body)) == {"error"}
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "FOO"])
-def test_other_methods_are_refused(server: ViewerServer, method: str) -> None:
-    reply = ask(server, "/", method)
-    assert reply.status == 501
-    assert "error" in reply.json
-
-
-def test_posts_go_to_one_place(server: ViewerServer, photo: bytes) -> None:
+def test_other_methods_are_refused_and_posts_go_to_one_place(server: ViewerServer, photo: bytes) -> None:
+    for method in ("PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "FOO"):
+        reply = ask(server, "/", method)
+        assert (reply.status, set(reply.json)) == (501, {"error"})
     for path in ("/", "/scene.json", "/photos/", "/photos/1", "//photos/"):
         assert ask(server, path, "POST", photo).status == 404
 
 
 @pytest.mark.parametrize(
-    "host",
+    ("header", "value"),
     [
-        *("evil.example", "evil.example:80", "localhost.evil.example", "127.0.0.1.evil.example", "10.0.0.7", ""),
-        *("localhost:x", "localhost@evil.example", "[::1", "0.0.0.0", "localhost evil.example"),
+        *(("Host", name) for name in ("evil.example", "evil.example:80", "localhost.evil.example", "10.0.0.7", "")),
+        *(("Host", name) for name in ("127.0.0.1.evil.example", "localhost:x", "localhost@evil.example", "[::1")),
+        *(("Host", name) for name in ("0.0.0.0", "localhost evil.example")),
+        *(("Origin", page) for page in ("http://evil.example", "null", "http://localhost:1", "http://127.0.0.1", "")),
+        *(("Sec_Fetch_Site", site) for site in ("cross-site", "same-site")),
     ],
 )
-def test_a_foreign_host_is_refused(server: ViewerServer, host: str, photo: bytes) -> None:
-    assert raw(server, get("/", host=host)).split()[1] == b"403"
-    assert send(server, photo, Host=host).status == 403
-
-
-def test_a_request_has_one_host(server: ViewerServer) -> None:
-    assert raw(server, b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n").split()[1] == b"403"
-    assert raw(server, get("/", "Host: evil.example")).split()[1] == b"403"
+def test_a_foreign_host_page_or_site_is_refused(server: ViewerServer, header: str, value: str, photo: bytes) -> None:
+    assert ask(server, **{header: value}).status == 403
+    assert send(server, photo, **{header: value}).status == 403
+    if header == "Host":
+        assert raw(server, get("/", host=value)).split()[1] == b"403"
+        assert raw(server, get("/", f"Host: {value}")).split()[1] == b"403"  # a request has one host
+        assert raw(server, b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n").split()[1] == b"403"
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST:9", "localhost:9000", "[::1]:9000", "127.0.0.2"])
@@ -175,24 +155,11 @@ def test_names_of_this_machine_are_ours_at_any_port(server: ViewerServer, host: 
     assert raw(server, get("/", host=host)).split()[1] == b"200"
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:1", "http://127.0.0.1", ""])
-def test_a_foreign_page_is_refused(server: ViewerServer, origin: str, photo: bytes) -> None:
-    assert send(server, photo, Origin=origin).status == 403
-    assert ask(server, Origin=origin).status == 403
-
-
-@pytest.mark.parametrize("site", ["cross-site", "same-site"])
-def test_a_browser_tells_who_asks(server: ViewerServer, site: str, photo: bytes) -> None:
-    assert send(server, photo, Sec_Fetch_Site=site).status == 403
-    assert ask(server, Sec_Fetch_Site=site).status == 403
-
-
 def test_open_to_the_network_its_names_are_more_but_not_all() -> None:
     with serving(host="0.0.0.0") as server:
         assert not server.local
         assert server.url == f"http://127.0.0.1:{server.port}/"
-        named = {"10.0.0.7:80": b"200", socket.gethostname(): b"200", "evil.example": b"403"}
-        for host, status in named.items():
+        for host, status in {"10.0.0.7:80": b"200", socket.gethostname(): b"200", "evil.example": b"403"}.items():
             assert raw(server, get("/", host=host)).split()[1] == status
 
 
@@ -224,20 +191,22 @@ def test_malformed_requests_get_a_plain_answer(server: ViewerServer, data: bytes
 
 
 @pytest.mark.parametrize(
-    "key", ["", "Sec-WebSocket-Key: dGhl\r\nSec-WebSocket-Version: 13\r\n", "Sec-WebSocket-Key: \r\n"]
+    ("headers", "more"),
+    [
+        *(
+            (f"Upgrade: websocket\r\nConnection: Upgrade\r\n{key}", b"\x81\x85\x37\xfa\x21\x3d\x7f\x9f\x4d\x51\x58")
+            for key in ("", "Sec-WebSocket-Key: dGhl\r\nSec-WebSocket-Version: 13\r\n", "Sec-WebSocket-Key: \r\n")
+        ),
+        (f"Content-Length: {len(get('/none'))}\r\n", get("/none")),
+    ],
 )
-def test_there_is_no_websocket(server: ViewerServer, key: str) -> None:
-    upgrade = f"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n".encode()
-    answer = raw(server, upgrade + b"\x81\x85\x37\xfa\x21\x3d\x7f\x9f\x4d\x51\x58")
+def test_there_is_no_websocket_and_the_body_of_a_get_is_no_request(
+    server: ViewerServer, headers: str, more: bytes
+) -> None:
+    answer = raw(server, f"GET / HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n".encode() + more)
     assert answer.split()[1] == b"200"
-    assert answer.count(b"HTTP/1.1") == 1  # what follows is no request
+    assert answer.count(b"HTTP/1.1") == 1
     assert ask(server).status == 200
-
-
-def test_a_body_of_a_get_is_no_second_request(server: ViewerServer) -> None:
-    smuggled = get("/none")
-    data = f"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(smuggled)}\r\n\r\n".encode() + smuggled
-    assert raw(server, data).count(b"HTTP/1.1") == 1
 
 
 def test_a_client_that_never_reads_is_left() -> None:
@@ -275,14 +244,13 @@ def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: b
     with serving(endless) as server:
         job = send(server, photo).json["job"]
         assert reached.wait(3)
-        folder = Path(server.uploads.name)
         with dial(server, get(f"{job}/events")) as listener:
             listener.recv(12)
             start = time.monotonic()
             assert server.close()
             assert time.monotonic() - start < 1.5
             assert answer_of(listener).endswith(b'data: {"error": "the viewer has been stopped"}\n\n')
-        assert not folder.exists()
+        assert not Path(server.uploads.name).exists()
         with pytest.raises(OSError, match="refused"):
             dial(server)
 
@@ -303,19 +271,20 @@ def test_a_job_that_cannot_be_interrupted_does_not_hold_up_the_end() -> None:
     go_on.set()
 
 
-def test_a_port_that_is_taken_is_one_line(server: ViewerServer) -> None:
-    with pytest.raises(InputError, match=f"--port {server.port}: cannot listen at 127.0.0.1: Address already in use"):
-        ViewerServer(PAGES, complete, port=server.port)
-    for wrong in (-1, 65536):
-        with pytest.raises(InputError, match="must lie between"):
-            ViewerServer(PAGES, complete, port=wrong)
-    with pytest.raises(InputError, match=r"--host 192\.0\.2\.1: is no address of this machine"):
-        ViewerServer(PAGES, complete, host="192.0.2.1")
-    with pytest.raises(InputError, match=r"--host no\.such\.host\.invalid: no address"):
-        ViewerServer(PAGES, complete, host="no.such.host.invalid")
+def test_where_nothing_can_listen_the_option_is_named(server: ViewerServer) -> None:
+    for option, where in (
+        (f"--port {server.port}: ", {"port": server.port}),
+        ("--port -1: ", {"port": -1}),
+        ("--port 65536: ", {"port": 65536}),
+        ("--host 192.0.2.1: ", {"host": "192.0.2.1"}),
+        ("--host no.such.host.invalid: ", {"host": "no.such.host.invalid"}),
+    ):
+        with pytest.raises(InputError) as caught:
+            ViewerServer(PAGES, complete, **where)  # type: ignore[arg-type]
+        assert str(caught.value).startswith(option)
 
 
-def test_the_log_cannot_play_with_a_terminal(server: ViewerServer) -> None:
+def test_the_log_cannot_play_with_a_terminal() -> None:
     lines: list[str] = []
     with serving(log=lines.append) as server:
         raw(server, get("/\x1b[31m\x07", host="localhost"))
@@ -323,7 +292,7 @@ def test_the_log_cannot_play_with_a_terminal(server: ViewerServer) -> None:
     assert all(line.isprintable() for line in lines), lines
 
 
-def test_patience_is_for_the_whole_too() -> None:
+def test_the_time_limit_is_for_the_whole_too() -> None:
     one, other = socket.socketpair()
     with one, other:
         reader = TimeoutReader(one)
