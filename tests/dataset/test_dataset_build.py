@@ -34,7 +34,7 @@ from torch.utils.data import DataLoader
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
-from spackle.dataset import PseudoDataset, PseudoFiles, PseudoSample
+from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
 from spackle.dataset import build as building
 from spackle.dataset.encode import (
     decode_alpha,
@@ -48,7 +48,15 @@ from spackle.dataset.maker import Job, Made, Maker, _results
 from spackle.dataset.photos import choose, find_photos
 from spackle.dataset.sample import END, pack, unpack
 from spackle.dataset.shards import load_manifest
-from spackle.dataset.views import APART, PathChoice, draw_path, path_cameras, render_views, scene_completion
+from spackle.dataset.views import (
+    APART,
+    PathChoice,
+    ViewChoices,
+    draw_path,
+    path_cameras,
+    render_views,
+    scene_completion,
+)
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
@@ -146,13 +154,13 @@ def test_webdataset_reads_the_shards(whole: tuple[Path, Run]) -> None:
     shards = [str(path) for path in sorted(whole[0].glob("*.tar"))]
     groups = list(webdataset.WebDataset(shards, shardshuffle=False))
     assert [group["__key__"] for group in groups] == [f"{number:06d}" for number in range(5)]
-    for group, own in zip(groups, (PseudoFiles(whole[0]).group(number) for number in range(5)), strict=True):
+    for group, own in zip(groups, (DatasetFiles(whole[0]).group(number) for number in range(5)), strict=True):
         files = {f"{own.key}.{name}": data for name, data in group.items() if not name.startswith("__")}
         assert files == dict(own.files)
 
 
 def test_the_files_say_what_the_paper_asks_for(whole: tuple[Path, Run]) -> None:
-    group = PseudoFiles(whole[0]).group(4)
+    group = DatasetFiles(whole[0]).group(4)
     facts = group.facts
     assert facts["photo"]["name"] == "deep/1.png"
     assert facts["trajectory"]["kind"] in TRAJECTORIES
@@ -167,7 +175,7 @@ def test_the_files_say_what_the_paper_asks_for(whole: tuple[Path, Run]) -> None:
 
 
 def test_what_is_read_is_what_was_drawn(whole: tuple[Path, Run], place: Path) -> None:
-    group = PseudoFiles(whole[0]).group(0)
+    group = DatasetFiles(whole[0]).group(0)
     for index in range(group.views):
         sample = group.view(index, with_base=True)
         assert sample.base is not None
@@ -229,7 +237,7 @@ def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(
     assert names_in(out) == left
     assert "not finished" in run("dataset", "verify", out).err
     with pytest.raises(InputError, match="not finished"):
-        PseudoDataset(out)
+        ViewDataset(out)
     (out / "parts" / f".000003.{'0' * 12}.tar").write_bytes(b"half")
     done = build(place, out)
     assert done.code == 0, done.err
@@ -403,7 +411,7 @@ def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) 
     for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: not there", "bytes instead of"):
         assert words in done.err
     with pytest.raises(InputError, match="000001"):
-        list(PseudoDataset(copy))
+        list(ViewDataset(copy))
     text = (copy / "manifest.json").read_text()
     (copy / "manifest.json").write_text(text.replace('"0.png"', '"9.png"'))
     done = run("dataset", "verify", copy)
@@ -434,35 +442,35 @@ def test_info_spells_the_path_as_the_option_does(tmp_path: Path) -> None:
         assert done.code == 0, done.err
     shown = run("dataset", "info", tmp_path / "out").out
     assert '"trajectory": "rotate-forward"' in shown
-    assert PseudoFiles(tmp_path / "out").group(0).facts["trajectory"]["kind"] == "rotate_forward"  # as Python has it
+    assert DatasetFiles(tmp_path / "out").group(0).facts["trajectory"]["kind"] == "rotate_forward"  # as Python has it
 
 
 # Readers ------------------------------------------------------------------------------------------
 
 
-def names_of(samples: list[PseudoSample]) -> list[tuple[str, int]]:
+def names_of(samples: list[DatasetView]) -> list[tuple[str, int]]:
     return [(sample.key, sample.index) for sample in samples]
 
 
 def test_ranks_and_workers_read_every_view_once(whole: tuple[Path, Run]) -> None:
     every = {(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)}
-    assert names_of(list(PseudoDataset(whole[0]))) == sorted(every)
+    assert names_of(list(ViewDataset(whole[0]))) == sorted(every)
     for shuffle in (0, 7):
         for ranks in (1, 2, 3, 7):
-            parts = [list(PseudoDataset(whole[0], shuffle=shuffle, rank=r, ranks=ranks)) for r in range(ranks)]
+            parts = [list(ViewDataset(whole[0], shuffle=shuffle, rank=r, ranks=ranks)) for r in range(ranks)]
             seen = [name for part in parts for name in names_of(part)]
             assert len(seen) == len(every)
             assert set(seen) == every
     seen = []
     for rank in range(2):
-        loader = DataLoader(PseudoDataset(whole[0], rank=rank, ranks=2), batch_size=None, num_workers=2)
+        loader = DataLoader(ViewDataset(whole[0], rank=rank, ranks=2), batch_size=None, num_workers=2)
         seen += names_of(list(loader))
     assert sorted(seen) == sorted(every)
 
 
 def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: tuple[Path, Run]) -> None:
     def order(seed: int, epoch: int) -> list[tuple[str, int]]:
-        dataset = PseudoDataset(whole[0], shuffle=8, seed=seed)
+        dataset = ViewDataset(whole[0], shuffle=8, seed=seed)
         dataset.set_epoch(epoch)
         return names_of(list(dataset))
 
@@ -471,14 +479,14 @@ def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: tup
 
 
 def test_samples_are_values_of_the_house(whole: tuple[Path, Run]) -> None:
-    sample = next(iter(PseudoDataset(whole[0], with_base=True)))
+    sample = next(iter(ViewDataset(whole[0], with_base=True)))
     assert isinstance(sample.camera, Camera)
     assert isinstance(sample.base, Gaussians)
     assert sample.rendering.rgb.shape == sample.target.shape == (54, 72, 3)
     assert sample.mask.dtype == torch.bool
-    assert next(iter(PseudoDataset(whole[0]))).base is None
+    assert next(iter(ViewDataset(whole[0]))).base is None
     with pytest.raises(ValueError, match="rank"):
-        PseudoDataset(whole[0], rank=2, ranks=2)
+        ViewDataset(whole[0], rank=2, ranks=2)
 
 
 def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(
@@ -488,7 +496,7 @@ def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(
     memory = fsspec.filesystem("memory")
     for path in whole[0].iterdir():
         memory.pipe(f"/there/{path.name}", path.read_bytes())
-    assert names_of(list(PseudoDataset("memory://there"))) == names_of(list(PseudoDataset(whole[0])))
+    assert names_of(list(ViewDataset("memory://there"))) == names_of(list(ViewDataset(whole[0])))
     assert run("dataset", "verify", "memory://there").code == 0
     done = run("dataset", "info", "nothing://there")
     assert (done.code, len(done.lines)) == (2, 1)
@@ -668,11 +676,11 @@ def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind
 
 
 def test_a_photos_path_depends_on_the_photo_and_the_seed() -> None:
-    drawn = [draw_path(0, hashlib.sha256(bytes([n])).hexdigest()) for n in range(40)]
+    drawn = [draw_path(ViewChoices(), hashlib.sha256(bytes([n])).hexdigest()) for n in range(40)]
     assert {path.kind for path in drawn} == set(TRAJECTORIES)
     assert all(0.1 <= path.disparity <= 0.6 for path in drawn)
-    assert draw_path(0, "ab") == draw_path(0, "ab") != draw_path(1, "ab")
-    assert draw_path(0, "ab", "swipe").disparity == draw_path(0, "ab").disparity
+    assert draw_path(ViewChoices(), "ab") == draw_path(ViewChoices(), "ab") != draw_path(ViewChoices(1), "ab")
+    assert draw_path(ViewChoices(trajectory="swipe"), "ab").disparity == draw_path(ViewChoices(), "ab").disparity
 
 
 def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:
@@ -785,7 +793,7 @@ def test_a_sample_of_a_dataset_is_one_of_its_views(whole: tuple[Path, Run]) -> N
     assert bool(sample.valid.all())
     drawn = get_renderer().render(sample.base, sample.camera)
     assert psnr(drawn.rgb, sample.rendering.rgb) > 55
-    views = [view for view in PseudoDataset(whole[0]) if torch.equal(view.target, sample.target)]
+    views = [view for view in ViewDataset(whole[0]) if torch.equal(view.target, sample.target)]
     assert len(views) == 1
     assert torch.equal(views[0].mask, sample.hole)
 

@@ -255,6 +255,7 @@ def noting(counts: list[int]) -> SimpleNamespace:
         wait=lambda calls, timeout: (calls[:1], calls[1:]),
         get=get,
         kill=lambda actor: None,
+        nodes=list,
         exceptions=ray.exceptions,
     )
 
@@ -263,6 +264,6 @@ def test_workers_have_few_photos_in_hand(tmp_path: Path) -> None:
     options = DatasetOptions(BaseSettings("rgbd", tmp_path), ViewChoices(), workers=3, ray="local")
     jobs = [(number, PhotoFile(tmp_path / f"{number}.png", f"{number}.png", "")) for number in range(50)]
     counts: list[int] = []
-    crew = on_ray.WorkerPool(noting(counts), options, tmp_path, jobs, 0, print)
+    crew = on_ray.WorkerPool(noting(counts), options, tmp_path, jobs, print)
     assert sorted(made.index for made in crew.results()) == list(range(50))
     assert max(counts) == 3 * IN_HAND

@@ -40,7 +40,7 @@ from spackle.bases.sharp.checkpoint import (
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.camera import Camera
-from spackle.dataset import PseudoFiles
+from spackle.dataset import DatasetFiles
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
@@ -194,7 +194,7 @@ def test_gradients_from_pixels_to_gaussians_are_those_of_the_plain_renderer(base
 
 
 def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
-    group = PseudoFiles(place / "data").group(0)
+    group = DatasetFiles(place / "data").group(0)
     views = [group.view(index) for index in range(group.views)]
     holes = [float(view.mask.float().mean()) for view in views]
     assert holes[0] < 0.02 < min(holes[1:])

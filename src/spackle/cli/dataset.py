@@ -74,7 +74,7 @@ def dataset_build(
     settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
     options = DatasetOptions(
         settings,
-        ViewChoices.named(seed, views, trajectory, disparity),
+        ViewChoices(seed, views, trajectory, disparity),
         images=images,
         sample=sample,
         inpainter=inpainter,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,11 @@ import torch
 from rich.console import Console
 from rich.filesize import decimal
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
-from spackle.dataset.reader import PseudoFiles
+from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import PhotoGroup
-from spackle.dataset.shards import Manifest, load_manifest, problems
+from spackle.dataset.shards import load_manifest, problems
 from spackle.errors import InputError
 from spackle.formats import save_png, save_video
 from spackle.output_folder import results_folder
@@ -37,17 +37,12 @@ def show_info(location: str, console: Console) -> None:
     passed = sum(len(shard.passed_over) for shard in manifest.shards)
     if passed:
         lines.append(f"{passed} photos gave no sample: manifest.json says why")
-    if holes := mean_holes(manifest):
+    if samples:
+        holes = np.mean([sample.holes for _, sample in samples], axis=0)
         lines.append("holes of each view: " + " ".join(f"{share:.1%}" for share in holes))
     lines.append("configuration: " + json.dumps(manifest.config, indent=1, sort_keys=True))
     for line in lines:
         console.print(line, markup=False, soft_wrap=True)
-
-
-def mean_holes(manifest: Manifest) -> list[float]:
-    """HAR of each view, the mean over the photos."""
-    rows = [sample.holes for _, sample in manifest.samples]
-    return [float(share) for share in np.mean(rows, axis=0)] if rows else []
 
 
 def verify_dataset(location: str, reporter: Reporter) -> int:
@@ -76,20 +71,23 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
         output: a folder.
         photos: how many, spread over the dataset.
         views: of each, spread over its path.
-        reporter: says where they lie.
+        reporter: logs where they lie.
 
     Raises:
         InputError: no finished dataset, a damaged one, or a folder that cannot be written to.
     """
     if min(photos, views) < 1:
         raise InputError("--photos and --views must be at least 1")
-    files = PseudoFiles(location)
+    files = DatasetFiles(location)
     if not len(files):
         raise InputError(f"{location}: holds no photos")
     with results_folder(output, (SHEET, VIDEO)):
         chosen = [files.group(index) for index in _spread(len(files), photos)]
         save_png(_stack([_block(group, views) for group in chosen], 0), output / SHEET)
-        save_video(_frames(chosen[0]), output / VIDEO, fps=FPS)
+        # The path without the photo's own view, which comes before it.
+        path = (chosen[0].view(index) for index in range(1, chosen[0].views))
+        frames = (torch.cat([view.rendering.rgb, view.target], dim=1) for view in path)
+        save_video(frames, output / VIDEO, fps=FPS)
     reporter.say(f"{SHEET} and {VIDEO} -> {output}")
 
 
@@ -108,13 +106,6 @@ def _block(group: PhotoGroup, views: int) -> Tensor:
     return _stack(columns, 1)
 
 
-def _frames(group: PhotoGroup) -> Iterator[Tensor]:
-    """The path without the photo's own view, which comes before it."""
-    for index in range(1, group.views):
-        view = group.view(index)
-        yield torch.cat([view.rendering.rgb, view.target], dim=1)
-
-
 def _small(picture: Tensor) -> Tensor:
     height, width = picture.shape[:2]
     scale = min(1.0, THUMBNAIL / max(height, width))
@@ -124,11 +115,9 @@ def _small(picture: Tensor) -> Tensor:
 
 def _stack(pictures: Sequence[Tensor], axis: int) -> Tensor:
     """Pictures in a row or column, the smaller ones filled up with white."""
-    other = 1 - axis
-    most = max(picture.shape[other] for picture in pictures)
+    longest = max(picture.shape[1 - axis] for picture in pictures)
     filled = []
     for picture in pictures:
-        shape = list(picture.shape)
-        shape[other] = most - shape[other]
-        filled.append(torch.cat([picture, torch.ones(shape)], dim=other))
+        missing = longest - picture.shape[1 - axis]
+        filled.append(pad(picture, (0, 0, 0, missing) if axis == 0 else (0, 0, 0, 0, 0, missing), value=1.0))
     return torch.cat(filled, dim=axis)

@@ -16,7 +16,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -25,11 +24,11 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera_path import DepthRange
 from spackle.dataset.options import DatasetOptions
 from spackle.dataset.photos import PhotoFile
-from spackle.dataset.sample import pack, to_members
+from spackle.dataset.sample import pack_sample
 from spackle.dataset.views import PathChoice, draw_path, path_cameras, render_views, scene_completion
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.image import Photo, load_photo, resize_photo
+from spackle.image import load_photo, resize_photo
 from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
 from spackle.render import Renderer, get_renderer
 
@@ -74,25 +73,18 @@ class Maker:
         """Set up; a network is loaded with the first photo. InputError where that cannot be."""
         base, renderer = open_base(options.base), get_renderer(options.base.device)
         device = None if options.base.device == "auto" else options.base.device
-        weights, side = options.inpainter_weights, options.inpainter_side
-        inpainter = get_inpainter(
-            options.inpainter, InpainterOptions(weights, side, device, scene_completion(renderer))
-        )
-        return Maker(options, output, base, renderer, inpainter)
+        wishes = InpainterOptions(options.inpainter_weights, options.inpainter_side, device, scene_completion(renderer))
+        return Maker(options, output, base, renderer, get_inpainter(options.inpainter, wishes))
 
     def make(self, job: Job) -> Made:
-        """Write a photo's sample, whole or not at all.
-
-        Raises:
-            InputError: no photo can be worked on, or nothing can be written.
-        """
+        """Write a photo's sample, whole or not at all; InputError where no photo can be worked on or be written."""
         return keep(self.output, *self.sample(job))
 
     def sample(self, job: Job) -> tuple[Made, bytes | None]:
         """A photo's sample as a stretch of a tar archive, or None where the photo gives none.
 
         Raises:
-            InputError: no photo can be worked on.
+            BaseError: no photo can be worked on.
         """
         index, file = job
         seconds: Seconds = {}
@@ -113,33 +105,24 @@ class Maker:
         with timed("inpaint", seconds):
             targets = self.inpainter.complete(stack)
         with timed("encode", seconds):
-            facts = self._facts(file, photo, prediction)
-            picture = resize_photo(photo).rgb
-            return pack(to_members(key, picture, stack, targets, self.options.choices.threshold, path, facts))
+            lens = {"focal_source": prediction.lens_source or photo.focal_source}
+            size = {"width": photo.width, "height": photo.height}
+            facts = {
+                "photo": {"name": file.name, "sha256": file.sha256} | size | lens,
+                "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
+                "inpainter": {"name": self.inpainter.name, "version": self.inpainter.version},
+                "threshold": self.options.choices.threshold,
+            }
+            return pack_sample(key, resize_photo(photo).rgb, stack, targets, path, facts)
 
     def _draw(self, file: PhotoFile, prediction: BasePrediction) -> tuple[PathChoice, ViewStack]:
         choices, camera = self.options.choices, prediction.camera
-        path = draw_path(choices.seed, file.sha256, choices.trajectory, choices.disparity)
-        even = camera.even()
+        path = draw_path(choices, file.sha256)
         try:
-            cameras = path_cameras(path, even, DepthRange.of(prediction.gaussians), choices.views)
+            cameras = path_cameras(path, camera.even(), DepthRange.of(prediction.gaussians), choices.views)
         except ValueError as error:
             raise InputError(f"{file.path}: no camera path: {error}") from error
         return path, render_views(prediction.gaussians, camera, cameras, self.renderer, choices.threshold)
-
-    def _facts(self, file: PhotoFile, photo: Photo, prediction: BasePrediction) -> dict[str, Any]:
-        """What the JSON says of the photo, besides its views."""
-        return {
-            "photo": {
-                "name": file.name,
-                "sha256": file.sha256,
-                "width": photo.width,
-                "height": photo.height,
-                "focal_source": prediction.lens_source or photo.focal_source,
-            },
-            "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
-            "inpainter": {"name": self.inpainter.name, "version": self.inpainter.version},
-        }
 
 
 def keep(output: Path, made: Made, data: bytes | None) -> Made:

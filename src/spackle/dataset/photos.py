@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from spackle.bases.open import Log
+from spackle.downloads.transfer import digest
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES, check_file, load_photo
+from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")
 MIN_SIDE = 32  # pixels: a smaller picture has no depth that anybody could see
 MAX_JSON_BYTES = 1 << 30
-
-Step = Callable[[int, int], None]  # (done, of how many)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +58,8 @@ def find_photos(source: Path, folder: Path | None = None) -> Found:
     names = []
     for place, folders, files in os.walk(source):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for file in files:
-            if file.lower().endswith(SUFFIXES) and not file.startswith("."):
-                names.append((Path(place) / file).relative_to(source).as_posix())
+        photos = [name for name in files if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
+        names += [(Path(place) / name).relative_to(source).as_posix() for name in photos]
     if not names:
         raise InputError(f"{source}: no photos in this folder (looked for {', '.join(SUFFIXES)})")
     return Found(source, sorted(names))
@@ -79,22 +80,17 @@ def _named_by_coco(source: Path, folder: Path | None) -> Found:
     root = source.parent if folder is None else folder
     if not os.path.isdir(root):
         raise InputError(f"{root}: no such folder, and the photos of {source.name} should be in it")
-    unique = sorted({_inside(name, source) for name in names})
-    there = [name for name in unique if os.path.isfile(root / name)]
+    for name in names:  # stays in its folder
+        if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
+            raise InputError(f"{source}: {str(name)[:60]!r} is no file name of an image")
+    unique = sorted({Path(name).as_posix() for name in names})
+    there = {name for name in unique if os.path.isfile(root / name)}
     if not there:
         raise InputError(f"{source}: none of its {len(unique)} images is in {root}: name their folder")
-    present = set(there)
-    return Found(root, there, [name for name in unique if name not in present])
+    return Found(root, sorted(there), [name for name in unique if name not in there])
 
 
-def _inside(name: object, source: Path) -> str:
-    """A file name that stays in its folder."""
-    if not isinstance(name, str) or not name or "\0" in name or name.startswith("/") or ".." in Path(name).parts:
-        raise InputError(f"{source}: {str(name)[:60]!r} is no file name of an image")
-    return Path(name).as_posix()
-
-
-def choose(found: Found, count: int | None, seed: int, warn: Callable[[str], None], progress: Step) -> list[PhotoFile]:
+def choose(found: Found, count: int | None, seed: int, warn: Log, progress: Step) -> list[PhotoFile]:
     """The photos of a dataset, in the order of their names: all, or a random subset.
 
     The subset depends on the names, the contents and the seed, not on the order in which a file system lists them.
@@ -120,8 +116,13 @@ def choose(found: Found, count: int | None, seed: int, warn: Callable[[str], Non
     for name in names:
         if len(chosen) == wanted:
             break
+        path = found.root / name
         try:
-            chosen.append(_checked(found.root / name, name))
+            photo = load_photo(path)  # from its first to its last pixel
+            if min(photo.width, photo.height) < MIN_SIDE:
+                size = f"{photo.width}×{photo.height}"
+                raise InputError(f"{path}: {size} pixels are too few (at least {MIN_SIDE} each way)")
+            chosen.append(PhotoFile(path, name, _sha256(path)))
         except InputError as error:
             warn(f"passed over: {error}")
         progress(len(chosen), wanted)
@@ -132,46 +133,29 @@ def choose(found: Found, count: int | None, seed: int, warn: Callable[[str], Non
     return sorted(chosen, key=lambda photo: photo.name)
 
 
-def _checked(path: Path, name: str) -> PhotoFile:
-    """A photo that can be read from its first to its last pixel."""
-    photo = load_photo(path)
-    if min(photo.width, photo.height) < MIN_SIDE:
-        raise InputError(f"{path}: {photo.width}×{photo.height} pixels are too few (at least {MIN_SIDE} each way)")
-    return PhotoFile(path, name, _sha256(path))
-
-
-def _repeated(found: Found, warn: Callable[[str], None]) -> set[str]:
+def _repeated(found: Found, warn: Log) -> set[str]:
     """Names whose file holds the same bytes as one of an earlier name. Only files of one size are read."""
     by_size: dict[int, list[str]] = defaultdict(list)
     for name in found.names:
-        by_size[_size(found.root / name)].append(name)
+        with contextlib.suppress(OSError):  # what cannot be read is found out later
+            by_size[(found.root / name).stat().st_size].append(name)
     repeated: set[str] = set()
     for size, names in by_size.items():
-        if len(names) == 1 or size <= 0:  # empty ones are told as such
+        if len(names) == 1 or not size:  # empty ones are told as such
             continue
         first: dict[str, str] = {}
         for name in names:
-            digest = _sha256(found.root / name)
-            if digest and first.setdefault(digest, name) != name:
-                warn(f"passed over: {found.root / name}: the same photo as {first[digest]}")
+            sha256 = _sha256(found.root / name)
+            if sha256 and first.setdefault(sha256, name) != name:
+                warn(f"passed over: {found.root / name}: the same photo as {first[sha256]}")
                 repeated.add(name)
     return repeated
 
 
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return -1
-
-
 def _sha256(path: Path) -> str:
-    """Hexadecimal digest of a file; "" of one that cannot be read, which is found out later."""
+    """Hexadecimal digest of a file; "" of one that cannot be read."""
     try:
         with open(path, "rb") as file:
-            digest = hashlib.sha256()
-            while block := file.read(1 << 20):
-                digest.update(block)
-            return digest.hexdigest()
+            return digest(file).hexdigest()
     except OSError:
         return ""

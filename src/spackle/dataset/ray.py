@@ -32,9 +32,6 @@ RETRIES = 3  # of a photo whose worker died
 STARTING = -1  # in place of a photo's index, for a worker that died before it had one
 
 
-# The cluster --------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def cluster(options: DatasetOptions) -> Iterator[Any]:
     """The package, connected to the cluster of --ray; None without --ray. A cluster of our own ends with the block.
@@ -112,9 +109,6 @@ def gpus_of(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> int:
     return int(there and options.takes_gpu)
 
 
-# On a node ----------------------------------------------------------------------------------------
-
-
 class RemoteMaker:
     """A `Maker` on a node, which has to see the very files that the main process sees.
 
@@ -142,15 +136,10 @@ class RemoteMaker:
             )
 
     def make(self, job: Job, seen: Sequence[str]) -> tuple[Made, bytes | None]:
-        """A photo's sample, or None where it gives none.
-
-        Raises:
-            InputError: the node does not see the same photo or depth map, or no photo can be worked on.
-        """
-        _, photo = job
-        if what_is_seen(photo, self.options) != seen:
+        """As `Maker.sample`; InputError also where the node does not see the same photo or depth map."""
+        if what_is_seen(job[1], self.options) != seen:
             raise InputError(
-                f"{photo.path}: node {socket.gethostname()} does not find this photo or its depth map, or others in "
+                f"{job[1].path}: node {socket.gethostname()} does not find this photo or its depth map, or others in "
                 "their place: they must lie at the same paths on every node, on a disk that all share"
             )
         return self.maker.sample(job)
@@ -165,9 +154,6 @@ def what_is_seen(photo: PhotoFile, options: DatasetOptions) -> list[str]:
     return [content, *options.inputs_of(photo)]
 
 
-# The pool of workers ------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def at_work_on_ray(
     ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], log: Log
@@ -177,7 +163,7 @@ def at_work_on_ray(
     Raises:
         InputError: a base, node, folder or disk that cannot be used, or a photo at which workers die.
     """
-    pool = WorkerPool(ray, options, output, jobs, gpus_of(options, ray.nodes()), log)
+    pool = WorkerPool(ray, options, output, jobs, log)
     try:
         yield pool.results()
     finally:
@@ -201,13 +187,12 @@ class WorkerPool:
     which one nor on which actor, so nobody could name the photo, make it again and start another worker.
     """
 
-    def __init__(
-        self, ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], gpus: int, log: Log
-    ) -> None:
-        """Start workers, with `gpus` each, on `ray`, which is connected to a cluster."""
+    def __init__(self, ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], log: Log) -> None:
+        """Start workers on `ray`, which is connected to a cluster."""
         self.ray, self.options, self.output, self.log = ray, options, output, log
         self.left, self.deaths = deque(jobs), Counter[int]()  # deaths by the index of the photo
         self.expected = configuration(options, (), Maker.of(options, output).inpainter)
+        gpus = gpus_of(options, ray.nodes())
         self.kind = ray.remote(num_cpus=options.threads, num_gpus=gpus, max_restarts=0)(RemoteMaker)
         self.workers: list[_Worker] = []
         self.calls: dict[Any, _Worker] = {}  # answers that are awaited, in the order in which they were asked for

@@ -9,14 +9,47 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
-from spackle.dataset.sample import PhotoGroup, PseudoSample
-from spackle.dataset.shards import Manifest, SampleEntry, ShardEntry, load_manifest, open_in, read_sample
+from spackle.dataset.sample import DatasetView, PhotoGroup
+from spackle.dataset.shards import Place, load_manifest, open_in, read_sample
 from spackle.errors import InputError
 
-Place = tuple[ShardEntry, SampleEntry]
+
+class DatasetFiles:
+    """Any view of a dataset by its place, for readers that choose themselves."""
+
+    def __init__(self, location: str | os.PathLike[str]) -> None:
+        """Read the manifest in a folder, or at an address that fsspec understands.
+
+        Raises:
+            InputError: no dataset, or one that is not finished.
+        """
+        self.location = location
+        self.manifest = load_manifest(location)
+        if not self.manifest.complete:
+            raise InputError(f"{location}: not finished: the command that builds it goes on")
+        self.samples = self.manifest.samples
+
+    def __len__(self) -> int:
+        """Photos."""
+        return len(self.samples)
+
+    def group(self, index: int) -> PhotoGroup:
+        """The files of a photo, held to their digest; InputError where they are damaged."""
+        (group,) = self.groups([self.samples[index]])
+        return group
+
+    def groups(self, places: Sequence[Place]) -> Iterator[PhotoGroup]:
+        """Likewise of several photos, with one shard open at a time."""
+        start = 0
+        while start < len(places):
+            shard = places[start][0]
+            with open_in(self.location, shard.file) as file:
+                while start < len(places) and places[start][0] is shard:
+                    yield read_sample(file, places[start][1], f"{self.location}/{shard.file}")
+                    start += 1
 
 
-class PseudoDataset(IterableDataset[PseudoSample]):
+class ViewDataset(IterableDataset[DatasetView]):
     """The views of a dataset, decoded one after the other; nothing is unpacked on the disk.
 
     Photos are divided between ranks and, in a DataLoader, between its workers: each view comes once in all, and no
@@ -37,7 +70,7 @@ class PseudoDataset(IterableDataset[PseudoSample]):
         """Read the manifest.
 
         Args:
-            location: a folder, or an address that fsspec understands.
+            location: see `DatasetFiles`.
             shuffle: views held back to choose from at random, as they are stored (1 to 2 MB each at 640×480,
                 and the Gaussians once for each photo); the order of the shards is random too. 0: as they lie.
             seed: of that order, together with the epoch.
@@ -50,10 +83,7 @@ class PseudoDataset(IterableDataset[PseudoSample]):
             ValueError: a rank that there is not.
         """
         super().__init__()
-        self.location = location
-        self.manifest: Manifest = load_manifest(location)
-        if not self.manifest.complete:
-            raise InputError(f"{location}: not finished: the command that builds it goes on")
+        self.files = DatasetFiles(location)
         self.shuffle, self.seed, self.with_base, self.epoch = shuffle, seed, with_base, 0
         here = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if here else 0
@@ -65,7 +95,7 @@ class PseudoDataset(IterableDataset[PseudoSample]):
         """Another order, the same for all ranks; to be called before a DataLoader's workers start."""
         self.epoch = epoch
 
-    def __iter__(self) -> Iterator[PseudoSample]:
+    def __iter__(self) -> Iterator[DatasetView]:
         """Views of this rank and worker.
 
         Raises:
@@ -74,30 +104,20 @@ class PseudoDataset(IterableDataset[PseudoSample]):
         worker = get_worker_info()
         part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
         mine = self._order()[self.rank * parts + part :: self.ranks * parts]
-        views = self._views(mine)
+        views = (
+            (group.only(index, with_base=self.with_base), index)
+            for group in self.files.groups(mine)
+            for index in range(group.views)
+        )
         for group, index in self._shuffled(views, self.rank * parts + part) if self.shuffle else views:
             yield group.view(index, with_base=self.with_base)
 
     def _order(self) -> Sequence[Place]:
         """All photos, the same list for everybody: whole shards one after the other."""
-        shards = list(self.manifest.shards)
+        shards = list(self.files.manifest.shards)
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(shards)
         return [(shard, sample) for shard in shards for sample in shard.samples]
-
-    def _views(self, places: Sequence[Place]) -> Iterator[tuple[PhotoGroup, int]]:
-        """Each photo is read once, with one shard open at a time."""
-        for group in self._groups(places):
-            yield from ((group.only(index, with_base=self.with_base), index) for index in range(group.views))
-
-    def _groups(self, places: Sequence[Place]) -> Iterator[PhotoGroup]:
-        start = 0
-        while start < len(places):
-            shard = places[start][0]
-            with open_in(self.location, shard.file) as file:
-                while start < len(places) and places[start][0] is shard:
-                    yield read_sample(file, places[start][1], f"{self.location}/{shard.file}")
-                    start += 1
 
     def _shuffled(self, views: Iterator[tuple[PhotoGroup, int]], reader: int) -> Iterator[tuple[PhotoGroup, int]]:
         """A random one of those held back makes room for the next."""
@@ -112,25 +132,3 @@ class PseudoDataset(IterableDataset[PseudoSample]):
             held[place] = view
         for place in rng.permutation(len(held)):
             yield held[place]
-
-
-class PseudoFiles:
-    """Any view of a dataset by its place, for readers that choose themselves."""
-
-    def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Read the manifest; InputError where there is no finished dataset."""
-        self.location = location
-        self.manifest = load_manifest(location)
-        if not self.manifest.complete:
-            raise InputError(f"{location}: not finished: the command that builds it goes on")
-        self.samples = self.manifest.samples
-
-    def __len__(self) -> int:
-        """Photos."""
-        return len(self.samples)
-
-    def group(self, index: int) -> PhotoGroup:
-        """The files of a photo, held to their digest; InputError where they are damaged."""
-        shard, sample = self.samples[index]
-        with open_in(self.location, shard.file) as file:
-            return read_sample(file, sample, f"{self.location}/{shard.file}")

@@ -65,7 +65,7 @@ def unpack(data: bytes) -> Mapping[str, bytes]:
 
 
 @dataclasses.dataclass(frozen=True)
-class PseudoSample:
+class DatasetView:
     """One view of a photo: what the paper's training sample holds (appendix, "Dataset")."""
 
     key: str  # of the photo in its dataset
@@ -80,25 +80,18 @@ class PseudoSample:
     base: Gaussians | None  # where the reader was asked for it
 
 
-def to_members(
-    key: str,
-    photo: Tensor,
-    stack: ViewStack,
-    targets: Tensor,
-    threshold: float,
-    path: PathChoice,
-    facts: dict[str, Any],
-) -> list[tuple[str, bytes]]:
-    """The files of a photo in their order: KEY.json, KEY.photo.png, KEY.base.safetensors, then five a view.
+def pack_sample(
+    key: str, photo: Tensor, stack: ViewStack, targets: Tensor, path: PathChoice, facts: dict[str, Any]
+) -> bytes:
+    """A photo as a stretch of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
 
     Args:
-        key: their common beginning, without a dot.
+        key: how the files begin, without a dot.
         photo: [h, w, 3] sRGB at its working size.
         stack: V views of it.
         targets: [V, H, W, 3] sRGB.
-        threshold: of the mask.
         path: where the camera goes.
-        facts: more for the JSON.
+        facts: more for the JSON; the mask's "threshold" among them.
     """
     files: list[tuple[str, bytes]] = []
     views: list[dict[str, Any]] = []
@@ -109,7 +102,7 @@ def to_members(
             "rgb": encode_rgb(rgb),
             "target": encode_rgb(targets[index]),
             "mask": encode_mask(mask),
-            "alpha": encode_alpha(alpha, mask, threshold),
+            "alpha": encode_alpha(alpha, mask, facts["threshold"]),
             "depth": depth_png,
         }
         files += [(_view_file(key, index, kind), data) for kind, data in kinds.items()]
@@ -117,13 +110,12 @@ def to_members(
     common = {
         "key": key,
         "trajectory": {"kind": path.kind, "disparity": path.disparity},
-        "threshold": threshold,
         "photo_camera": _camera_facts(stack.photo_camera),
         "views": views,
     }
     text = json.dumps(facts | common, indent=1, sort_keys=True, allow_nan=False) + "\n"
     first = (f"{key}.json", text.encode()), (f"{key}.photo.png", encode_rgb(photo))
-    return [*first, (f"{key}.base.safetensors", encode_gaussians(stack.base)), *files]
+    return pack([*first, (f"{key}.base.safetensors", encode_gaussians(stack.base)), *files])
 
 
 def _view_file(key: str, index: int, kind: str) -> str:
@@ -162,7 +154,7 @@ class PhotoGroup:
         """HAR of each view (paper, eq. 11)."""
         return tuple(float(view["hole"]) for view in self.facts["views"])
 
-    def view(self, index: int, *, with_base: bool = False) -> PseudoSample:
+    def view(self, index: int, *, with_base: bool = False) -> DatasetView:
         """Decode one view.
 
         Raises:
@@ -173,7 +165,7 @@ class PhotoGroup:
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
             depth = decode_depth(self._file(index, "depth"), *facts["depth_range"])
             rendering = Rendering(rgb, depth, decode_alpha(self._file(index, "alpha")))
-            return PseudoSample(
+            return DatasetView(
                 key=self.key,
                 index=index,
                 kind=self.facts["trajectory"]["kind"],

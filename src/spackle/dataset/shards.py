@@ -22,16 +22,11 @@ FORMAT = 1  # of shards and manifest; a reader of another one refuses
 PIECE = 1 << 20  # bytes read at once
 
 
-def is_address(location: str | os.PathLike[str]) -> bool:
-    """Whether this is a URL such as s3://bucket/dataset and not a folder."""
-    return "://" in str(location)
-
-
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """Open a file of a dataset for reading; it can be sought in.
 
     Args:
-        location: a folder, or an address that fsspec understands.
+        location: a folder, or an address that fsspec understands, such as s3://bucket/dataset.
         name: of the file in it.
 
     Raises:
@@ -39,24 +34,21 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """
     place = f"{str(location).rstrip('/')}/{name}"
     try:
-        return _open_remote(place) if is_address(location) else open(os.path.join(location, name), "rb")
+        return _open_address(place) if "://" in place else open(os.path.join(location, name), "rb")
     except FileNotFoundError as error:
         raise InputError(f"{place}: not there: is {location} a dataset of `spackle dataset build`?") from error
-    except InputError:
-        raise
     except OSError as error:
         raise InputError(f"{place}: cannot be read: {error.strerror or reason_in_a_line(error)}") from error
 
 
-def _open_remote(url: str) -> IO[bytes]:
+def _open_address(url: str) -> IO[bytes]:
     try:
         import fsspec
     except ImportError as error:
         raise InputError(f"{url}: addresses need a package: pip install fsspec") from error
     try:
-        file: Any = fsspec.open(url, "rb").open()
-        opened: IO[bytes] = file
-        return opened
+        file: IO[bytes] = fsspec.open(url, "rb").open()
+        return file
     except (ValueError, ImportError) as error:  # an unknown protocol, or one whose package is missing
         raise InputError(f"{url}: cannot be opened: {reason_in_a_line(error)}") from error
 
@@ -84,6 +76,9 @@ class ShardEntry:
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
 
 
+Place = tuple[ShardEntry, SampleEntry]
+
+
 @dataclasses.dataclass(frozen=True)
 class Manifest:
     """A dataset, finished or not."""
@@ -93,7 +88,7 @@ class Manifest:
     complete: bool
 
     @property
-    def samples(self) -> list[tuple[ShardEntry, SampleEntry]]:
+    def samples(self) -> list[Place]:
         """All photos in their order."""
         return [(shard, sample) for shard in self.shards for sample in shard.samples]
 
@@ -181,7 +176,7 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
     """Put samples one after the other into a tar file, whole or not at all.
 
     Args:
-        parts: key and file of each sample, as `make_sample` made it.
+        parts: key and file of each sample, see `pack_sample`.
         target: the shard.
         passed_over: photos that are not in it, for its entry.
 

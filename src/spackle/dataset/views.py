@@ -17,8 +17,7 @@ from spackle.gaussians import Gaussians
 from spackle.inpaint import SceneCompletion, ViewStack
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer, hole_mask
-from spackle.residual.hole_features import MASK_THRESHOLD
+from spackle.residual import MASK_THRESHOLD, Completer, hole_mask
 
 VIEWS = 20  # the paper's, the photo's own view among them
 DISPARITY = (0.1, 0.6)  # from a small move to the widest in the paper's figures
@@ -33,14 +32,8 @@ class ViewChoices:
     seed: int = 0
     views: int = VIEWS  # of a photo, its own among them
     trajectory: TrajectoryKind | None = None  # drawn for each photo where None
-    disparity: tuple[float, float] = DISPARITY  # drawn between these
+    disparity: tuple[float, float] = DISPARITY  # drawn between these, see `spackle.camera_path.max_offset`
     threshold: float = MASK_THRESHOLD
-
-    @staticmethod
-    def named(seed: int, views: int, trajectory: str | None, disparity: tuple[float, float]) -> ViewChoices:
-        """The choices of a person; the trajectory by its name in `TRAJECTORIES`."""
-        kinds: dict[str, TrajectoryKind] = {name: name for name in TRAJECTORIES}
-        return ViewChoices(seed, views, None if trajectory is None else kinds[trajectory], disparity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,21 +44,12 @@ class PathChoice:
     disparity: float
 
 
-def draw_path(
-    seed: int, photo_sha256: str, kind: TrajectoryKind | None = None, disparity: tuple[float, float] = DISPARITY
-) -> PathChoice:
-    """The path of a photo: the same for the same seed and photo, whatever else the dataset holds.
-
-    Args:
-        seed: the dataset's.
-        photo_sha256: of the photo's file.
-        kind: this one; drawn where None.
-        disparity: between these two, see `spackle.trajectory.max_offset`.
-    """
-    digest = hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()
+def draw_path(choices: ViewChoices, photo_sha256: str) -> PathChoice:
+    """The path of a photo: the same for the same seed and the same photo's file, whatever else the dataset holds."""
+    digest = hashlib.sha256(f"{choices.seed}:{photo_sha256}".encode()).digest()
     rng = np.random.default_rng(list(digest))
     drawn = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
-    return PathChoice(kind or drawn, float(rng.uniform(*disparity)))
+    return PathChoice(choices.trajectory or drawn, float(rng.uniform(*choices.disparity)))
 
 
 def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int = VIEWS) -> list[Camera]:
@@ -100,12 +84,11 @@ def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, view
 
 def _apart(cameras: Sequence[Camera], least: float) -> list[Camera]:
     """Those whose eye is farther than `least` from all before them."""
-    eyes = torch.stack([view.position.double() for view in cameras])
-    kept: list[int] = []
-    for index, eye in enumerate(eyes):
-        if all(float((eye - eyes[other]).norm()) > least for other in kept):
-            kept.append(index)
-    return [cameras[index] for index in kept]
+    kept: list[Camera] = []
+    for camera in cameras:
+        if all(float((camera.position.double() - other.position.double()).norm()) > least for other in kept):
+            kept.append(camera)
+    return kept
 
 
 @torch.no_grad()
@@ -118,8 +101,7 @@ def render_views(
 ) -> ViewStack:
     """Draw the base from each camera; a pixel with less opacity than `threshold` is uncovered (eq. 4)."""
     drawn = [renderer.render(base, camera) for camera in cameras]
-    alpha = torch.stack([view.alpha for view in drawn])
-    rgb, depth = torch.stack([view.rgb for view in drawn]), torch.stack([view.depth for view in drawn])
+    rgb, depth, alpha = (torch.stack([getattr(view, name) for view in drawn]) for name in ("rgb", "depth", "alpha"))
     return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha, threshold))
 
 

@@ -20,8 +20,8 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
 from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
-from spackle.dataset.reader import PseudoFiles
-from spackle.dataset.sample import PseudoSample
+from spackle.dataset.reader import DatasetFiles
+from spackle.dataset.sample import DatasetView
 from spackle.device import enough_memory
 from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
@@ -52,7 +52,7 @@ PICTURE_SIDE = 512  # pixels of a picture's longer side
 class PseudoPhotos:
     """A pseudo-supervised dataset by its photos: some are learned from, the others are for validation."""
 
-    files: PseudoFiles
+    files: DatasetFiles
     learned: tuple[int, ...]  # places in the dataset
     validation: tuple[int, ...]  # others
     digest: str
@@ -81,7 +81,7 @@ class PseudoPhotos:
         digest = digest_of((files.manifest.digest, learned, order[:held]))
         return PseudoPhotos(files, tuple(learned), tuple(order[:held]), digest)
 
-    def drawn(self, place: int, rng: np.random.Generator) -> list[PseudoSample]:
+    def drawn(self, place: int, rng: np.random.Generator) -> list[DatasetView]:
         """`VIEWS_AT_ONCE` views of a photo: its own, and others at random; all of them where there are fewer.
 
         Raises:
@@ -91,19 +91,19 @@ class PseudoPhotos:
         others = 1 + rng.permutation(group.views - 1)[: VIEWS_AT_ONCE - 1]
         return [group.view(index) for index in [0, *sorted(int(other) for other in others)]]
 
-    def all(self, place: int) -> list[PseudoSample]:
+    def all(self, place: int) -> list[DatasetView]:
         """Every view of a photo; InputError likewise."""
         group = self.files.group(place)
         return [group.view(index) for index in range(group.views)]
 
-    def widest(self, place: int) -> list[PseudoSample]:
+    def widest(self, place: int) -> list[DatasetView]:
         """A photo's own view and the one with the largest hole; InputError likewise."""
         group, holes = self.files.group(place), self.files.samples[place][1].holes
         return [group.view(index) for index in (0, int(np.argmax(holes)))]
 
 
 def render_photo(
-    decoder: nn.Module, base: TunableSharp, views: Sequence[PseudoSample], renderer: Renderer
+    decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer
 ) -> ViewBatch:
     """Predict a photo's Gaussians anew, and draw them in some of its views; InputError where memory is too small.
 
@@ -151,10 +151,10 @@ class DirectFt(ViewMethod):
         (item,) = items
         return self._render(network, self.photos.all(self.photos.validation[item]))
 
-    def _render(self, decoder: nn.Module, views: Sequence[PseudoSample]) -> ViewBatch:
+    def _render(self, decoder: nn.Module, views: Sequence[DatasetView]) -> ViewBatch:
         return render_photo(decoder, self.base, views, self.objective.renderer)
 
-    def _drawn(self, step: int, item: int) -> list[PseudoSample]:
+    def _drawn(self, step: int, item: int) -> list[DatasetView]:
         """The views that a step takes of a photo: nothing but the arguments decides."""
         return self.photos.drawn(self.photos.learned[item], np.random.default_rng([self.seed, step, item]))
 
@@ -249,7 +249,7 @@ def _only_dataset(data: DataRecipe) -> Path:
     return data.pseudo
 
 
-def _check_base(files: PseudoFiles, weights_sha256: str) -> None:
+def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
     """InputError unless the dataset's renderings and masks are those of the weights that are to learn."""
     base, location = files.manifest.config.get("base", {}), files.location
     if base.get("name") != BASE:

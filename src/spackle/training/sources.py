@@ -22,7 +22,7 @@ from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
-from spackle.dataset.reader import PseudoFiles
+from spackle.dataset.reader import DatasetFiles
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
@@ -179,7 +179,7 @@ class PseudoViews:
         Raises:
             InputError: no finished dataset, one without holes, or one whose targets nobody has completed.
         """
-        self.files = PseudoFiles(location)
+        self.files = DatasetFiles(location)
         config = self.files.manifest.config
         if config.get("inpainter", {}).get("name") == UNCOMPLETED:
             raise InputError(f"{location}: built with --inpainter none, so its targets teach nothing: build another")
