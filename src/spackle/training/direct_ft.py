@@ -102,9 +102,7 @@ class PseudoPhotos:
         return [group.view(index) for index in (0, int(np.argmax(holes)))]
 
 
-def render_photo(
-    decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer
-) -> ViewBatch:
+def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
     """Predict a photo's Gaussians anew, and draw them in some of its views; InputError where memory is too small.
 
     Only the decoder, which follows on `base`, gets gradients.
