@@ -16,9 +16,8 @@ from PIL import Image
 from scenes import psnr
 from torch import Tensor
 
-from spackle.bases.depth_map import load_depth
 from spackle.errors import InputError
-from spackle.formats import VideoWriter, save_depth_png, save_gray_png, save_png, save_video
+from spackle.formats import VideoWriter, save_gray_png, save_png, save_video
 
 
 def frames(count: int, height: int, width: int) -> list[Tensor]:
@@ -222,18 +221,9 @@ def test_colour_and_grey_png(tmp_path: Path) -> None:
     save_gray_png(torch.tensor([[0.0, 0.5], [2.0, math.nan]]), tmp_path / "g.png")
     with Image.open(tmp_path / "g.png") as image:
         assert np.array(image).tolist() == [[0, 128], [255, 0]]
-    for save, shape in ((save_png, (4, 4)), (save_gray_png, (4, 4, 3)), (save_depth_png, (1, 4, 4))):
+    for save, shape in ((save_png, (4, 4)), (save_gray_png, (4, 4, 3))):
         with pytest.raises(ValueError, match="got"):
             save(torch.zeros(shape), tmp_path / "bad.png")
     with pytest.raises(InputError, match="cannot write"):
         save_png(rgb, tmp_path)
     assert sorted(os.listdir(tmp_path)) == ["a.png", "g.png"]
-
-
-def test_depth_png_reads_back(tmp_path: Path) -> None:
-    depth = torch.tensor([[0.001, 1.2344, 65.534], [math.inf, math.nan, 70.0], [0.0, -2.0, 3.0]])
-    save_depth_png(depth, tmp_path / "d.png")
-    found = load_depth(tmp_path / "d.png")
-    expected = torch.tensor([[0.001, 1.234, 65.534], [0.0, 0.0, 0.0], [0.0, 0.0, 3.0]])
-    torch.testing.assert_close(found.depth, expected)
-    assert torch.equal(found.valid, expected > 0)

@@ -97,16 +97,6 @@ def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRende
         gpu.render(BASE, SIDE, tiles=tiles[:2])
 
 
-def test_many_cameras_in_one_call_are_the_same_as_one_by_one(gpu: GsplatRenderer) -> None:
-    cameras = [SCENE.camera, SIDE, shifted(SCENE.camera, -0.2)]
-    views = gpu.render_batch(BASE, cameras)
-    for view, camera in zip(views, cameras, strict=True):
-        agree(view, gpu.render(BASE, camera))
-    assert gpu.render_batch(BASE, []) == []
-    with pytest.raises(ValueError, match="one size"):
-        gpu.render_batch(BASE, [SIDE, SIDE.resized(30, 20)])
-
-
 def test_a_scene_travels_once() -> None:
     store = SetStore(torch.device("cpu"))
     kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
@@ -150,9 +140,6 @@ def test_a_scene_is_projected_once_for_a_camera(gpu: GsplatRenderer, monkeypatch
     gpu.render(BASE, SCENE.camera)
     gpu.render(BASE, SIDE, eps2d=0.3)
     assert counts == [len(BASE), 50, len(BASE), len(BASE)]
-    gpu.render_batch(BASE, [SIDE, SIDE])
-    gpu.render_batch(BASE, [SIDE, SIDE])
-    assert counts[4:] == [len(BASE)] * 2  # what many cameras see would be too much to remember
 
 
 def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

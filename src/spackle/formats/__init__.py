@@ -1,9 +1,9 @@
 """Files in and out: scenes, videos, pictures and cameras, each written whole or not at all."""
 
 from spackle.formats.atomic import atomic_path, check_writable
-from spackle.formats.camera_files import load_cameras, load_path, save_cameras
+from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
-from spackle.formats.png import save_depth_png, save_gray_png, save_png
+from spackle.formats.png import save_gray_png, save_png
 from spackle.formats.video import VideoWriter, save_video
 
 __all__ = [
@@ -16,8 +16,6 @@ __all__ = [
     "load_ply_base_count",
     "load_ply_camera",
     "load_ply_disparity",
-    "save_cameras",
-    "save_depth_png",
     "save_gray_png",
     "save_ply",
     "save_png",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,7 +12,6 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.camera_path import UNITS, Keyframe, KeyframePath, PathError
 from spackle.errors import InputError, reason_in_a_line
-from spackle.formats.atomic import atomic_path
 from spackle.image import check_file
 
 MAX_CAMERA_BYTES, MAX_PATH_BYTES = 64 << 20, 4 << 20
@@ -55,21 +53,6 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         pose = _matrix(frame.get("world_to_camera"), 4, "world_to_camera", where)
         cameras.append(checked_camera(K, pose, width, height, where))
     return cameras
-
-
-def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
-    """Write a camera file; `load_cameras` returns the same numbers, bit for bit in float32."""
-    if not cameras:
-        raise ValueError("a camera file needs at least one camera")
-    first, frames = cameras[0], []
-    for camera in cameras:
-        frame: dict[str, Any] = {"K": camera.K.tolist(), "world_to_camera": camera.world_to_camera.tolist()}
-        if (camera.width, camera.height) != (first.width, first.height):
-            frame |= {"width": camera.width, "height": camera.height}
-        frames.append(frame)
-    text = json.dumps({"width": first.width, "height": first.height, "frames": frames}, indent=1, allow_nan=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def checked_camera(K: Tensor, world_to_camera: Tensor, width: object, height: object, where: str) -> Camera:

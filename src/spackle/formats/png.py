@@ -1,17 +1,14 @@
-"""Pictures out: colour, grey, and depth in millimetres, always as PNG."""
+"""Pictures out: colour and grey, always as PNG."""
 
 from __future__ import annotations
 
 import os
 
-import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
 from spackle.formats.atomic import atomic_path
-
-LARGEST_MM = 65534  # 65535 means "unknown" to some readers
 
 
 def to_bytes(image: Tensor) -> Tensor:
@@ -32,18 +29,6 @@ def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
     if gray.ndim != 2:
         raise ValueError(f"a grey picture is [H, W], got {tuple(gray.shape)}")
     _save(Image.fromarray(to_bytes(gray).numpy()), path)
-
-
-def save_depth_png(depth: Tensor, path: str | os.PathLike[str]) -> None:
-    """Write depth [H, W] in metres as 16-bit millimetres; InputError where that cannot be.
-
-    0 stands for unknown: depth that is not finite, not positive, or beyond 65.534 m.
-    """
-    if depth.ndim != 2:
-        raise ValueError(f"a depth map is [H, W], got {tuple(depth.shape)}")
-    millimetres = (depth.detach().cpu().double() * 1000).round()
-    known = torch.isfinite(millimetres) & (millimetres >= 0) & (millimetres <= LARGEST_MM)
-    _save(Image.fromarray(millimetres.where(known, 0).numpy().astype(np.uint16)), path)
 
 
 def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:

@@ -42,12 +42,12 @@ class Material:
 
 
 class Projection(NamedTuple):
-    """A set as C cameras see it."""
+    """A set as a camera sees it."""
 
-    radii: Tensor  # [C, N, 2] int; 0 where nothing is seen
-    means2d: Tensor  # [C, N, 2] pixels; anything where nothing is seen, as the rest
-    depths: Tensor  # [C, N]
-    conics: Tensor  # [C, N, 3]
+    radii: Tensor  # [1, N, 2] int; 0 where nothing is seen
+    means2d: Tensor  # [1, N, 2] pixels; anything where nothing is seen, as the rest
+    depths: Tensor  # [1, N]
+    conics: Tensor  # [1, N, 3]
 
 
 @dataclasses.dataclass
@@ -74,9 +74,9 @@ class SetStore:
         return Material.of(part, self.device) if entry is None else entry.material
 
     def projection(self, part: Gaussians, key: Hashable, make: Callable[[Material], Projection]) -> Projection:
-        """What `make` makes of the set's material; not again for the key of the last call. None is no such key."""
+        """What `make` makes of the set's material; not again for the key of the last call."""
         entry = self._entry(part)
-        if entry is None or key is None:
+        if entry is None:
             return make(self.material(part))
         if entry.projection is None or entry.key != key:
             with torch.inference_mode(False):
@@ -126,70 +126,51 @@ class GsplatRenderer:
         onto: Rendering | None = None,
     ) -> Rendering:
         """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
-        sets = _listed(gaussians)
+        sets = [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians] or [Gaussians.empty()]
         grid = tile_grid(camera.height, camera.width)
         if tiles is not None and tuple(tiles.shape) != grid:
             raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}")
         wanted = None if tiles is None else tiles.to(self.device, torch.bool)
-        drawn = self._draw(sets, [camera], eps2d, None if wanted is None else wanted[None])
-        found = Rendering(drawn.rgb[0], drawn.depth[0], drawn.alpha[0])
+        drawn = self._draw(sets, camera, eps2d, wanted)
         if wanted is not None:
-            under = None if onto is None else Rendering(*(image.to(found.rgb) for image in onto.tensors))
-            found = paste(found, wanted, under)
-        return Rendering(*(image.to(sets[0].means.device) for image in found.tensors))
+            under = None if onto is None else Rendering(*(image.to(drawn.rgb) for image in onto.tensors))
+            drawn = paste(drawn, wanted, under)
+        return Rendering(*(image.to(sets[0].means.device) for image in drawn.tensors))
 
-    def render_batch(
-        self, gaussians: Gaussians | Sequence[Gaussians], cameras: Sequence[Camera], *, eps2d: float = 0.0
-    ) -> list[Rendering]:
-        """Views of cameras of one size in one call; see `render`."""
-        if len({(camera.width, camera.height) for camera in cameras}) > 1:
-            raise ValueError("cameras drawn in one call must have one size")
-        if not cameras:
-            return []
-        sets = _listed(gaussians)
-        drawn = self._draw(sets, cameras, eps2d, None)
-        rgb, depth, alpha = (image.to(sets[0].means.device) for image in drawn.tensors)
-        return [Rendering(*images) for images in zip(rgb, depth, alpha, strict=True)]
-
-    def _draw(
-        self, sets: Sequence[Gaussians], cameras: Sequence[Camera], eps2d: float, wanted: Tensor | None
-    ) -> Rendering:
-        """[C, …] images of all cameras, drawn where `wanted` [C, rows, columns] says; elsewhere they hold anything."""
-        count, width, height = len(cameras), cameras[0].width, cameras[0].height
+    def _draw(self, sets: Sequence[Gaussians], camera: Camera, eps2d: float, wanted: Tensor | None) -> Rendering:
+        """Images drawn where `wanted` [rows, columns] says; elsewhere they hold anything."""
+        width, height = camera.width, camera.height
         rows, columns = tile_grid(height, width)
         parts = [self._store.material(part) for part in sets]
-        seen = self._seen(sets, cameras, eps2d)
+        seen = self._seen(sets, camera, eps2d)
         radii = seen.radii
         if wanted is not None:
             radii = radii * _touching(seen.means2d.detach(), radii, wanted)[..., None]
         _, keys, ids = self._gsplat.isect_tiles(seen.means2d.detach(), radii, seen.depths.detach(), TILE, columns, rows)
-        offsets = self._gsplat.isect_offset_encode(keys, count, columns, rows)
-        opacities = torch.cat([part.opacities for part in parts])
-        colors = torch.cat([part.colors for part in parts]).expand(count, -1, -1)
+        offsets = self._gsplat.isect_offset_encode(keys, 1, columns, rows)
+        opacities = torch.cat([part.opacities for part in parts])[None]
+        colors = torch.cat([part.colors for part in parts])[None]
         drawn, alpha = self._gsplat.rasterize_to_pixels(
-            seen.means2d, seen.conics, torch.cat([colors, seen.depths[..., None]], dim=-1),
-            opacities.expand(count, -1).contiguous(), width, height, TILE,
-            offsets.reshape(count, rows, columns), ids, masks=wanted,
+            seen.means2d, seen.conics, torch.cat([colors, seen.depths[..., None]], dim=-1), opacities, width, height,
+            TILE, offsets.reshape(1, rows, columns), ids, masks=None if wanted is None else wanted[None],
         )  # fmt: skip
-        alpha = alpha[..., 0]
+        drawn, alpha = drawn[0], alpha[0, ..., 0]
         return Rendering(linear_to_srgb(drawn[..., :3]), drawn[..., 3] / torch.where(alpha > 0, alpha, 1), alpha)
 
-    def _seen(self, sets: Sequence[Gaussians], cameras: Sequence[Camera], eps2d: float) -> Projection:
-        """All sets as all cameras see them; what one camera sees of a set is remembered."""
-        views = torch.stack([camera.world_to_camera.to(self.device, torch.float32) for camera in cameras])
-        lenses = torch.stack([camera.K.to(self.device, torch.float32) for camera in cameras])
-        size = cameras[0].width, cameras[0].height
+    def _seen(self, sets: Sequence[Gaussians], camera: Camera, eps2d: float) -> Projection:
+        """All sets as a camera sees them; what it sees of a set is remembered."""
+        view = camera.world_to_camera.to(self.device, torch.float32)[None]
+        lens = camera.K.to(self.device, torch.float32)[None]
 
         def project(part: Material) -> Projection:
             radii, means2d, depths, conics, _ = self._gsplat.fully_fused_projection(
-                part.means, part.covariances, None, None, views, lenses, *size,
+                part.means, part.covariances, None, None, view, lens, camera.width, camera.height,
                 eps2d=eps2d, near_plane=NEAR_PLANE, opacities=part.opacities,
             )  # fmt: skip
             return Projection(radii, means2d, depths, conics)
 
-        own = cameras[0]
-        numbers = (*own.K.flatten().tolist(), *own.world_to_camera.flatten().tolist())
-        key = (eps2d, *size, *numbers) if len(cameras) == 1 else None
+        numbers = (*camera.K.flatten().tolist(), *camera.world_to_camera.flatten().tolist())
+        key = (eps2d, camera.width, camera.height, *numbers)
         parts = [self._store.projection(part, key, project) for part in sets]
         return parts[0] if len(parts) == 1 else Projection(*(torch.cat(field, 1) for field in zip(*parts, strict=True)))
 
@@ -215,15 +196,10 @@ def load_gsplat(device: torch.device) -> ModuleType:
     return package
 
 
-def _listed(gaussians: Gaussians | Sequence[Gaussians]) -> list[Gaussians]:
-    """One set at least, if only an empty one."""
-    return [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians] or [Gaussians.empty()]
-
-
 def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
-    """[C, N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
-    rows, columns = wanted.shape[1:]
-    before = torch.nn.functional.pad(wanted.int(), (1, 0, 1, 0)).cumsum(1).cumsum(2).flatten(1)  # [C, (rows+1)(cols+1)]
+    """[1, N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
+    rows, columns = wanted.shape
+    before = torch.nn.functional.pad(wanted.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).flatten()  # [(rows+1)(columns+1)]
     size = means2d.new_tensor([columns, rows])
     radii = radii.to(means2d)
 
@@ -233,7 +209,7 @@ def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
     low, high = tile(((means2d - radii) / TILE).floor()), tile(((means2d + radii) / TILE).ceil())
 
     def at(x: Tensor, y: Tensor) -> Tensor:
-        return before.gather(1, y * (columns + 1) + x)
+        return before[y * (columns + 1) + x]
 
     (left, top), (right, bottom) = low.unbind(-1), high.unbind(-1)
     return ((at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)) > 0).int()
