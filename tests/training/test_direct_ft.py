@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import signal
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from safetensors.torch import save_file
 from scenes import shifted
 from sharp_weights import MICRO
 from torch import Tensor
-from training_runs import killed_at, started, state
+from training_runs import started, state
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import (
@@ -47,7 +46,7 @@ from spackle.image import Photo
 from spackle.render import get_renderer
 from spackle.render.reference import ReferenceRenderer
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
-from spackle.training.method import Objective, ViewBatch
+from spackle.training.method import Objective
 from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
 from spackle.training.trainer import Callbacks, Trainer
 
@@ -218,14 +217,12 @@ def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: ob
     photos = PseudoPhotos.of(recipe.data, place / "data", owner.sha256)
     method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), objective, 4, 0)
     losses: list[float] = []
-
-    def note(step: int, numbers: dict[str, float]) -> None:
-        losses.append(numbers["loss"])
-
-    def nothing(progress: object) -> None:
-        """Nobody is told."""
-
-    callbacks = Callbacks(note, nothing, nothing, lambda: False)
+    callbacks = Callbacks(
+        step=lambda step, numbers: losses.append(numbers["loss"]),
+        validated=lambda progress: None,
+        saved=lambda progress: None,
+        stop=lambda: False,
+    )
     decoder = base.network.gaussian_decoder().let_learn()
     assert Trainer(recipe, method, decoder, CPU, folder, callbacks).run() == "steps"
     return losses
@@ -279,20 +276,6 @@ def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Pa
     assert state(folder).method == "direct-ft"
 
 
-def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path
-) -> None:
-    process = child(place, tmp_path / "out", killed_at(3))
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-    assert state(tmp_path / "out").progress.step == 2
-    done = train(place, tmp_path / "out")
-    assert f"{tmp_path}/out: going on from step 2" in done.lines
-    one, other = state(tmp_path / "out"), state(whole[0])
-    assert all(torch.equal(one.network[name], other.network[name]) for name in other.network)
-    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
-
-
 def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
     return started(arguments(place, output, *more), f"{SMALL}\n{code}", **environment)
 
@@ -319,13 +302,8 @@ def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> 
 def test_photos_that_make_a_loss_that_is_no_number_are_named(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    complete = DirectFt.complete
-
-    def broken(self: DirectFt, network: torch.nn.Module, step: int, items: list[int]) -> ViewBatch:
-        batch = complete(self, network, step, items)
-        return dataclasses.replace(batch, rgb=batch.rgb * float("nan"))
-
-    monkeypatch.setattr(DirectFt, "complete", broken)
+    total = Objective.total
+    monkeypatch.setattr(Objective, "total", lambda self, batch: (total(self, batch)[0] * float("nan"), {}))
     done = train(place, tmp_path / "out")
     assert done.code == 2
     assert "out/bad_batch: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
@@ -427,8 +405,10 @@ def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
 ) -> None:
     owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
     (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
-    for _ in range(2):
-        link_owner(owner, tmp_path)
+    # The link is renewed, and counts more than another file of the checkpoint's name.
+    for where in (tmp_path / "where it lay once", owner.path, owner.path):
+        link_owner(Owner(where, owner.sha256), tmp_path)
+    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")
     same, learned = gaussians_from(tmp_path / "same.safetensors"), gaussians_from(whole[0] / "best.safetensors")
     before = gaussians_from(owner.path)
     assert all(map(torch.equal, same.tensors, before.tensors))
@@ -439,17 +419,6 @@ def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
     assert {name for name in state if not torch.equal(state[name], weights[name])} <= {
         name for name in state if name.startswith(PARTS)
     }
-
-
-def test_the_link_to_a_checkpoint_is_renewed_and_counts_more_than_a_name(
-    place: Path, base: TunableSharp, tmp_path: Path
-) -> None:
-    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
-    (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
-    link_owner(Owner(tmp_path / "where it lay once", owner.sha256), tmp_path)
-    link_owner(owner, tmp_path)
-    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")  # another of that name
-    assert len(gaussians_from(tmp_path / "same.safetensors")) > 0
 
 
 def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:

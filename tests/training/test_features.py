@@ -16,17 +16,9 @@ from spackle.training.features import ResNet50, SqueezeNet, load_features
 
 WITHOUT_HEAD = 25_557_032 - 2048 * 1000 - 1000  # parameters of torchvision's ResNet-50 less its classifier
 
-# Inputs, squeezed and expanded channels, as the paper of SqueezeNet has them in its table 1.
-FIRES = {
-    "fire2": (96, 16, 64),
-    "fire3": (128, 16, 64),
-    "fire4": (128, 32, 128),
-    "fire5": (256, 32, 128),
-    "fire6": (256, 48, 192),
-    "fire7": (384, 48, 192),
-    "fire8": (384, 64, 256),
-    "fire9": (512, 64, 256),
-}
+# Inputs, squeezed and expanded channels of fire2 to fire9, as the paper of SqueezeNet has them in its table 1.
+FIRES = [(96, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128), (256, 48, 192), (384, 48, 192), (384, 64, 256)]
+FIRES += [(512, 64, 256)]
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +36,9 @@ def resnet() -> dict[str, Tensor]:
 def squeezed() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     shapes = {"conv1": (96, 3, 7, 7), "conv10": (1000, 512, 1, 1)}
-    for fire, (inside, squeeze, expand) in FIRES.items():
-        shapes[f"{fire}/conv1x1_1"] = (squeeze, inside, 1, 1)
-        shapes[f"{fire}/conv1x1_2"] = (expand, squeeze, 1, 1)
-        shapes[f"{fire}/conv3x3_2"] = (expand, squeeze, 3, 3)
+    for number, (inside, squeeze, expand) in enumerate(FIRES, 2):
+        shapes[f"fire{number}/conv1x1_1"] = (squeeze, inside, 1, 1)
+        shapes |= {f"fire{number}/conv{k}x{k}_2": (expand, squeeze, k, k) for k in (1, 3)}
     arrays = {}
     for name, shape in shapes.items():
         fan = np.prod(shape[1:])
@@ -81,14 +72,11 @@ def test_resnet_has_torchvisions_names_and_shapes() -> None:
     assert len(shapes) == 320 - 2  # torchvision's, less its classifier
     literal = {
         "conv1.weight": (64, 3, 7, 7),
-        "bn1.running_mean": (64,),
         "bn1.num_batches_tracked": (),
         "layer1.0.conv1.weight": (64, 64, 1, 1),
         "layer1.0.downsample.0.weight": (256, 64, 1, 1),
-        "layer1.0.downsample.1.bias": (256,),
         "layer2.0.conv2.weight": (128, 128, 3, 3),
         "layer3.5.bn3.running_var": (1024,),
-        "layer4.0.downsample.0.weight": (2048, 1024, 1, 1),
         "layer4.2.conv3.weight": (2048, 512, 1, 1),
     }
     assert {name: shapes[name] for name in literal} == literal
@@ -165,11 +153,8 @@ def test_networks_are_frozen_and_pass_gradients_on(kind: type[ResNet50 | Squeeze
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
-def test_none_is_no_network() -> None:
-    assert load_features("none", None) is None
-
-
 def test_a_network_wants_its_file(tmp_path: Path) -> None:
+    assert load_features("none", None) is None
     assert "name their file" in refusal("resnet50", None)
     assert "no such feature network" in refusal("vgg", None)
     assert "no such weight file" in refusal("squeezenet", tmp_path / "missing.npz")

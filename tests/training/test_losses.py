@@ -67,26 +67,23 @@ def pictures(*shape: int, seed: int = 1) -> tuple[Tensor, Tensor]:
     return values[0].requires_grad_(), values[1]
 
 
-def test_color_is_the_mean_difference_in_the_hole() -> None:
-    assert color_loss(RGB, TARGET, LEFT).item() == pytest.approx((0.1 + 0.0 + 0.3) / 3)
-    assert color_loss(RGB, TARGET, ~NO_HOLE).item() == pytest.approx((0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6)
+def grad(tensor: Tensor) -> Tensor:
+    assert tensor.grad is not None
+    return tensor.grad
 
 
-def test_color_counts_the_images_of_a_batch_alike() -> None:
+def test_color_is_the_mean_difference_in_each_images_hole_then_over_images() -> None:
     hole = torch.tensor([[[True, False]], [[True, True]], [[False, False]]])
+    each = [0.4 / 3, (0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6, 0]
+    assert [color_loss(RGB, TARGET, part[None]).item() for part in hole] == pytest.approx(each)
     rgb, target = RGB.expand(3, -1, -1, -1), TARGET.expand(3, -1, -1, -1)
-    assert color_loss(rgb, target, hole).item() == pytest.approx((0.4 / 3 + 1.8 / 6 + 0) / 3)
+    assert color_loss(rgb, target, hole).item() == pytest.approx(sum(each) / 3)
 
 
-def test_alpha_counts_the_images_of_a_batch_alike() -> None:
-    alpha = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]])
-    hole = torch.tensor([[[True, False]], [[True, True]]])
+def test_alpha_is_cross_entropy_towards_one_and_counts_images_alike() -> None:
+    alpha, hole = torch.tensor([[[0.5, 0.25, 0.9]]]), torch.tensor([[[True, True, False]]])
     assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
-
-
-def test_alpha_is_cross_entropy_towards_one() -> None:
-    alpha = torch.tensor([[[0.5, 0.25, 0.9]]])
-    hole = torch.tensor([[[True, True, False]]])
+    alpha, hole = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]]), torch.tensor([[[True, False]], [[True, True]]])
     assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
 
 
@@ -95,8 +92,7 @@ def test_alpha_of_nothing_is_clamped_and_a_faint_splat_still_has_a_gradient() ->
     loss = alpha_loss(alpha, ~NO_HOLE)
     loss.backward()
     assert loss.item() == pytest.approx((6.907755 + 5.541264) / 2)  # -log 0.001 and -log(1/255)
-    assert alpha.grad is not None
-    assert alpha.grad.flatten().tolist() == pytest.approx([0, -255 / 2])
+    assert grad(alpha).flatten().tolist() == pytest.approx([0, -255 / 2])
 
 
 def test_preserve_is_the_mean_difference_outside_and_leaves_the_base_alone() -> None:
@@ -105,8 +101,8 @@ def test_preserve_is_the_mean_difference_outside_and_leaves_the_base_alone() -> 
     loss.backward()
     assert loss.item() == pytest.approx((0.5 + 0.5 + 0.4) / 3)
     assert base.grad is None
-    assert rgb.grad is not None
-    assert rgb.grad.flatten().tolist() == pytest.approx([0, 0, 0, -1 / 3, 1 / 3, -1 / 3])
+    assert grad(rgb).flatten().tolist() == pytest.approx([0, 0, 0, -1 / 3, 1 / 3, -1 / 3])
+    assert preserve_loss(RGB, TARGET, ~NO_HOLE).item() == 0
 
 
 def perceptual_example() -> tuple[Tensor, Tensor]:
@@ -119,23 +115,15 @@ FEATURE_TERM = (1 + 0.5 + 0) / math.sqrt(0.5) / 3
 GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1) of the prediction, of nine
 
 
-def test_perceptual_is_a_feature_term_and_a_gram_term() -> None:
+@pytest.mark.parametrize("factors", [(1,), (1, 100, 0.01)])
+def test_perceptual_sums_feature_and_gram_terms_of_layers_and_counts_images_alike(factors: tuple[float, ...]) -> None:
     rgb, target = perceptual_example()
-    loss = perceptual_loss(Pixels(1), rgb, target, LEFT, dilation=1, size=None)
-    assert loss.item() == pytest.approx(FEATURE_TERM + GRAM_TERM, rel=1e-5)
-
-
-def test_perceptual_sums_layers_whatever_their_scale() -> None:
-    rgb, target = perceptual_example()
-    loss = perceptual_loss(Pixels(1, 100, 0.01), rgb, target, LEFT, dilation=1, size=None)
-    assert loss.item() == pytest.approx(3 * (FEATURE_TERM + GRAM_TERM), rel=1e-5)
-
-
-def test_perceptual_counts_the_images_of_a_batch_alike() -> None:
-    rgb, target = perceptual_example()
-    hole = torch.cat([LEFT, NO_HOLE])
-    loss = perceptual_loss(Pixels(1), rgb.repeat(2, 1, 1, 1), target.repeat(2, 1, 1, 1), hole, dilation=1, size=None)
-    assert loss.item() == pytest.approx((FEATURE_TERM + GRAM_TERM) / 2, rel=1e-5)
+    expected = len(factors) * (FEATURE_TERM + GRAM_TERM)
+    loss = perceptual_loss(Pixels(*factors), rgb, target, LEFT, dilation=1, size=None)
+    assert loss.item() == pytest.approx(expected, rel=1e-5)
+    both = (tensor.repeat(2, 1, 1, 1) for tensor in (rgb, target))
+    loss = perceptual_loss(Pixels(*factors), *both, torch.cat([LEFT, NO_HOLE]), dilation=1, size=None)
+    assert loss.item() == pytest.approx(expected / 2, rel=1e-5)
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts() -> None:
@@ -156,13 +144,7 @@ def test_perceptual_looks_only_near_the_hole() -> None:
     hole = torch.zeros(1, 1, 7, dtype=torch.bool)
     hole[0, 0, 3] = True
     perceptual_loss(Pixels(1), rgb, target, hole, dilation=5, size=None).backward()
-    assert rgb.grad is not None
-    assert rgb.grad[0, 0].abs().sum(-1).bool().tolist() == [False, True, True, True, True, True, False]
-
-
-def test_perceptual_of_equal_images_is_nothing() -> None:
-    _, target = pictures(1, 6, 8)
-    assert perceptual_loss(Convolved(), target, target, torch.ones(1, 6, 8, dtype=torch.bool)).item() == 0
+    assert grad(rgb)[0, 0].abs().sum(-1).bool().tolist() == [False, True, True, True, True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -177,19 +159,18 @@ def test_perceptual_resizes_to_the_longer_side(shape: tuple[int, int], size: int
             return super().__call__(images)
 
     rgb, target = pictures(1, *shape)
-    perceptual_loss(Watching(1), rgb, target, torch.ones(1, *shape, dtype=torch.bool), size=size)
+    every = torch.ones(1, *shape, dtype=torch.bool)
+    perceptual_loss(Watching(1), rgb, target, every, size=size)
+    assert perceptual_loss(Pixels(1), target, target, every, size=size).item() == 0
     assert sizes == [(1, 3, *seen)] * 2
 
 
-def test_dilation_is_a_square_and_wants_a_centre() -> None:
+def test_dilation_is_a_square_and_a_mask_is_pooled_by_area() -> None:
     mask = torch.zeros(1, 5, 5, dtype=torch.bool)
     mask[0, 1, 2] = True
     assert dilate(mask, 3)[0].int().tolist() == [[0, 1, 1, 1, 0]] * 3 + [[0] * 5] * 2
     with pytest.raises(ValueError, match="odd"):
         dilate(mask, 4)
-
-
-def test_a_mask_is_pooled_by_area() -> None:
     mask = torch.tensor([[[True, True, False, False], [True, False, False, False]]])
     assert covered(mask, torch.zeros(1, 7, 1, 2)).flatten().tolist() == [0.75, 0]
 
@@ -215,14 +196,10 @@ def test_without_a_hole_there_is_nothing_to_fill_and_all_to_preserve() -> None:
     loss, terms = total_loss(rgb, alpha, target, RGB, NO_HOLE, features=Never())
     loss.backward()
     assert terms == {"color": 0, "alpha": 0, "preserve": 0, "perceptual": 0}
-    assert rgb.grad is not None
-    assert alpha.grad is not None
-    assert not rgb.grad.any()
-    assert not alpha.grad.any()
-
-
-def test_where_all_is_hole_nothing_is_preserved() -> None:
-    assert preserve_loss(RGB, TARGET, ~NO_HOLE).item() == 0
+    assert not grad(rgb).any()
+    assert not grad(alpha).any()
+    _, terms = total_loss(RGB, torch.ones(1, 1, 2), TARGET, RGB, LEFT)
+    assert set(terms) == {"color", "alpha", "preserve"}
 
 
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(1, 2, 3, 4)])
@@ -230,18 +207,10 @@ def test_the_total_is_the_weighted_sum_of_its_terms(weights: LossWeights) -> Non
     rgb, target = perceptual_example()
     alpha, base = torch.tensor([[[0.5, 0.0]]]), torch.full_like(rgb, 8.75)
     loss, terms = total_loss(rgb, alpha, target, base, LEFT, features=Pixels(1), weights=weights, dilation=1, size=None)
+    assert LossWeights() == LossWeights(10.0, 0.5, 1.0, 5.0)  # the paper's
     values = {"color": 0.5, "alpha": 0.693147, "perceptual": FEATURE_TERM + GRAM_TERM, "preserve": 0.25}
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(values, rel=1e-5)
     assert loss.item() == pytest.approx(sum(getattr(weights, name) * value for name, value in values.items()), rel=1e-5)
-
-
-def test_the_weights_are_the_papers() -> None:
-    assert LossWeights() == LossWeights(color=10.0, alpha=0.5, perceptual=1.0, preserve=5.0)
-
-
-def test_without_features_there_is_no_perceptual_term() -> None:
-    _, terms = total_loss(RGB, torch.ones(1, 1, 2), TARGET, RGB, LEFT)
-    assert set(terms) == {"color", "alpha", "preserve"}
 
 
 def test_an_unknown_target_counts_for_opacity_alone() -> None:
@@ -254,10 +223,9 @@ def test_an_unknown_target_counts_for_opacity_alone() -> None:
     assert terms["color"].item() == pytest.approx(0.5)
     assert terms["alpha"].item() == pytest.approx(0.693147 / 2)
     assert 0 < terms["perceptual"].item() < math.inf
-    assert rgb.grad is not None
-    assert rgb.grad.isfinite().all()
-    assert rgb.grad[0, 0, 0].any()
-    assert not rgb.grad[0, 0, 1].any()
+    assert grad(rgb).isfinite().all()
+    assert grad(rgb)[0, 0, 0].any()
+    assert not grad(rgb)[0, 0, 1].any()
 
 
 def test_distance_is_between_directions_of_feature_vectors() -> None:
@@ -289,8 +257,5 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
 def test_psnr_is_of_the_hole_alone() -> None:
     assert hole_psnr(RGB[0], TARGET[0], LEFT[0]) == pytest.approx(-10 * math.log10((0.01 + 0.09) / 3))
     assert hole_psnr(RGB[0], RGB[0], LEFT[0]) == math.inf
-
-
-def test_without_a_hole_there_is_no_distance() -> None:
-    assert math.isnan(hole_distance(Never(), RGB[0], TARGET[0], NO_HOLE[0]))
     assert math.isnan(hole_psnr(RGB[0], TARGET[0], NO_HOLE[0]))
+    assert math.isnan(hole_distance(Never(), RGB[0], TARGET[0], NO_HOLE[0]))

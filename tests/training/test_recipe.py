@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -13,38 +14,27 @@ from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences
 from spackle.training.trainer import ema_decay, learning_rate, samples_of_step
 
 pytest.importorskip("yaml")
-RECIPES = ("cpu", "direct_ft", "paper", "reverse_view")
+PLAIN = "loss: {features: none}"
 
 
-def written(folder: Path, text: str = "loss: {features: none}") -> Path:
+def written(folder: Path, text: str = PLAIN) -> Path:
     path = folder / "recipe.yaml"
     path.write_text(text)
     return path
 
 
-def refusal(folder: Path, text: str = "loss: {features: none}", *overrides: str) -> str:
-    with pytest.raises(InputError) as error:
-        load_recipe(written(folder, text), overrides)
-    message = str(error.value)
-    assert "\n" not in message
-    return message.replace(str(folder), "")
-
-
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
 def test_every_packaged_recipe_can_be_read_and_has_the_papers_weights(name: str) -> None:
     recipe = load_recipe(name)
     assert recipe.loss.weights == PAPER_WEIGHTS
     assert recipe.data.photos is not None or recipe.data.pseudo is not None
     assert recipe.loss.dilation == 21
-
-
-def test_the_papers_recipe_says_what_the_paper_says() -> None:
-    recipe = load_recipe("paper")
-    optim, run = recipe.optim, recipe.run
-    assert (optim.lr, optim.min_lr, optim.warmup) == (1.6e-4, 1.6e-5, 10_000)
-    assert (run.patience, run.min_delta) == (10, 1e-4)
-    assert (recipe.loss.features, recipe.loss.feature_size) == ("resnet50", 512)
-    assert recipe.data.views == 20_000
+    if name == "paper":
+        optim, run = recipe.optim, recipe.run
+        assert (optim.lr, optim.min_lr, optim.warmup) == (1.6e-4, 1.6e-5, 10_000)
+        assert (run.patience, run.min_delta) == (10, 1e-4)
+        assert (recipe.loss.features, recipe.loss.feature_size) == ("resnet50", 512)
+        assert recipe.data.views == 20_000
 
 
 def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path: Path) -> None:
@@ -70,45 +60,45 @@ def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("text", "override", "said"),
+    ("text", "override", "named"),
     [
-        ("optim: {stepps: 3}", "", "recipe.yaml: optim.stepps is unknown; there are lr, min_lr, warmup, steps"),
-        ("data: {shares: {video: 1}}", "", "data.shares.video is unknown; there are composites, rgbd, stereo, pairs"),
-        ("optim: {steps: many}", "", "recipe.yaml: optim.steps cannot be 'many'; it takes a whole number from 1 to"),
+        ("optim: {stepps: 3}", "", "optim.stepps is unknown; there are lr, min_lr"),
+        ("data: {shares: {video: 1}}", "", "data.shares.video is unknown"),
+        ("optim: {steps: many}", "", "optim.steps cannot be 'many'; it takes a whole number from 1 to"),
         ("optim: {steps: 2.5}", "", "optim.steps cannot be '2.5'"),
         ("optim: {steps: true}", "", "optim.steps cannot be 'True'"),
         ("optim: {lr: .nan}", "", "optim.lr cannot be 'nan'; it takes a number above 0, up to 1"),
         ("optim: {precision: fp8}", "", "optim.precision cannot be 'fp8'; it takes auto, fp32, bf16"),
         ("loss: {feature_size: 3}", "", "loss.feature_size cannot be '3'; it takes a whole number from 64 to 4096, or"),
         ("data: {photos: 3}", "", "data.photos cannot be '3'; it takes a path, or null"),
-        (
-            "data: {disparity: [0.1]}",
-            "",
-            "data.disparity cannot be '[0.1]'; it takes a list of two numbers, each from 0",
-        ),
+        ("data: {disparity: [0.1]}", "", "data.disparity cannot be '[0.1]'; it takes a list of two numbers, each from"),
         ("data: {disparity: [0.1, 7]}", "", "data.disparity cannot be '7'"),
-        ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px is missing; data.rgbd.0 needs it"),
+        ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px is missing"),
         ("data: {rgbd: kitchen}", "", "data.rgbd cannot be 'kitchen'; it takes a list"),
         ("[1, 2]", "", "the recipe cannot be '[1, 2]'; it takes keys data, loss, optim, run, init"),
-        ("a: [", "", "recipe.yaml: not YAML: while parsing"),
-        ("loss: {features: none}", "optim.stepps=3", "optim.stepps=3: optim.stepps is unknown"),
-        ("loss: {features: none}", "optim.steps=0", "optim.steps=0: optim.steps cannot be '0'"),
-        ("loss: {features: none}", "quick", "'quick': neither an option nor key=value"),
-        ("loss: {features: none}", "optim.steps.a=1", "optim.steps cannot be"),
-        ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd has 0 entries, counted from 0; 0 is none of them"),
-        ("data: {disparity: [0.5, 0.1]}\nloss: {features: none}", "", "data.disparity runs from 0.5 down to 0.1"),
-        ("loss: {features: none}", "optim.min_lr=0.5", "optim.min_lr 0.5 is above optim.lr"),
-        ("loss: {features: none}", "loss.dilation=4", "loss.dilation 4 is even"),
-        ("loss: {features: resnet50}", "", "loss.features_path is missing: it names the weights of resnet50"),
-        (
-            "{loss: {features: squeezenet, features_path: a, feature_size: null}, data: {cells: 16}}",
-            "",
-            "crops of 16 cells are too small for squeezenet",
-        ),
+        ("a: [", "", "not YAML"),
+        (PLAIN, "optim.stepps=3", "optim.stepps=3: optim.stepps is unknown"),
+        (PLAIN, "optim.steps=0", "optim.steps=0: optim.steps cannot be '0'"),
+        (PLAIN, "quick", "'quick': neither an option nor key=value"),
+        (PLAIN, "optim.steps.a=1", "optim.steps cannot be"),
+        ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd has 0 entries"),
+        ("{data: {disparity: [0.5, 0.1]}, loss: {features: none}}", "", "data.disparity"),
+        (PLAIN, "optim.min_lr=0.5", "optim.min_lr 0.5 is above optim.lr"),
+        (PLAIN, "loss.dilation=4", "loss.dilation 4 is even"),
+        ("loss: {features: resnet50}", "", "loss.features_path is missing"),
+        ("{loss: {features_path: a, feature_size: null}, data: {cells: 16}}", "", "crops of 16 cells are too small"),
     ],
 )
-def test_what_cannot_be_is_said_in_a_line(tmp_path: Path, text: str, override: str, said: str) -> None:
-    assert said in refusal(tmp_path, text, *([override] if override else []))
+def test_what_cannot_be_is_named_with_its_file_or_option(tmp_path: Path, text: str, override: str, named: str) -> None:
+    with pytest.raises(InputError) as error:
+        load_recipe(written(tmp_path, text), [override] if override else [])
+    assert named in str(error.value)
+    assert (
+        (override or str(tmp_path / "recipe.yaml")) in str(error.value)
+        or "min_lr" in override
+        or "dilation" in override
+    )
+    assert "\n" not in str(error.value)
 
 
 def test_a_missing_recipe_is_named(tmp_path: Path) -> None:
@@ -128,27 +118,19 @@ def test_runs_differ_by_what_is_learned_and_not_by_how_long_it_takes(tmp_path: P
 
 
 def test_a_plain_recipe_is_made_of_plain_things() -> None:
-    def kinds(value: object) -> set[type]:
-        if isinstance(value, (dict, list)):
-            items = value.values() if isinstance(value, dict) else value
-            return {type(value)}.union(*map(kinds, items))
-        return {type(value)}
-
     recipe = plain(Recipe(init=Path("a")))
-    assert kinds(recipe) <= {dict, list, str, int, float, type(None)}
+    assert json.loads(json.dumps(recipe)) == recipe
     assert recipe["init"] == "a"
 
 
-def test_the_learning_rate_warms_up_and_falls_as_a_cosine() -> None:
+def test_the_rate_warms_up_and_falls_as_a_cosine_and_the_average_forgets_quickly_at_first() -> None:
     optim = OptimRecipe(lr=1.0, min_lr=0.1, warmup=4, steps=14)
     assert [learning_rate(step, optim) for step in range(4)] == pytest.approx([0.25, 0.5, 0.75, 1])
     assert learning_rate(4, optim) == pytest.approx(1)
     assert learning_rate(9, optim) == pytest.approx(0.55)
     assert learning_rate(13, optim) == pytest.approx(0.1 + 0.45 * (1 + math.cos(0.9 * math.pi)))
     assert learning_rate(99, optim) == pytest.approx(0.1)
-
-
-def test_the_average_forgets_quickly_at_first() -> None:
+    # The average forgets quickly at first.
     assert ema_decay(0, 0.9) == pytest.approx(0.1)
     assert ema_decay(10_000, 0.9) == 0.9
     assert ema_decay(0, 0) == 0
