@@ -23,8 +23,12 @@ from PIL import Image
 from scenes import box_before_wall, shifted
 from torch import Tensor
 
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import BaseError, BaseSettings
+from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
+from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case, LoadedCase, load_case
@@ -33,7 +37,8 @@ from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics,
 from spackle.evaluation.protocols import Gauges, large_views, measure
 from spackle.evaluation.results import Mean, Record, Row
 from spackle.evaluation.results import Run as Results
-from spackle.evaluation.run import problem_of
+from spackle.evaluation.run import examine, problem_of
+from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
@@ -42,40 +47,32 @@ from spackle.residual import hole_mask
 TABLES = ("tables.md", "tables.tex")
 FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package
 OUTPUTS = {"results.json", "times.json", "config.json", "worst.png", "best.png", "images", *TABLES}
-
-
-def noisy(height: int = 57, width: int = 83, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A random image and a disturbed copy, float64."""
-    generator = torch.Generator().manual_seed(seed)
-    image = torch.rand(height, width, 3, generator=generator, dtype=torch.float64)
-    return image, (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+Figures = dict[str, dict[str, float | None]]
 
 
 # --- metrics
 
 
+def noisy(seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A random image and a disturbed copy, float64."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(57, 83, 3, generator=generator, dtype=torch.float64)
+    return image, (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_psnr_and_ssim_are_scikit_images(seed: int) -> None:
     theirs = pytest.importorskip("skimage.metrics")
-    image, truth = noisy(seed=seed)
+    image, truth = noisy(seed)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
     mean, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
     assert ssim(image, truth) == pytest.approx(mean, abs=1e-6)
     assert np.abs(ssim_map(image, truth).numpy() - full).max() < 1e-6
-    assert psnr(image, truth) == pytest.approx(
-        theirs.peak_signal_noise_ratio(truth.numpy(), image.numpy(), data_range=1), abs=1e-6
-    )
-
-
-def test_a_mask_restricts_a_metric_to_its_pixels() -> None:
-    theirs = pytest.importorskip("skimage.metrics")
-    image, truth = noisy()
     mask = torch.zeros(image.shape[:2], dtype=torch.bool)
     mask[:20, -30:] = True  # up to the border, where half of a hole may be
-    part, other = image[:20, -30:].numpy(), truth[:20, -30:].numpy()
-    assert psnr(image, truth, mask) == pytest.approx(
-        theirs.peak_signal_noise_ratio(other, part, data_range=1), abs=1e-6
-    )
+    for found, part in ((psnr(image, truth), np.s_[:]), (psnr(image, truth, mask), np.s_[:20, -30:])):
+        expected = theirs.peak_signal_noise_ratio(truth.numpy()[part], image.numpy()[part], data_range=1)
+        assert found == pytest.approx(expected, abs=1e-6)
     assert ssim(image, truth, mask) == pytest.approx(float(ssim_map(image, truth)[mask].mean()), abs=1e-12)
     changed = torch.where(mask[..., None], image, torch.zeros_like(image))
     assert psnr(changed, truth, mask) == psnr(image, truth, mask)
@@ -95,23 +92,24 @@ def test_metrics_of_nothing_and_of_equal_images() -> None:
 # --- pyiqa, by a stand-in
 
 
-def test_without_pyiqa_each_of_its_metrics_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_pyiqa(monkeypatch, error=ModuleNotFoundError("No module named 'pyiqa'", name="pyiqa"))
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (ModuleNotFoundError("No module named 'pyiqa'", name="pyiqa"), NOT_INSTALLED),
+        (RuntimeError("operator torchvision::nms does not exist"), "pyiqa cannot be imported: operator torchvision"),
+    ],
+)
+def test_without_pyiqa_each_of_its_metrics_says_so(
+    error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_pyiqa(monkeypatch, error=error)
     opened = open_metrics(["niqe", "lpips"], "cpu", download=False)
     assert opened.metrics == {}
-    assert opened.missing == {"niqe": NOT_INSTALLED, "lpips": NOT_INSTALLED}
+    assert {name: why.startswith(says) for name, why in opened.missing.items()} == {"niqe": True, "lpips": True}
     assert open_metrics([], "cpu", download=False).missing == {}
 
 
-def test_a_torchvision_that_does_not_fit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_pyiqa(monkeypatch, error=RuntimeError("operator torchvision::nms does not exist"))
-    opened = open_metrics(["niqe"], "cpu", download=False)
-    assert opened.missing == {"niqe": "pyiqa cannot be imported: operator torchvision::nms does not exist"}
-
-
-def test_the_variant_of_each_metric_is_pinned_and_images_come_as_pyiqa_wants_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, Any] = {}
     seen: list[tuple[Tensor, ...]] = []
 
@@ -130,16 +128,15 @@ def test_the_variant_of_each_metric_is_pinned_and_images_come_as_pyiqa_wants_the
     assert (opened.version, opened.missing) == ("9.9", {})
     assert asked["lpips"] == (torch.device("cpu"), {"net": "alex", "version": "0.1"})
     assert asked["musiq"][1] == {"pretrained": "koniq10k"}
-    assert asked["clipiqa"][1]["backbone"] == "RN50"
+    assert asked["clipiqa"][1] == {"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False}
+    assert (asked["niqe"][1], asked["dists"][1]) == ({"test_y_channel": True}, {})
     picture, truth = torch.full((5, 7, 3), 1.5), torch.full((5, 7, 3), 0.25)
     picture[0, 1, 2] = 0.0
     assert opened.metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
     assert opened.metrics["niqe"](truth, None) == pytest.approx(0.25)
     first, second = seen[0]
     assert first.shape == second.shape == (1, 3, 5, 7)
-    assert first[0, 2, 0, 1] == 0
-    assert float(first.max()) == 1
-    assert len(seen[1]) == 1
+    assert (float(first[0, 2, 0, 1]), float(first.max()), len(seen[1])) == (0, 1, 1)
 
 
 def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,14 +152,14 @@ def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatc
     opened = open_metrics(["niqe", "musiq", "clipiqa"], "cpu", download=False)
     assert socket.getaddrinfo is lookup
     assert opened.missing["niqe"].startswith("weights: not on this machine")
-    assert opened.missing["musiq"] == "pyiqa cannot load it: 'koniq'"
+    assert "'koniq'" in opened.missing["musiq"]
     assert math.isnan(opened.metrics["clipiqa"](torch.zeros(4, 4, 3), None))
 
 
 # --- tables
 
 
-def results(title: str, protocol: str, methods: list[str], figures: dict[str, dict[str, float | None]]) -> Results:
+def results(title: str, protocol: str, methods: list[str], figures: Figures) -> Results:
     """A run of two images with two views each, and one that was passed over."""
     settings = ["near"] if protocol == "near-view" else ["0.3", "0.4", "0.5"]
     rows = tuple(Row(s, v, m, figures[m]) for s in settings for m in methods for v in ("left", "right"))
@@ -180,7 +177,7 @@ def results(title: str, protocol: str, methods: list[str], figures: dict[str, di
     return Results(config, records)
 
 
-LARGE: dict[str, dict[str, float | None]] = {
+LARGE: Figures = {
     "base": {"har_before": 0.2, "har": 0.2, "aux": 0, "aux_share": 0.0, "merged": 1000, "niqe": 4.5, "musiq": None},
     "spackle": {"har_before": 0.2, "har": 0.05, "aux": 30, "aux_share": 0.03, "merged": 1030, "niqe": 4.25},
 }
@@ -188,42 +185,37 @@ LARGE: dict[str, dict[str, float | None]] = {
 
 def cells(table: Table, dataset: str) -> list[tuple[str, ...]]:
     """The rows of a dataset, without its name."""
-    found, inside = [], False
-    for line in table.lines:
-        inside = line.cells[0] == dataset or (inside and line.cells[0] == "")
-        if inside:
-            found.append(line.cells[1:])
-    return found
+    names = [line.cells[0] for line in table.lines]
+    start = names.index(dataset)
+    end = next((k for k in range(start + 1, len(names)) if names[k]), len(names))
+    return [line.cells[1:] for line in table.lines[start:end]]
 
 
 def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
     quality, holes, gaussians = make_tables([results("Middlebury", "large-view", ["base", "spackle"], LARGE)])
     assert (quality.label, holes.label) == ("tab:large_view_nr_iqa", "tab:controlled_disocclusion")
-    assert [name for name, _ in quality.groups] == [
-        "", "S1: disparity 0.3", "S2: disparity 0.4", "S3: disparity 0.5",
-    ]  # fmt: skip
+    settings = ["S1: disparity 0.3", "S2: disparity 0.4", "S3: disparity 0.5"]
+    assert [name for name, _ in quality.groups] == ["", *settings]
     assert quality.columns[3:6] == ("CLIPIQA ↑", "NIQE ↓", "MUSIQ ↑")
     base, spackle, sharp, theirs = cells(quality, "Middlebury")
     assert base[:5] == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
     assert spackle[:4] == ("Spackle (rgbd)", "2/23", "", "**4.2500**")
     assert sharp == ("SHARP (paper)", "23", *(f"{n:.4f}" for n in paper.QUALITY["Middlebury", "SHARP"]))
     assert theirs[2:5] == ("0.3921", "4.3127", "58.1583")
-    assert cells(holes, "Middlebury")[0][2:5] == ("0.2000", "0.0500", "75.00%")
+    assert [row[2:5] for row in cells(holes, "Middlebury")[:1]] == [("0.2000", "0.0500", "75.00%")]
     assert cells(holes, "Middlebury")[1][2:5] == ("0.0121", "0.0011", "90.47%")
     assert cells(gaussians, "Middlebury")[0][2:5] == ("30", "3.00", "1,030")
     assert cells(gaussians, "LLFF")[1][-3:] == ("23,397", "1.98", "1,203,045")
     assert cells(quality, "Tanks")[0] == ("not run", *[""] * 10)
     assert len(cells(holes, "Booster")) == 2
-    assert any("CLIPIQA not run: pyiqa is not installed" in note for note in quality.notes)
-    assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
-    assert any("Noncommercial" in note for note in quality.notes)
-    assert "swipe" in quality.caption
-    assert "shipped weights 01234567" in quality.caption
-    assert "rgbd: the dataset's own depth" in quality.caption
+    for word in ("CLIPIQA not run: pyiqa is not installed", "1 of 3 images gave no figures: c.", "Noncommercial"):
+        assert any(word in note for note in quality.notes)
+    for word in ("swipe", "shipped weights 01234567", "rgbd: the dataset's own depth"):
+        assert word in quality.caption
 
 
 def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
-    figures: dict[str, dict[str, float | None]] = {
+    figures: Figures = {
         "spackle": {"har_before": 0.1, "aux": 25, "dists": 0.3, "psnr": 20.0, "psnr_hole": 15.5, "ssim_hole": 0.5},
         "dense": {"har_before": 0.1, "aux": 100, "dists": 0.25, "psnr": 21.0, "psnr_hole": 14.5, "ssim_hole": 0.5},
     }
@@ -241,11 +233,10 @@ def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
 
 def test_results_that_do_not_go_together_are_refused() -> None:
     one = results("LLFF", "large-view", ["base"], LARGE)
-    with pytest.raises(ValueError, match="two results for LLFF"):
-        make_tables([one, one])
     other = Results({**one.config, "title": "Tanks", "disparities": [0.3]}, one.records)
-    with pytest.raises(ValueError, match="different disparities"):
-        make_tables([one, other])
+    for second, why in ((one, "two results for LLFF"), (other, "different disparities")):
+        with pytest.raises(InputError, match=why):
+            make_tables([one, second])
 
 
 def test_a_mean_leaves_out_what_is_not_finite_and_counts_it() -> None:
@@ -282,29 +273,35 @@ def test_a_table_as_markdown_and_as_latex() -> None:
         Table("t", "", ("A",), (("", 1),), (Line(("1", "2")),))
 
 
-def test_the_best_of_a_column_is_set_off() -> None:
-    assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
-    assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
-    assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
-    assert mark_best([1.0], ["1"], lower=False) == ["1"]
+@pytest.mark.parametrize(
+    ("values", "texts", "lower", "marked"),
+    [
+        ([1.0, None, 2.0], ["1", "", "2"], True, ["**1**", "", "2"]),
+        ([1.0, 1.0001], ["1.0", "1.0"], False, ["1.0", "1.0"]),
+        ([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], False, ["1.0", "**1.1**", "**1.1**"]),
+        ([1.0], ["1"], False, ["1"]),
+    ],
+)
+def test_the_best_of_a_column_is_set_off(
+    values: list[float | None], texts: list[str], lower: bool, marked: list[str]
+) -> None:
+    assert mark_best(values, texts, lower) == marked
 
 
 # --- methods and views
 
 
-def shot_of(cameras: list[Camera]) -> Shot:
+def shot_of(*sides: float) -> Shot:
     """A box before a wall, from elsewhere."""
-    prediction = box_before_wall().lift()
-    renderer = get_renderer()
+    prediction, renderer = box_before_wall().lift(), get_renderer()
+    cameras: list[Camera] = [shifted(box_before_wall().camera, side) for side in sides]
     return Shot(prediction, cameras, [renderer.render(prediction.gaussians, camera) for camera in cameras], renderer)
 
 
 def test_large_views_are_the_ends_of_a_swipe_at_each_disparity() -> None:
     prediction = box_before_wall(width=95, height=71).lift()
     views = large_views(prediction, (0.3, 0.5))
-    assert [(view.setting, view.name) for view in views] == [
-        ("0.3", "left"), ("0.3", "right"), ("0.5", "left"), ("0.5", "right"),
-    ]  # fmt: skip
+    assert [(view.setting, view.name) for view in views] == [(s, n) for s in ("0.3", "0.5") for n in ("left", "right")]
     assert {(view.camera.width, view.camera.height) for view in views} == {(96, 72)}
     reach = DepthRange.of(prediction.gaussians)
     for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
@@ -314,34 +311,31 @@ def test_large_views_are_the_ends_of_a_swipe_at_each_disparity() -> None:
 
 
 def test_each_method_starts_from_the_same_base() -> None:
-    shot = shot_of([shifted(box_before_wall().camera, side) for side in (0.4, -0.4)])
-    alone, per_view, scene, dense = (
-        list(make_method(name, None)(shot)) for name in ("base", "seeds", "spackle-scene", "dense")
-    )
+    shot = shot_of(0.4, -0.4)
+    names = ("base", "seeds", "spackle-scene", "dense")
+    alone, per_view, scene, dense = (list(make_method(name, None)(shot)) for name in names)
     for index, before in enumerate(shot.before):
         covered = ~hole_mask(before.alpha)
         assert torch.equal(alone[index].rgb, before.rgb)
         assert alone[index].aux == 0
-        for views in (per_view, scene, dense):
-            view = views[index]
+        for view in (per_view[index], scene[index], dense[index]):
             assert view.alpha is not None
             assert float(hole_mask(view.alpha).float().mean()) < 0.1 * float((~covered).float().mean())
             assert float((view.rgb - before.rgb).abs()[covered].mean()) < 0.01
-        cells = before.alpha.numel() / 4
-        assert 0.97 * cells <= (dense[index].aux or 0) <= cells
-        assert (per_view[index].aux or 0) < 0.5 * cells
+        whole = before.alpha.numel() / 4
+        assert 0.97 * whole <= (dense[index].aux or 0) <= whole
+        assert (per_view[index].aux or 0) < 0.5 * whole
     assert scene[0].aux == scene[1].aux  # one set for both
 
 
 def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
-    shot = shot_of([shifted(box_before_wall().camera, 0.4)])
-    base = shot.prediction
-    same = list(make_method("direct-ft", None, lambda: (base, 1.0))(shot))
-    assert torch.equal(same[0].rgb, shot.before[0].rgb)
-    g = base.gaussians
+    shot = shot_of(0.4)
+    base, g = shot.prediction, shot.base
     double = dataclasses.replace(base, gaussians=dataclasses.replace(g, means=2 * g.means, scales=2 * g.scales))
-    other = list(make_method("direct-ft", None, lambda: (double, 2.0))(shot))
-    assert float((other[0].rgb - shot.before[0].rgb).abs().max()) < 1e-3
+    same = next(make_method("direct-ft", None, lambda: (base, 1.0))(shot))
+    other = next(make_method("direct-ft", None, lambda: (double, 2.0))(shot))
+    assert torch.equal(same.rgb, shot.before[0].rgb)
+    assert float((other.rgb - shot.before[0].rgb).abs().max()) < 1e-3
     with pytest.raises(ValueError, match="a base of its own"):
         make_method("direct-ft", None)
 
@@ -352,10 +346,8 @@ def test_a_metric_that_fails_is_a_remark_and_no_number() -> None:
     def broken(picture: Tensor, truth: Tensor | None) -> float:
         raise RuntimeError("svd did not converge")
 
-    gauges = Gauges(("niqe",), {"niqe": broken}, None)
-    found = measure(
-        prediction, large_views(prediction, (0.3,)), {"base": make_method("base", None)}, gauges, get_renderer()
-    )
+    gauges, methods = Gauges(("niqe",), {"niqe": broken}, None), {"base": make_method("base", None)}
+    found = measure(prediction, large_views(prediction, (0.3,)), methods, gauges, get_renderer())
     assert found.remarks == ["niqe failed: svd did not converge"]
     assert [row.figures["niqe"] for row in found.rows] == [None, None]
     assert found.pictures["base"].shape == (72, 96, 3)
@@ -397,42 +389,36 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
         return lambda image: image.mean() if name == "niqe" else torch.tensor(math.nan)
 
     fake_pyiqa(monkeypatch, create)
-    output = tmp_path / "out"
     methods = f"base,{FLAT}seeds,spackle,spackle-scene"
-    done = evaluate(scenes, output, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3,0.5")
+    done = evaluate(scenes, tmp_path, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3", "0.5")
     assert done.code == 0, done.err
-    assert names_in(output) == OUTPUTS
-    found = read(output)
-    assert found["problems"] == {}
+    assert names_in(tmp_path) == OUTPUTS
+    found = read(tmp_path)
+    assert (found["problems"], found["config"]["disparities"]) == ({}, [0.3, 0.5])
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02
         for method in ("seeds", "spackle", "spackle-scene"):
             assert mean_of(found, setting, method, "har") < 0.05 * before
             assert mean_of(found, setting, method, "merged") > mean_of(found, setting, "base", "merged")
-        assert mean_of(found, setting, "spackle", "niqe") > mean_of(
-            found, setting, "base", "niqe"
-        )  # black holes are filled
+        dark, filled = (mean_of(found, setting, method, "niqe") for method in ("base", "spackle"))
+        assert filled > dark  # black holes are filled
     assert mean_of(found, "0.5", "base", "har") > mean_of(found, "0.3", "base", "har")
     assert {image["name"] for image in found["images"]} == {"Ball", "Chair", "Door"}
     assert found["config"]["metrics"] == {"niqe": "pyiqa 9.9", "musiq": "pyiqa 9.9"}
-    text = (output / "tables.md").read_text()
-    assert "(6 NaN)" in text
-    assert "3/23" in text
-    assert "PolyForm Noncommercial" in text
-    with Image.open(output / "worst.png") as sheet:
+    text = (tmp_path / "tables.md").read_text()
+    assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
+    with Image.open(tmp_path / "worst.png") as sheet:
         assert sheet.width >= 4 * 72
 
 
 def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
     write_motorcycle(tmp_path / "data" / "Motorcycle")
-    output = tmp_path / "out"
     methods = f"base,{FLAT}spackle,dense"
-    done = evaluate(
-        tmp_path / "data", output, "--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim"
-    )
+    words = ("--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim")
+    done = evaluate(tmp_path / "data", tmp_path / "out", *words)
     assert done.code == 0, done.err
-    found = read(output)
+    found = read(tmp_path / "out")
     hole, outside = (
         {name: mean_of(found, "near", name, f"psnr_{place}") for name in methods.split(",")}
         for place in ("hole", "outside")
@@ -443,7 +429,7 @@ def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
     assert guided < 0.6 * dense
     size = found["images"][0]["facts"]
     assert 0.97 <= dense / (math.ceil(size["width"] / 2) * math.ceil(size["height"] / 2)) <= 1
-    assert "tab:mask_guided_init" in (output / "tables.tex").read_text()
+    assert "tab:mask_guided_init" in (tmp_path / "out" / "tables.tex").read_text()
 
 
 @pytest.mark.parametrize("images", [1, 2])
@@ -451,18 +437,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
     choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.4")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert evaluate(scenes, whole, *choices).code == 0
-    words = [
-        "evaluate",
-        "--dataset",
-        "middlebury",
-        "--root",
-        str(scenes),
-        "--base",
-        "rgbd",
-        "-o",
-        str(killed),
-        *choices,
-    ]
+    place = ("--root", str(scenes), "--base", "rgbd", "-o", str(killed))
     code = (
         "import os, sys\n"
         "from spackle.evaluation import run as job\n"
@@ -476,10 +451,8 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
         "last = sys.argv.pop()\n"
         "main()\n"
     )
-    last = f"{images - 1:05d}"
-    ended = subprocess.run(
-        [sys.executable, "-c", code, *words, last], capture_output=True, check=False, env=dict(os.environ)
-    )
+    words = [sys.executable, "-c", code, "evaluate", "--dataset", "middlebury", *place, *choices, f"{images - 1:05d}"]
+    ended = subprocess.run(words, capture_output=True, check=False, env=dict(os.environ))
     assert ended.returncode == -9, ended.stderr
     assert len(list((killed / "images").glob("*.json"))) == images
     assert not (killed / "results.json").exists()
@@ -492,43 +465,32 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
     assert before == {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
     same_files(whole, killed, ("results.json", "worst.png", "best.png", *TABLES))
     refused = evaluate(scenes, killed, *choices[:-1], "0.5")
-    assert refused.code == 2
-    assert "disparities: [0.4] -> [0.5]" in refused.err
+    assert (refused.code, "disparities: [0.4] -> [0.5]" in refused.err) == (2, True)
 
 
 def test_a_broken_image_is_named_and_the_others_go_on(scenes: Path, tmp_path: Path) -> None:
-    root = tmp_path / "data"
+    root, output = tmp_path / "data", tmp_path / "out"
     shutil.copytree(scenes, root)
-    whole = (root / "Chair" / "left.png").read_bytes()
-    (root / "Chair" / "left.png").write_bytes(whole[: len(whole) // 2])
-    output = tmp_path / "out"
-    choices = ("--methods", "seeds", "--metrics", "none", "--disparity", "0.3")
-    done = evaluate(root, output, *choices)
-    assert done.code == 0
-    assert sum("passed over:" in line for line in done.lines) == 1
-    found = read(output)
-    assert list(found["problems"]) == ["Chair"]
-    assert str(tmp_path) not in json.dumps(found)
+    photo = root / "Chair" / "left.png"
+    whole = photo.read_bytes()
+    choices = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
+    for content in (whole[: len(whole) // 2], b"", b"no picture"):  # the last two have not even a header
+        photo.write_bytes(content)
+        for where, more in ((output, choices), (tmp_path / "near", (*choices[:4], "--protocol", "near-view"))):
+            done = evaluate(root, where, *more)
+            assert done.code == 0, done.err
+            (line,) = [line for line in done.lines if "passed over:" in line]
+            assert "Chair/left.png: " in line
+            found = read(where)
+            assert list(found["problems"]) == ["Chair"]
+            assert str(tmp_path) not in json.dumps(found)
     assert "1 of 3 images gave no figures: Chair." in (output / "tables.md").read_text()
-    (root / "Chair" / "left.png").write_bytes(whole)
+    photo.write_bytes(whole)
     assert evaluate(root, output, *choices).code == 0
     assert read(output)["problems"] == {}
-
-
-@pytest.mark.parametrize("content", [b"", b"no picture"])
-def test_a_photo_without_a_header_is_passed_over_too(content: bytes, scenes: Path, tmp_path: Path) -> None:
-    root = tmp_path / "data"
-    shutil.copytree(scenes, root)
-    (root / "Chair" / "left.png").write_bytes(content)
-    for protocol in ("large-view", "near-view"):
-        output = tmp_path / protocol
-        done = evaluate(root, output, "--protocol", protocol, "--methods", "base", "--metrics", "none")
-        assert done.code == 0, done.err
-        assert [line for line in done.lines if "passed over: Chair/left.png: " in line]
-        assert list(read(output)["problems"]) == ["Chair"]
     for scene in root.iterdir():
-        (scene / "left.png").write_bytes(content)
-    done = evaluate(root, tmp_path / "none", "--methods", "base", "--metrics", "none")
+        (scene / "left.png").write_bytes(b"")
+    done = evaluate(root, tmp_path / "none", *choices)
     assert (done.code, len(done.lines), "none of 3 images gave figures" in done.err) == (2, 4, True)
 
 
@@ -546,30 +508,45 @@ def test_a_second_photo_that_is_broken_is_a_remark(
     assert done.code == 0, done.err
     remark = "without one of its second photos: Chair/third.png: not an image"
     assert f"Chair: {remark}" in done.lines
-    records = json.loads((tmp_path / "results.json").read_text())["images"]
-    assert {record["name"]: record["remarks"] for record in records if record["remarks"]} == {"Chair": [remark]}
-
-
-def test_what_is_passed_over_is_named_whichever_photo_is_broken(tmp_path: Path) -> None:
+    assert {record["name"]: record["remarks"] for record in read(tmp_path)["images"] if record["remarks"]} == {
+        "Chair": [remark]
+    }
     case = Case("fern/003", tmp_path / "fern/images/003.jpg")
     error = InputError(f"{tmp_path}/fern/images/007.jpg: not\nan image")
     assert problem_of(case, error, tmp_path) == "fern/003: fern/images/007.jpg: not an image"
     assert problem_of(case, InputError("fern/003: has no second photo"), tmp_path) == "fern/003: has no second photo"
 
 
-def test_disparities_may_be_words_of_their_own(scenes: Path, tmp_path: Path) -> None:
-    choices = ("--methods", "base", "--metrics", "none", "--limit", "1")
-    for place, words in enumerate((("0.3,0.5",), ("0.3", "0.5"), ("0.3 0.5",))):
-        assert evaluate(scenes, tmp_path / str(place), "--disparity", *words, *choices).code == 0
-        assert read(tmp_path / str(place))["config"]["disparities"] == [0.3, 0.5]
+def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
+    scenes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict = RgbdBase.predict
+
+    def too_large(*arguments: Any) -> BasePrediction:
+        found = predict(*arguments)
+        return dataclasses.replace(
+            found, gaussians=dataclasses.replace(found.gaussians, means=found.gaussians.means / 0)
+        )
+
+    def too_little(*arguments: Any) -> BasePrediction:
+        raise MemoryShort("not enough memory for the network")
+
+    options = EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), residual="seeds", metrics=())
+    evaluation = open_evaluation(options)
+    for broken, kind in ((too_large, InputError), (too_little, BaseError)):
+        monkeypatch.setattr(RgbdBase, "predict", broken)
+        with pytest.raises(InputError) as caught:
+            examine(evaluation.cases[0], evaluation)
+        assert type(caught.value) is kind
 
 
 def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:
-    choices = ("--methods", "base,seeds", "--metrics", "none", "--limit", "1")
+    choices = ("--methods", "base,seeds", "--metrics", "none", "--limit", "1", "--disparity", "0.3 0.5")
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0
-    assert evaluate(scenes, two, *choices, "--protocol", "near-view").code == 0
-    assert len(read(one)["images"]) == 1
+    assert evaluate(scenes, two, *choices[:-2], "--protocol", "near-view").code == 0
+    found = read(one)
+    assert (len(found["images"]), found["config"]["disparities"]) == (1, [0.3, 0.5])
     done = run("tables", one, two, "-o", both)
     assert done.code == 0, done.err
     text = (both / "tables.md").read_text()
@@ -577,10 +554,9 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     assert "tab:near_view" in text
     assert run("tables", one, "-o", tmp_path / "again").code == 0
     same_files(one, tmp_path / "again", TABLES)
-    refused = run("tables", one, one, "-o", both)
-    assert (refused.code, "two results" in refused.err) == (2, True)
-    refused = run("tables", scenes, "-o", both)
-    assert (refused.code, "results.json is missing" in refused.err) == (2, True)
+    for folders, why in (((one, one), "two results"), ((scenes,), "results.json is missing")):
+        refused = run("tables", *folders, "-o", both)
+        assert (refused.code, why in refused.err) == (2, True)
 
 
 @pytest.mark.parametrize(
@@ -591,11 +567,12 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--protocol", "near"), "did you mean near-view?"),
         (("--dataset", "midlebury"), "did you mean middlebury?"),
         (("--base", "shrap"), "did you mean sharp?"),
+        (("--base", "auto"), "--base auto"),
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),
-        (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view looks from where"),
+        (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view"),
         (("--disparity", "0.3,3"), "up to 2"),
-        (("--disparity=-0.3",), "--disparity -0.3: must be above 0"),
+        (("--disparity=-0.3",), "--disparity -0.3"),
         (("--disparity", "0.3,0.30"), "the same number twice"),
         (("--disparity", "0.3", "3"), "up to 2"),
         (("--disparity", "0.3", "x"), "x: a word of no option"),
@@ -610,13 +587,13 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("-c", "x.pt"), "no checkpoint"),
         (("--precision", "fp8"), "--precision fp8"),
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
+        (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
+        (("--root", "nowhere"), "nowhere"),
     ],
 )
 def test_bad_input_is_one_line(words: tuple[str, ...], message: str, scenes: Path, tmp_path: Path) -> None:
     done = evaluate(scenes, tmp_path / "out", *words)
-    assert done.code == 2
-    assert len(done.lines) == 1
-    assert message in done.err
+    assert (done.code, len(done.lines), message in done.err) == (2, 1, True), done.err
     assert not (tmp_path / "out").exists()
 
 
@@ -624,17 +601,3 @@ def test_a_missing_opencv_is_one_line(scenes: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "cv2", None)
     done = evaluate(scenes, tmp_path / "out", "--methods", "inpaint2d", "--metrics", "none")
     assert (done.code, len(done.lines), "pip install 'spackle-nvs[opencv]'" in done.err) == (2, 1, True)
-
-
-def test_a_dataset_without_what_is_needed_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    done = evaluate(tmp_path / "empty", tmp_path / "out")
-    assert (done.code, len(done.lines), str(tmp_path / "empty") in done.err) == (2, 1, True)
-
-
-def test_direct_ft_needs_its_weights(scenes: Path, tmp_path: Path) -> None:
-    checkpoint = tmp_path / "sharp.pt"
-    checkpoint.write_bytes(b"0")
-    words = ("--base", "sharp", "-c", checkpoint, "--methods", "direct-ft")
-    done = run("evaluate", "--dataset", "middlebury", "--root", scenes, "-o", tmp_path / "out", *words)
-    assert (done.code, "give --direct-ft FILE" in done.err) == (2, True)

@@ -1,7 +1,4 @@
-"""What a dataset is to an evaluation: photos, and what is known beside them.
-
-A case's photos at the working size, with their cameras.
-"""
+"""What a dataset is to an evaluation: photos, what is known beside them, and both at the working size."""
 
 from __future__ import annotations
 
@@ -17,6 +14,8 @@ from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.image import MAX_SIDE, Photo, load_photo, resize_photo
+
+SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,13 +62,9 @@ class EvalDataset(Protocol):
         """All inputs, in an order that depends on names alone.
 
         Raises:
-            InputError: folders that are not this dataset's; says what was expected where.
+            InputError: folders that are not this dataset's; the message tells what was expected where.
         """
         ...
-
-
-SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
-LENS_SOURCE = "dataset"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,24 +87,12 @@ class LoadedCase:
     seconds: tuple[LoadedView, ...]
     lacks: tuple[str, ...] = ()  # why second photos of the case are not among them
 
-    @property
-    def cells(self) -> int:
-        """Of a view of the photo's size, see `dense_cells`."""
-        return dense_cells(self.photo.width, self.photo.height)
-
-
-def dense_cells(width: int, height: int) -> int:
-    """Cells of 2×2 pixels in a picture whose sides are made even: the paper's dense count."""
-    return (width + 1) // 2 * ((height + 1) // 2)
-
 
 def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
-    """Read the photos of a case.
+    """Read the photos of a case and bring them, and their cameras, to `working_size`.
 
-    Photos are brought to `working_size`, as everywhere, and cameras with them. The last row or column of a second
-    photo with an odd side is cut off: views have even sides, and there are no true pixels to add.
-
-    A second photo that cannot be used is left out: the others are as true without it.
+    The last row or column of a second photo with an odd side is cut off: views have even sides, and there are no true
+    pixels to add. A second photo that cannot be used is left out: the others are as true without it.
 
     Raises:
         InputError: a file that is missing or no image, or one of another shape than its camera; of second photos,
@@ -119,14 +102,40 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
         raise InputError(case.problem)
     full = load_photo(case.photo)
     if case.camera is not None:
-        check_shape(case.photo, full, case.camera)
+        _check_shape(case.photo, full, case.camera)
         focal = case.camera.resized(full.width, full.height).focal[0]
-        full = dataclasses.replace(full, focal_px=focal, focal_source=LENS_SOURCE)
+        full = dataclasses.replace(full, focal_px=focal, focal_source="dataset")
     photo = resize_photo(full, max_side)
     camera = photo.camera if case.camera is None else case.camera.resized(photo.width, photo.height)
-    seconds, lacks = _load_views(case, max_side)
+    seconds, lacks = [], []
+    for view in case.seconds:
+        try:
+            seconds.append(_load_view(view, max_side))
+        except InputError as error:
+            lacks.append(str(error))
+    if lacks and not seconds:
+        raise InputError(lacks[0])
     camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
     return LoadedCase(case, full, photo, camera, tuple(seconds), tuple(lacks))
+
+
+def _load_view(view: SecondView, max_side: int) -> LoadedView:
+    stored = load_photo(view.photo)
+    _check_shape(view.photo, stored, view.camera)
+    photo = resize_photo(stored, max_side)
+    camera = view.camera.resized(photo.width, photo.height)
+    width, height = (max(1, side - side % 2) for side in (photo.width, photo.height))
+    rgb = photo.rgb[:height, :width].contiguous()
+    return LoadedView(view.name, rgb, dataclasses.replace(camera, width=width, height=height))
+
+
+def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:
+    """InputError unless the photo has the shape that its camera was calibrated for."""
+    if abs(photo.width * camera.height / (photo.height * camera.width) - 1) > SHAPE_TOLERANCE:
+        raise InputError(
+            f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
+            f"{camera.width}×{camera.height}: the photo was cropped or turned, unpack it again"
+        )
 
 
 def known_depth(case: Case) -> DepthMap:
@@ -148,35 +157,3 @@ def known_depth(case: Case) -> DepthMap:
     if not bool((depth > 0).any()):
         raise InputError(f"{case.name}: not one of its {len(points.z)} points lies in the photo")
     return DepthMap(depth, depth > 0, camera.K, None, "depth", case.photo)
-
-
-def check_shape(path: Path, photo: Photo, camera: Camera) -> None:
-    """InputError unless the photo has the shape that its camera was calibrated for."""
-    if abs(photo.width * camera.height / (photo.height * camera.width) - 1) > SHAPE_TOLERANCE:
-        raise InputError(
-            f"{path}: {photo.width}×{photo.height} pixels upright, but its calibration is for "
-            f"{camera.width}×{camera.height}: the photo was cropped or turned, unpack it again"
-        )
-
-
-def _load_views(case: Case, max_side: int) -> tuple[list[LoadedView], list[str]]:
-    """The second photos, and what is wrong with those that cannot be used; InputError where that is all."""
-    seconds, lacks = [], []
-    for view in case.seconds:
-        try:
-            seconds.append(_load_view(view.name, view.photo, view.camera, max_side))
-        except InputError as error:
-            lacks.append(str(error))
-    if lacks and not seconds:
-        raise InputError(lacks[0])
-    return seconds, lacks
-
-
-def _load_view(name: str, path: Path, camera: Camera, max_side: int) -> LoadedView:
-    stored = load_photo(path)
-    check_shape(path, stored, camera)
-    photo = resize_photo(stored, max_side)
-    camera = camera.resized(photo.width, photo.height)
-    width, height = (max(1, side - side % 2) for side in (photo.width, photo.height))
-    rgb = photo.rgb[:height, :width].contiguous()
-    return LoadedView(name, rgb, dataclasses.replace(camera, width=width, height=height))

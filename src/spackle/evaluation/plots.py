@@ -9,7 +9,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spackle.errors import InputError
@@ -56,12 +56,17 @@ SCENE_FIGURES = {  # titles of the plot and of its axis
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """A drawing with its words."""
+    """A drawing below its title."""
 
     title: str
-    alt: str
+    series: Sequence[Series]
     svg: bytes
     note: str = ""
+
+    @property
+    def alt(self) -> str:
+        """For those who do not see it."""
+        return f"{self.title}. {', '.join(one.title for one in self.series)}"
 
     @property
     def address(self) -> str:
@@ -80,14 +85,9 @@ class Series:
     line: str = ""  # "", "-" or "--"
 
 
-def has_matplotlib() -> bool:
-    """Whether matplotlib is installed: it comes with the extra `eval`."""
-    return importlib.util.find_spec("matplotlib") is not None
-
-
 def check_matplotlib(option: str) -> None:
     """InputError where matplotlib is not installed."""
-    if not has_matplotlib():
+    if importlib.util.find_spec("matplotlib") is None:
         raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
 
 
@@ -132,15 +132,16 @@ def plots_of(run: Run) -> list[Plot]:
 
 def holes_plot(run: Run) -> Plot | None:
     """HAR against disparity, before and after, and the paper's."""
-    moves = sorted(map(float, run.config["disparities"]))
+
+    def known(found: Iterable[tuple[float, float | None]]) -> list[tuple[float, float]]:
+        return [(move, value) for move, value in found if value is not None]
 
     def means(figure: str, method: str) -> list[tuple[float, float]]:
-        found = [(move, run.mean(figure, method, f"{move:g}").value) for move in moves]
-        return [(move, value) for move, value in found if value is not None]
+        moves = sorted(map(float, run.config["disparities"]))
+        return known((move, run.mean(figure, method, f"{move:g}").value) for move in moves)
 
     def papers(place: int) -> list[tuple[float, float]]:
-        found = [(move, paper.at(paper.HOLES.get(run.title), move)[place]) for move in paper.DISPARITIES]
-        return [(move, value) for move, value in found if value is not None]
+        return known((move, paper.at(paper.HOLES.get(run.title), move)[place]) for move in paper.DISPARITIES)
 
     series = [Series(f"before: {run.base} alone", "base", means("har_before", run.methods[0]), line="--")]
     filling = [method for method in run.methods if method in FILLING]
@@ -164,7 +165,7 @@ def holes_plot(run: Run) -> Plot | None:
         axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
 
     svg = draw(series, "disparity of the view", "HAR, share of the pixels", finish)
-    return _plot("Hole Area Ratio against disparity", series, svg)
+    return Plot("Hole Area Ratio against disparity", series, svg)
 
 
 def overhead_plot(run: Run) -> Plot | None:
@@ -193,7 +194,7 @@ def overhead_plot(run: Run) -> Plot | None:
         axes.set_ylim(bottom=0)
 
     svg = draw(series, "hole before, % of the pixels", "added Gaussians, % of the base's", finish)
-    return _plot("Added Gaussians against hole size", series, svg, note)
+    return Plot("Added Gaussians against hole size", series, svg, note)
 
 
 def _overheads(run: Run, method: str) -> Iterator[tuple[float, float]]:
@@ -229,17 +230,13 @@ def scenes_plot(run: Run, figure: str) -> Plot | None:
     title, axis = SCENE_FIGURES[figure]
     svg = draw(series, axis, "", finish, HEIGHT / 2 + ROW * len(names))
     some = f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
-    return _plot(title, series, svg, f"In the order of {METHODS[leader].title}, best first.{some}")
+    return Plot(title, series, svg, f"In the order of {METHODS[leader].title}, best first.{some}")
 
 
 def _short(name: str) -> str:
     """A name that fits beside its row: names differ at their ends as often as at their beginnings."""
     name, half = UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", name), LETTERS // 2
     return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"
-
-
-def _plot(title: str, series: Sequence[Series], svg: bytes, note: str = "") -> Plot:
-    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", svg, note)
 
 
 def evenly(count: int, most: int) -> list[int]:

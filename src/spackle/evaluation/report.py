@@ -85,6 +85,9 @@ def make_report(sources: Sequence[Source], bench: Mapping[str, Any] | None = Non
         tables=[_table(table) for table in make_tables([source.run for source in sources])],
         bench={key: value for key, value in (bench or {}).items() if key != "images"},
         best=BEST,
+        most=MOST,
+        least=LEAST,
+        side=SIDE,
         not_run=NOT_RUN,
         paper=PAPER_ROW.format(""),
         columns=lambda rows: dict.fromkeys(key for row in rows for key in row),
@@ -127,37 +130,24 @@ def find_bench(folders: Sequence[Path]) -> dict[str, Any] | None:
 
 
 def _parts(sources: Sequence[Source]) -> list[dict[str, Any]]:
-    """What the page says of each evaluation."""
+    """What the page has of each evaluation."""
     count = max(LEAST, MOST // len(sources))
     rankings = [rank(source.run) for source in sources]
     picked = [_pick(source, ranking, count) for source, ranking in zip(sources, rankings, strict=True)]
     fits = iter(fitting([pictures for cases in picked for _, _, pictures in cases]))
-    parts = []
-    for source, ranking, cases in zip(sources, rankings, picked, strict=True):
-        run = source.run
-        parts.append({
-            "name": f"{run.title}, {'near' if run.near else 'large'} views, base {run.base}",
-            "about": _about(run),
-            "findings": findings(run),
-            "plots": plots_of(run),
-            "pictured": _pictured(run, ranking, len(cases)),
-            "cases": [_case(run, record, place, next(fits)) for record, place, _ in cases],
-            "setup": dict(run.config) | {"versions": source.versions, "machine": source.machine},
-            "problems": [f"{record.name}: {record.problem}" for record in run.records if record.problem is not None],
-            "remarks": [f"{record.name}: {'; '.join(record.remarks)}" for record in run.records if record.remarks],
-        })  # fmt: skip
-    return parts
-
-
-def _about(run: Run) -> str:
-    wanted = paper.IMAGES.get(run.title)
-    beside = f" (the paper has {wanted})" if wanted else ""
-    rows = "; ".join(method_name(run, method) for method in run.methods)
-    return f"{_images(run)}{beside}. Base: {run.config['base']['says']}. Methods: {rows}."
-
-
-def _images(run: Run) -> str:
-    return f"{len(run.measured)} image{'' if len(run.measured) == 1 else 's'}"
+    return [
+        {
+            "run": source.run,
+            "paper_images": paper.IMAGES.get(source.run.title),
+            "methods": [method_name(source.run, method) for method in source.run.methods],
+            "findings": findings(source.run),
+            "plots": plots_of(source.run),
+            "ranking": ranking,
+            "cases": [_case(source.run, record, place, next(fits)) for record, place, _ in cases],
+            "setup": dict(source.run.config) | {"versions": source.versions, "machine": source.machine},
+        }
+        for source, ranking, cases in zip(sources, rankings, picked, strict=True)
+    ]
 
 
 def findings(run: Run) -> list[str]:
@@ -225,25 +215,11 @@ def _pick(source: Source, ranking: Ranking | None, count: int) -> list[Picked]:
     return cases
 
 
-def _pictured(run: Run, ranking: Ranking | None, count: int) -> str:
-    """What is pictured, and what is not."""
-    if not count:
-        return "No pictures are left."
-    order = f", from the worst to the best by {ranking.says}" if ranking and count > 1 else ""
-    terms = f" Pictures of {run.title}: {run.config['terms']}." if run.config.get("terms") else ""
-    return (
-        f"{count} of {_images(run)}{order}; of each the view with the largest hole. Press and drag on a "
-        f"picture, or use the arrow keys. A page pictures up to {MOST} images, or {LEAST} of each evaluation where "
-        f"there are more than {MOST // LEAST}, up to {SIDE} pixels wide or high, smaller where they are many.{terms}"
-    )
-
-
 def _case(run: Run, record: Record, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     """An image: its pictures one over the other, and the figures of the view that they show."""
     shown = record.facts["shown"]
     rows = [row for row in record.rows if (row.setting, row.view) == (shown["setting"], shown["view"])]
     hole = next((row.figures.get("har_before") for row in rows), None)
-    setting = "near view" if run.near else f"disparity {shown['setting']}"
     names = list(pictures)
     left = "base" if "base" in pictures and len(names) > 1 else names[0]
     width, height = size_of(pictures[left])
@@ -257,7 +233,8 @@ def _case(run: Run, record: Record, place: str, pictures: Mapping[str, bytes]) -
     return {
         "name": record.name,
         "place": place,
-        "about": f"{setting}, {shown['view']}" + ("" if hole is None else f"; the base leaves {_percent(hole)} open"),
+        "shown": shown,
+        "hole": None if hole is None else _percent(hole),
         "titles": {name: column_title(run, name) for name in names},
         "pictures": {name: f"data:image/webp;base64,{base64.b64encode(d).decode()}" for name, d in pictures.items()},
         "left": left,

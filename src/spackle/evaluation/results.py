@@ -1,7 +1,4 @@
-"""What an evaluation found: a row for each view and method, and means over them.
-
-A folder of figures: one file for each finished part, so that a killed run goes on where it stopped.
-"""
+"""What an evaluation found, and its folder: a file for each finished image, so that a killed run goes on."""
 
 from __future__ import annotations
 
@@ -17,6 +14,16 @@ from spackle.dataset.shards import differences
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.output_folder import make_folder, remove_half_written
+
+IMAGES = "images"
+CONFIG, RESULTS, TIMES = "config.json", "results.json", "times.json"
+MARKDOWN, LATEX, WORST, BEST = "tables.md", "tables.tex", "worst.png", "best.png"
+FORMAT = 1
+KINDS = {  # of a configuration: the command, and what its folder holds
+    None: ("evaluate", "an evaluation"),
+    "bench": ("bench", "a benchmark"),
+    "suite": ("bench --suite", "a suite"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,13 +46,9 @@ class Record:
     problem: str | None = None
     remarks: tuple[str, ...] = ()  # what went wrong beside that, such as a metric that failed
 
-    def plain(self) -> dict[str, Any]:
-        """Ready for JSON."""
-        return dataclasses.asdict(self)
-
     @staticmethod
     def of(content: Mapping[str, Any]) -> Record:
-        """What `plain` gave; KeyError or TypeError for anything else."""
+        """What `dataclasses.asdict` gave; KeyError or TypeError for anything else."""
         rows = tuple(Row(**row) for row in content["rows"])
         return Record(**{**content, "rows": rows, "remarks": tuple(content["remarks"])})
 
@@ -87,59 +90,32 @@ class Run:
         """The images that gave figures."""
         return [record for record in self.records if record.problem is None]
 
-    def mean(self, figure: str, method: str, setting: str) -> Mean:
-        """Over all views of all images: each novel view counts once, as in the paper's "per novel view"."""
-        values = [
-            row.figures[figure]
-            for record in self.measured
-            for row in record.rows
-            if row.method == method and row.setting == setting and figure in row.figures
-        ]
-        found = [value for value in values if value is not None]
-        value = math.fsum(found) / len(found) if found else None
-        return Mean(value, len(found), len(values) - len(found))
-
     @property
     def base_gaussians(self) -> float | None:
         """Mean over the images; the same for all where the base is SHARP."""
         counts = [record.facts["base_gaussians"] for record in self.measured]
         return math.fsum(counts) / len(counts) if counts else None
 
+    def mean(self, figure: str, method: str, setting: str) -> Mean:
+        """Over all views of all images: each novel view counts once, as in the paper's "per novel view"."""
+        rows = [row for record in self.measured for row in record.rows]
+        values = [r.figures[figure] for r in rows if (r.method, r.setting) == (method, setting) and figure in r.figures]
+        found = [value for value in values if value is not None]
+        return Mean(math.fsum(found) / len(found) if found else None, len(found), len(values) - len(found))
+
     def plain(self) -> dict[str, Any]:
         """Ready for JSON: everything, and the means beside it."""
-        settings = list(dict.fromkeys(row.setting for record in self.measured for row in record.rows))
-        names = list(dict.fromkeys(name for r in self.measured for row in r.rows for name in row.figures))
+        rows = [row for record in self.measured for row in record.rows]
         means = [
             {"setting": setting, "method": method, "figure": figure} | dataclasses.asdict(mean)
-            for setting in settings
+            for setting in dict.fromkeys(row.setting for row in rows)
             for method in self.methods
-            for figure in names
+            for figure in dict.fromkeys(name for row in rows for name in row.figures)
             if (mean := self.mean(figure, method, setting)).count + mean.bad
         ]
         problems = {record.name: record.problem for record in self.records if record.problem is not None}
-        images = [record.plain() for record in self.records]
+        images = [dataclasses.asdict(record) for record in self.records]
         return {"config": dict(self.config), "problems": problems, "means": means, "images": images}
-
-    @staticmethod
-    def of(content: Any, where: str) -> Run:
-        """What `plain` gave; InputError, naming `where`, for anything else."""
-        try:
-            run = Run(dict(content["config"]), tuple(Record.of(image) for image in content["images"]))
-            _ = (run.title, run.near, run.methods, run.base, run.base_gaussians)  # all are there
-            return run
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"{where}: not the results of `spackle evaluate`: run it again") from error
-
-
-IMAGES = "images"
-CONFIG, RESULTS, TIMES = "config.json", "results.json", "times.json"
-MARKDOWN, LATEX, WORST, BEST = "tables.md", "tables.tex", "worst.png", "best.png"
-FORMAT = 1
-KINDS = {  # of a configuration: the command, and what its folder holds
-    None: ("evaluate", "an evaluation"),
-    "bench": ("bench", "a benchmark"),
-    "suite": ("bench --suite", "a suite"),
-}
 
 
 def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
@@ -147,11 +123,11 @@ def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
 
     Args:
         output: the folder.
-        config: its "kind" says whose results there are, see `KINDS`.
+        config: its "kind" tells whose results there are, see `KINDS`.
         parts: the folder in it for what is finished.
 
     Raises:
-        InputError: it holds another one, and says where they differ.
+        InputError: it holds another one; the message tells where they differ.
     """
     make_folder(output / parts)
     remove_half_written(output, output / parts)
@@ -174,31 +150,32 @@ def stem_of(index: int, name: str) -> str:
 
 def save_record(record: Record, photo: str, seconds: float, path: Path) -> None:
     """Write what became of an image, with the digest of its files."""
-    write_json({"inputs": photo, "seconds": seconds, "record": record.plain()}, path)
+    write_json({"inputs": photo, "seconds": seconds, "record": dataclasses.asdict(record)}, path)
 
 
 def load_record(path: Path, photo: str) -> tuple[Record, float] | None:
     """What an earlier run found, and how long it took; None where it is not there, or about other files."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["inputs"] != photo:
-            return None
-        return Record.of(content["record"]), float(content["seconds"])
+        found = Record.of(content["record"]), float(content["seconds"])
+        return found if content["inputs"] == photo else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
 def load_run(folder: Path) -> Run:
-    """The finished results in a folder.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The finished results in a folder; InputError where there are none."""
     path = folder / RESULTS
     if not path.is_file():
         state = "not finished: run its command again" if (folder / CONFIG).is_file() else "no results of an evaluation"
         raise InputError(f"{folder}: {state}: {RESULTS} is missing")
-    return Run.of(read_json(path), str(path))
+    content = read_json(path)
+    try:
+        run = Run(dict(content["config"]), tuple(Record.of(image) for image in content["images"]))
+        _ = (run.title, run.near, run.methods, run.base, run.base_gaussians)  # all are there
+        return run
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: not the results of `spackle evaluate`: run it again") from error
 
 
 def read_json(path: Path) -> Any:

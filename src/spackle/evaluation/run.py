@@ -15,39 +15,14 @@ from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
 from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError
+from spackle.evaluation import report, results
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import NEAR, Wanted, large_views, measure
-from spackle.evaluation.report import (
-    BENCH,
-    REPORT,
-    find_bench,
-    load_source,
-    picture_file,
-    save_picture,
-    source_of,
-    write_report,
-)
-from spackle.evaluation.results import (
-    BEST,
-    IMAGES,
-    LATEX,
-    MARKDOWN,
-    RESULTS,
-    TIMES,
-    WORST,
-    Record,
-    Run,
-    begin,
-    load_record,
-    save_record,
-    stem_of,
-    write_json,
-    write_text,
-)
+from spackle.evaluation.results import Record, Run, begin, load_record, save_record, write_json, write_text
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
@@ -59,7 +34,7 @@ from spackle.progress import Reporter
 from spackle.residual import hole_mask
 from spackle.signals import asked_to_stop
 
-TABLES = (MARKDOWN, LATEX)
+TABLES = (results.MARKDOWN, results.LATEX)
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
@@ -82,7 +57,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         check_matplotlib("--html")
     evaluation = open_evaluation(options)
     _log_missing(evaluation, reporter)
-    files = (RESULTS, TIMES, WORST, BEST, *TABLES, *([REPORT] if html else []))
+    files = (results.RESULTS, results.TIMES, results.WORST, results.BEST, *TABLES, *([report.REPORT] if html else []))
     with results_folder(output, files), alone_in(output, "evaluation"):
         begin(output, evaluation.config)
         records = _do_images(evaluation, output, reporter)
@@ -124,7 +99,7 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
 
 
 def _image_file(output: Path, index: int, case: Case, suffix: str) -> Path:
-    return output / IMAGES / (stem_of(index, case.name) + suffix)
+    return output / results.IMAGES / (results.stem_of(index, case.name) + suffix)
 
 
 def _do_image(
@@ -144,7 +119,7 @@ def _do_image(
         reporter.say(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
     for name, picture in pictures.items():
-        save_picture(picture, picture_file(output, index, case.name, name))
+        report.save_picture(picture, report.picture_file(output, index, case.name, name))
     save_png(strip(pictures), _image_file(output, index, case, ".png"))
     save_record(record, inputs, seconds, _image_file(output, index, case, ".json"))
     reporter.detail(f"  {case.name}: {seconds:.1f} s")
@@ -164,12 +139,14 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[Record, dict[str, Tenso
     loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, evaluation.base.takes_depth) if options.near else None
-    try:
-        wanted = (
-            _near_views(loaded, prediction, alignment) if alignment else large_views(prediction, options.disparities)
-        )
-    except ValueError as error:
-        raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
+    if alignment:
+        at, scale = (loaded.camera, prediction.camera), alignment.scale
+        wanted = [Wanted(NEAR, view.name, to_base(view.camera, *at, scale), view.rgb) for view in loaded.seconds]
+    else:
+        try:
+            wanted = large_views(prediction, options.disparities)
+        except ValueError as error:
+            raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
 
     def direct_ft() -> tuple[BasePrediction, float]:
         """The other base, and what its cameras' paths are to be multiplied by."""
@@ -179,8 +156,8 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[Record, dict[str, Tenso
             return other, 1.0
         return other, alignment.scale / _align(loaded, other, evaluation, False).scale
 
-    precision = options.base.precision
-    methods = {name: make_method(name, evaluation.network, direct_ft, precision) for name in options.methods}
+    more = evaluation.network, direct_ft, options.base.precision
+    methods = {name: make_method(name, *more) for name in options.methods}
     measured = measure(prediction, wanted, methods, evaluation.gauges, evaluation.renderer)
     facts: dict[str, Any] = {
         "width": loaded.photo.width,
@@ -202,14 +179,6 @@ def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluatio
     """The base's scale, by what it sees at the photo's own camera."""
     view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
     return align(loaded.case, view.depth, ~hole_mask(view.alpha), base_is_truth=is_truth)
-
-
-def _near_views(loaded: LoadedCase, prediction: BasePrediction, alignment: Alignment) -> list[Wanted]:
-    """The true second photos, and the base's world from their cameras."""
-    return [
-        Wanted(NEAR, view.name, to_base(view.camera, loaded.camera, prediction.camera, alignment.scale), view.rgb)
-        for view in loaded.seconds
-    ]
 
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:
@@ -244,16 +213,16 @@ def _finish(
     _write_tables([run], output)
     if ranking := rank(run):
         strips = {case.name: _image_file(output, k, case, ".png") for k, case in enumerate(evaluation.cases)}
-        for name, order in ((BEST, ranking.names), (WORST, ranking.names[::-1])):
+        for name, order in ((results.BEST, ranking.names), (results.WORST, ranking.names[::-1])):
             with atomic_path(output / name) as temporary:
                 sheet(run, ranking, order[:CASES], strips).save(temporary)
     seconds, machine = {record.name: spent for record, spent in found}, hardware(options.device)
     total = round(sum(seconds.values()), 3)
-    write_json({"hardware": machine, "total": total, "seconds": seconds}, output / TIMES)
+    write_json({"hardware": machine, "total": total, "seconds": seconds}, output / results.TIMES)
     if html:
-        write_report([source_of(run, output, versions(), machine)], find_bench([output]), output)
+        report.write_report([report.source_of(run, output, versions(), machine)], report.find_bench([output]), output)
     about: Mapping[str, Any] = {"versions": versions(), "definitions": definitions(options.wanted_metrics)}
-    write_json({**about, **run.plain()}, output / RESULTS)
+    write_json({**about, **run.plain()}, output / results.RESULTS)
     count, passed = len(run.measured), len(found) - len(run.measured)
     more = f", {passed} passed over" if passed else ""
     reporter.say(f"{run.title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")
@@ -262,8 +231,8 @@ def _finish(
 
 def _write_tables(runs: Sequence[Run], output: Path) -> None:
     tables = make_tables(runs)
-    write_text(to_markdown(tables), output / MARKDOWN)
-    write_text(to_latex(tables), output / LATEX)
+    write_text(to_markdown(tables), output / results.MARKDOWN)
+    write_text(to_latex(tables), output / results.LATEX)
 
 
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
@@ -283,14 +252,16 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     measured = list(folders)
     if html:
         check_matplotlib("--html")
-        measured = [f for f in folders if (f / RESULTS).exists() or not (f / BENCH).is_file()] or measured
-    sources = [load_source(folder) for folder in measured]
+        measured = [
+            f for f in folders if (f / results.RESULTS).exists() or not (f / report.BENCH).is_file()
+        ] or measured
+    sources = [report.load_source(folder) for folder in measured]
     runs = [source.run for source in sources]
     make_tables(runs)  # what does not go together is refused before anything is written
-    files = (*TABLES, *([REPORT] if html else []))
+    files = (*TABLES, *([report.REPORT] if html else []))
     with results_folder(output, files):
         _write_tables(runs, output)
         if html:
-            write_report(sources, find_bench(folders), output)
+            report.write_report(sources, report.find_bench(folders), output)
     names = ", ".join(f"{run.title} ({run.config['protocol']}, {run.base})" for run in runs)
     reporter.say(f"{names} -> {', '.join(str(output / name) for name in files)}")

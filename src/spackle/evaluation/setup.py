@@ -64,11 +64,6 @@ class EvaluateOptions:
         return tuple(name for name in METRICS if name in named)
 
     @property
-    def residual_file(self) -> Path | None:
-        """As `residual_file` has it."""
-        return residual_file(self.residual)
-
-    @property
     def device(self) -> torch.device:
         """Where networks run."""
         named = self.base.device
@@ -178,11 +173,10 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     dataset = get_dataset(options.dataset)
     cases = _limited(dataset.cases(options.root), options.limit)
     _check_cases(cases, options)
-    network = None if options.residual_file is None else load_residual(options.residual_file)
-    direct = None
+    weights, direct = residual_file(options.residual), None
+    network = None if weights is None else load_residual(weights)
     if options.direct_ft is not None:
-        path = _there(options.direct_ft, "--direct-ft")
-        direct = open_base(dataclasses.replace(options.base, checkpoint=path))
+        direct = open_base(dataclasses.replace(options.base, checkpoint=_there(options.direct_ft, "--direct-ft")))
     wanted, features = options.wanted_metrics, None
     if options.features is not None and "distance" in wanted:
         features = load_features("squeezenet", _there(options.features, "--features"))
@@ -221,7 +215,7 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
 
 
 def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case]) -> dict[str, Any]:
-    base, file = options.base, options.residual_file
+    base, file = options.base, residual_file(options.residual)
     residual = {
         "weights": "seeds" if file is None else "shipped" if options.residual is None else "given",
         "sha256": None if file is None else weights_digest(file),
