@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import importlib.util
 import sys
 from types import ModuleType
@@ -144,51 +143,40 @@ def test_a_scene_is_projected_once_for_a_camera(gpu: GsplatRenderer, monkeypatch
 
 def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match=r"sees no NVIDIA GPU.*--device cpu"):
+    with pytest.raises(InputError, match="--device cuda: PyTorch sees no NVIDIA GPU"):
         get_renderer("cuda")
     assert isinstance(get_renderer("auto"), CpuRenderer)
 
 
-def fake_package(monkeypatch: pytest.MonkeyPatch, kernels: object) -> None:
-    """A gsplat that can be imported, with or without its kernels."""
-    gsplat, cuda, backend = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
-    backend._C = kernels  # type: ignore[attr-defined]
-    gsplat.cuda, cuda._backend = cuda, backend  # type: ignore[attr-defined]
-    for module in (gsplat, cuda, backend):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+class BrokenBuild:
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        if name == "gsplat":
+            raise RuntimeError("Error building extension 'gsplat_cuda': ninja\nmany lines")
 
 
-def test_a_gsplat_without_kernels_is_told_so_and_auto_falls_back(
+def test_a_gsplat_that_cannot_be_used_is_told_in_a_line_and_auto_falls_back(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    fake_package(monkeypatch, None)
-    with pytest.raises(InputError, match=r"no kernels here.*CUDA toolkit"):
-        get_renderer("cuda")
-    assert isinstance(get_renderer("auto"), CpuRenderer)
-    assert "no kernels" in caplog.text
-    fake_package(monkeypatch, object())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+    def refused(says: str) -> None:
+        with pytest.raises(InputError, match=says) as caught:
+            get_renderer("cuda")
+        assert "\n" not in str(caught.value)
+        caplog.clear()
+        assert isinstance(get_renderer("auto"), CpuRenderer)
+        assert str(caught.value) in caplog.text
+
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    refused(r"spackle-nvs\[cuda\]")
+    gsplat, cuda, backend = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
+    backend._C, gsplat.cuda, cuda._backend = None, cuda, backend  # type: ignore[attr-defined]
+    for module in (gsplat, cuda, backend):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    refused("no kernels here")
+    backend._C = object()  # type: ignore[attr-defined]
     assert load_gsplat(torch.device("cuda")).__name__ == "gsplat"
     assert isinstance(get_renderer("auto"), GsplatRenderer)
-
-
-def test_a_missing_gsplat_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(InputError, match=r"spackle-nvs\[cuda\]"):
-        get_renderer("cuda")
-
-
-def test_a_failed_build_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-
-    class Broken:
-        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
-            if name == "gsplat":
-                raise RuntimeError("Error building extension 'gsplat_cuda': ninja\nmany lines")
-
-    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Broken(), *sys.meta_path])
-    with pytest.raises(InputError, match=r"cannot be built here: Error building.*ninja") as caught:
-        importlib.import_module("spackle.render").get_renderer("cuda")
-    assert "\n" not in str(caught.value)
+    monkeypatch.delitem(sys.modules, "gsplat")
+    monkeypatch.setattr(sys, "meta_path", [BrokenBuild(), *sys.meta_path])
+    refused("cannot be built here: Error building")
