@@ -1,6 +1,6 @@
-// Bundles the page into src/spackle/viewer/page: viewer.js, viewer.css, index.html and the licences.
+// Bundles the page's scripts into src/spackle/viewer/page: viewer.js and the licences. index.html and viewer.css lie there.
 import { createHash } from "node:crypto";
-import { copyFileSync, mkdirSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
+import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
@@ -42,7 +42,6 @@ function licences() {
   return [ours, ...packages].join(`\n\n${"-".repeat(80)}\n\n`) + "\n";
 }
 
-mkdirSync(OUT, { recursive: true });
 await build({
   entryPoints: ["src/main.js"],
   outfile: `${OUT}/viewer.js`,
@@ -56,4 +55,3 @@ await build({
   plugins: [compressWasm],
 });
 writeFileSync(`${OUT}/licenses.txt`, licences());
-for (const name of ["index.html", "viewer.css"]) copyFileSync(`src/${name}`, `${OUT}/${name}`);

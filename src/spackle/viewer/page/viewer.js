@@ -1,4 +1,4 @@
-/* built from web/ by "make viewer", sources 091c942c1c97aa01e60c81c965cb0978d65d6b84ba8a58dae8236742fc3fb3fe
+/* built from web/ by "make viewer", sources 3162b53f483e1ca7a1debf25e96d45bf6e729f59f765faf8a2dd617c65ade3bf
 
 viewer.js holds the page of Spackle (Apache-2.0, see LICENSE of the project) and these packages:
 
