@@ -11,12 +11,12 @@ The method follows its own optical flow; the true motion and the truth only judg
 from __future__ import annotations
 
 import argparse
+import collections
 import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +28,7 @@ from spackle.color import srgb_to_linear
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
+from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer
@@ -70,21 +71,24 @@ CLIPS = (
 
 def load_world(side: int) -> World:
     """Motorcycle's left photo, `side` pixels wide, completed so that it may be walked through; and the board."""
-    from skimage import data, transform
+    from skimage.transform import resize
 
-    left, _, disparity = data.stereo_motorcycle()
-    step = left.shape[1] / side
-    height = round(left.shape[0] / step)
-    rgb = torch.from_numpy(transform.resize(left, (height, side), anti_aliasing=True).astype(np.float32))
-    rows, columns = (((np.arange(n) + 0.5) * step).astype(int) for n in (height, side))
-    picked = disparity[rows][:, columns]
-    depth = np.where(np.isfinite(picked), 994.978 * 0.193001 / (picked + 31.086), 0).astype(np.float32)
-    camera = Camera.from_focal(994.978 / step, side, height)
-    depths = torch.from_numpy(depth)
-    still = lift(rgb, DepthMap(depths, depths > 0, None, None, "depth", Path("motorcycle")), camera).gaussians
+    pair = load_motorcycle()
+    step = pair.left.shape[1] / side
+    height = round(pair.left.shape[0] / step)
+    left = (255 * pair.left).round().byte().numpy()
+    rgb = torch.from_numpy(resize(left, (height, side), anti_aliasing=True)).float()
+    rows, columns = (((torch.arange(n) + 0.5) * step).long() for n in (height, side))
+    camera = Camera.from_focal(float(pair.left_camera.focal[0]) / step, side, height)
+    still = lift(rgb, depth_map(pair.depth.depth[rows][:, columns]), camera).gaussians
     around = [moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)]
     aux = Completer(still, camera, get_renderer()).complete_scene(around, exact=True)
     return World(Gaussians.cat([still, aux]), board(camera), camera)
+
+
+def depth_map(depth: Tensor) -> DepthMap:
+    """Of depth [H, W] in metres, 0 where it is not known."""
+    return DepthMap(depth, depth > 0, None, None, "depth", Path("clip"))
 
 
 def board(camera: Camera) -> Gaussians:
@@ -140,8 +144,7 @@ def play(
         taken = renderer.render(scene, camera)
         depth = said_depth(taken.depth, dice) if noisy else taken.depth
         own = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-        known = DepthMap(depth, depth > 0, None, None, "depth", Path(clip.name))
-        drawn = completer.add(taken.rgb, lift(taken.rgb, known, own))
+        drawn = completer.add(taken.rgb, lift(taken.rgb, depth_map(depth), own))
         pose = drawn.camera.world_to_camera @ camera.world_to_camera
         truth = dataclasses.replace(drawn.camera, world_to_camera=pose)
         yield drawn, Truth(truth, renderer.render(scene, truth))
@@ -157,48 +160,44 @@ def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
 
 
 class Sums:
-    """Means over the pixels of many frames."""
+    """Sums and counts of pixels over many frames."""
 
     def __init__(self) -> None:
-        self.sums: dict[str, float] = {}
-        self.counts: dict[str, int] = {}
+        self.sums: dict[str, Tensor] = collections.defaultdict(lambda: torch.zeros(2, dtype=torch.float64))
 
     def add(self, name: str, values: Tensor) -> None:
-        self.sums[name] = self.sums.get(name, 0.0) + float(values.double().sum())
-        self.counts[name] = self.counts.get(name, 0) + values.numel()
+        self.sums[name] += torch.tensor([float(values.double().sum()), values.numel()])
 
     def mean(self, name: str) -> float:
-        return self.sums[name] / max(1, self.counts[name])
-
-    def psnr(self, name: str) -> float:
-        return -10 * math.log10(self.mean(name))
+        total, count = map(float, self.sums[name])
+        return total / max(1.0, count)
 
 
 def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool, folder: Path | None) -> Sums:
     """Both ways through the same clip, side by side."""
-    sums, past = Sums(), None
-    steadied = play(world, clip, frames, disparity, noisy, steady=noisy)
+    sums = Sums()
+    past: dict[str, tuple[Drawn, Truth]] = {}
+    ways: list[Iterator[tuple[Drawn, Truth]]] = [play(world, clip, frames, disparity, noisy, steady=noisy)]
     # Where the depth is exact there is nothing to hold still, so the same run has both.
-    raw = play(world, clip, frames, disparity, noisy, steady=False) if noisy else None
-    pairs = ((one, one) for one in steadied) if raw is None else zip(steadied, raw, strict=True)
-    for index, ((drawn, truth), (lone, lone_truth)) in enumerate(pairs):
-        sums.add("holes", drawn.hole.float())
-        for name, view, hole, exact in (
-            ("carried", drawn.view.rgb, drawn.hole, truth),
-            ("alone", lone.alone.rgb, lone.hole, lone_truth),
-        ):
-            sums.add(f"{name} off", (view - exact.view.rgb)[hole & (exact.view.alpha > 0.99)].square())
-        if past is not None:
-            for name, now, was in (("carried", (drawn, truth), past[0]), ("alone", (lone, lone_truth), past[1])):
-                _compare(sums, name, now, was)
+    ways += [play(world, clip, frames, disparity, noisy, steady=False)] if noisy else []
+    for index, runs in enumerate(zip(*ways, strict=True)):
+        now = {"carried": runs[0], "alone": runs[-1]}
+        sums.add("holes", runs[0][0].hole.float())
+        for name, (drawn, truth) in now.items():
+            view = drawn.alone if name == "alone" else drawn.view
+            known = drawn.hole & (truth.view.alpha > 0.99)
+            sums.add(f"{name} off", (view.rgb - truth.view.rgb)[known].square())
+            if past:
+                compare(sums, name, now[name], past[name])
         if folder is not None:
-            rows = [truth.view.rgb, lone.before.rgb, lone.alone.rgb, drawn.view.rgb]
-            save_png(torch.cat(rows, dim=1), folder / f"{clip.name.replace(' ', '_')}_{int(noisy)}_{index:03d}.png")
-        past = ((drawn, truth), (lone, lone_truth))
+            (drawn, truth), (lone, _) = now.values()
+            pictures = [truth.view.rgb, lone.before.rgb, lone.alone.rgb, drawn.view.rgb]
+            save_png(torch.cat(pictures, dim=1), folder / f"{clip.name.replace(' ', '_')}_{int(noisy)}_{index:03d}.png")
+        past = now
     return sums
 
 
-def _compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, Truth]) -> None:
+def compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, Truth]) -> None:
     """Flicker of a view's holes, and of what is seen in it."""
     (drawn, truth), (earlier, before) = now, was
     flow, same = true_flow(truth, before)
@@ -207,8 +206,7 @@ def _compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, 
     for kind, chosen in (("hole", drawn.hole & (held > 0.999)), ("seen", ~drawn.hole & (held < 0.001))):
         value = flicker(view.rgb, view_before.rgb, flow, chosen & same)
         if value is not None:
-            count = int((chosen & same).sum())
-            sums.add(f"{name} {kind}", torch.full((count,), 255 * value))
+            sums.add(f"{name} {kind}", torch.full((int((chosen & same).sum()),), 255 * value))
 
 
 def main() -> None:
@@ -229,7 +227,7 @@ def main() -> None:
             sums = judge(world, clip, options.frames, options.disparity, noisy, options.save)
             alone, carried = sums.mean("alone hole"), sums.mean("carried hole")
             figures = (sums.mean("carried seen"), alone, carried, carried / alone)
-            figures += (sums.psnr("alone off"), sums.psnr("carried off"))
+            figures += tuple(-10 * math.log10(sums.mean(f"{name} off")) for name in ("alone", "carried"))
             cells = ["noisy" if noisy else "exact", f"{sums.mean('holes'):.1%}", *(f"{value:.2f}" for value in figures)]
             print(f"{clip.name:18}", *(f"{cell:>10}" for cell in cells), flush=True)
 

@@ -42,7 +42,7 @@ class Clock:
         self.last = now
 
 
-def run_original(clock: Clock, weights: Path, photo: Path, output: Path, checkout: str) -> None:
+def run_original(clock: Clock, weights: Path, photo: Path, output: Path, *, checkout: str) -> None:
     """What the original's `sharp predict` does, with a clock in it."""
     sys.path.insert(0, f"{checkout}/src")
     import torch

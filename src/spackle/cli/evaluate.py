@@ -143,8 +143,8 @@ def bench(
         int | None, typer.Option(help="In the suite: so many of SHARP's windows at once, 1 to 35.")
     ] = None,
     side: Annotated[
-        int | None, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
-    ] = None,
+        int, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
+    ] = 1536,
     disparity: Annotated[
         str, typer.Option(metavar="A,B,…", help="Of the timed views, with commas or spaces; the paper's S1, S2, S3.")
     ] = "0.3,0.4,0.5",

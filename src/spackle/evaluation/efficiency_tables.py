@@ -47,12 +47,11 @@ def _overhead_table(found: Efficiency) -> Table:
     average = [cell for i in indices for cell in _added(*((None, None) if i is None else averages[i]))]
     lines.append(Line(("Average", PAPER, *average), rule=True))
     lines.append(Line(("Runtime efficiency", *[EMPTY] * (1 + 2 * len(settings))), rule=True))
-    rows_of_times: tuple[tuple[str, str, Text, Text, Sequence[float]], ...] = (
+    for name, figure, our_text, their_text, values in (
         ("Median time of the base (ms)", "base_ms", _ms, _ms, published.MEDIAN_BASE_MS),
         ("Median time with Spackle (ms)", "spackle_ms", _ms, _ms, published.MEDIAN_SPACKLE_MS),
         ("Median time overhead", "overhead", _share, _percent, published.MEDIAN_OVERHEAD_PERCENT),
-    )
-    for name, figure, our_text, their_text, values in rows_of_times:
+    ):
         ours = [cell for s in settings for cell in (our_text(found.spread(s, figure).median), EMPTY)]
         papers = [cell for i in indices for cell in (EMPTY if i is None else their_text(values[i]), EMPTY)]
         lines += [Line((name, _base(found), *ours)), Line((EMPTY, PAPER, *papers))]
@@ -141,10 +140,9 @@ def _stages_table(found: Efficiency) -> Table:
 
 def _parameters_table(parameters: Parameters) -> Table:
     """How large the networks are."""
-    both = parameters.base + parameters.residual
     rows = (
         ("SHARP", parameters.base / 1e6, published.PARAMETERS_M),
-        ("SHARP and Spackle", both / 1e6, published.MERGED_PARAMETERS_M),
+        ("SHARP and Spackle", (parameters.base + parameters.residual) / 1e6, published.MERGED_PARAMETERS_M),
         ("Spackle alone", parameters.residual / 1e6, published.ADDED_PARAMETERS_M),
         ("Spackle, % of SHARP", 100 * parameters.share, published.ADDED_PARAMETERS_PERCENT),
     )

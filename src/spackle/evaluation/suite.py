@@ -58,15 +58,15 @@ class SuiteOptions:
     base: BaseSettings = SHARP  # its device is that of everything but the renderer's section; auto: the processor
     sharp: bool = False  # its section was asked for
     residual: Path | None = None  # weights; None: the seeds alone
-    side: int | None = None  # pixels along the made scenes; smaller than `SIDE` makes all small, for trying it out
+    side: int = SIDE  # pixels along the made scenes; a smaller one makes all small, for trying it out
 
     def check(self) -> None:
         """InputError for an option that cannot be used."""
         for name in self.only:
             check_name("--only", name, tuple(TITLES))
         check_runs(self.runs, self.base_runs)
-        if not (SIDES[0] <= self.pixels <= SIDES[1] and self.pixels % 2 == 0):
-            raise InputError(f"--side must be an even number between {SIDES[0]} and {SIDES[1]}, got {self.pixels}")
+        if not (SIDES[0] <= self.side <= SIDES[1] and self.side % 2 == 0):
+            raise InputError(f"--side must be an even number between {SIDES[0]} and {SIDES[1]}, got {self.side}")
         base = self.base
         get_renderer("cpu" if base.device == "auto" else base.device)
         if base.named != "sharp":
@@ -76,11 +76,6 @@ class SuiteOptions:
                 raise InputError(f"{option} {file}: no such file: check the name")
         if self.sharp:
             base.check()
-
-    @property
-    def pixels(self) -> int:
-        """Along the made scenes."""
-        return SIDE if self.side is None else self.side
 
     @property
     def device(self) -> torch.device:
@@ -122,7 +117,9 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
                         reporter.say(f"{name}: not run: {error}")
                         continue
                     write_part(path, inputs, without_nan(dataclasses.asdict(found[name])))
-        write_text(_head(config) + to_markdown(suite_tables(found, not_run)), output / MARKDOWN)
+        about = ", ".join(f"{key} {value}" for key, value in {**config["hardware"], **config["versions"]}.items())
+        head = f"# Speed\n\n{about}; commit {config['commit']}; {config['runs']} runs.\n\n"
+        write_text(head + to_markdown(suite_tables(found, not_run)), output / MARKDOWN)
         content = {"config": config, "not_run": not_run, "sections": {name: _plain(found, name) for name in found}}
         write_json(without_nan(content), output / RESULTS)
     reporter.say(f"{len(found)} of {len(TITLES)} sections -> {output / MARKDOWN}")
@@ -149,7 +146,7 @@ def _run(name: str, options: SuiteOptions, reporter: Reporter) -> Section:
 
 
 def _section(name: str, options: SuiteOptions) -> Section:
-    runs, side, device = options.runs, options.pixels, options.device
+    runs, side, device = options.runs, options.side, options.device
     if name == LIMITS:
         return stages.limits_section(runs, device, min(1.0, side / SIDE))
     if name == "renderer":
@@ -177,7 +174,7 @@ def _configuration(options: SuiteOptions) -> dict[str, Any]:
     """Everything that decides the figures of all sections, ready for JSON; nothing of where files lie."""
     machine = {"commit": commit(), "hardware": hardware(options.device), "versions": versions()}
     weights = options.residual and weights_digest(options.residual)
-    return {"kind": "suite", **machine, "runs": options.runs, "side": options.pixels, "residual": weights}
+    return {"kind": "suite", **machine, "runs": options.runs, "side": options.side, "residual": weights}
 
 
 def commit() -> str:
@@ -191,18 +188,12 @@ def commit() -> str:
         return "unknown"
 
 
-def _head(config: Mapping[str, Any]) -> str:
-    """The machine on which the tables were measured."""
-    machine = ", ".join(f"{key} {value}" for key, value in config["hardware"].items())
-    version = ", ".join(f"{key} {value}" for key, value in config["versions"].items())
-    return f"# Speed\n\n{machine}; commit {config['commit']}; {version}; {config['runs']} runs.\n\n"
-
-
 def suite_tables(found: Mapping[str, Section], not_run: Mapping[str, str]) -> list[Table]:
     """A table for each section that was run, and a line for each that was not, with the reason."""
     tables = []
     for name, one in found.items():
-        facts = ", ".join(f"{key} {_fact(value)}" for key, value in one.facts.items() if value is not None)
+        items = {k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in one.facts.items() if v is not None}
+        facts = ", ".join(f"{key} {text}" for key, text in items.items())
         lines = tuple(Line(_cells(row, limit_ms(row, found.get(LIMITS)))) for row in one.rows)
         tables.append(Table(name, f"{TITLES[name]}. {facts}.", COLUMNS, (("", len(COLUMNS)),), lines))
     if not_run:
@@ -240,7 +231,3 @@ def _number(value: float) -> str:
     if size >= 100 or value == 0:
         return f"{value:,.0f}"
     return f"{value:.1f}" if size >= 10 else f"{value:.2f}" if size >= 0.1 else f"{value:.2g}"
-
-
-def _fact(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)

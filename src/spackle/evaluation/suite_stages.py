@@ -170,13 +170,14 @@ def completion_section(
         ask = functools.partial(predict_deltas, network, cues, seeds, rim)
         tasks[NETWORK] = lambda _: ask()
     times = measure(runs, tasks, device)
-    shield, place, redraw = (np.array(times["view", stage]) for stage in EXTRA)
-    rows = [Timing(RENDER, times["view", "view"]), Timing(SHIELD, tuple(shield)), Timing(PLACE, tuple(place))]
+    shield, place, redraw = (times["view", stage] for stage in EXTRA)
+    added = tuple(map(sum, zip(place, redraw, strict=True)))
+    rows = [Timing(RENDER, times["view", "view"]), Timing(SHIELD, shield), Timing(PLACE, place)]
     if network is not None:
         dtype = "bf16" if pick_dtype("auto", CPU) == torch.bfloat16 else "fp32"
         rows.append(Timing(NETWORK, times[NETWORK, TOTAL], flops=count_flops(ask), dtype=dtype))
-    rows += [Timing(REDRAW, tuple(redraw)), Timing(ADDED, tuple(place + redraw))]
-    rows.append(Timing(IN_RENDERS, _ratios(tuple(place + redraw), times["view", "view"]), "×"))
+    rows += [Timing(REDRAW, redraw), Timing(ADDED, added)]
+    rows.append(Timing(IN_RENDERS, _ratios(added, times["view", "view"]), "×"))
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
     facts |= {"holes": hole_area_ratio(before.alpha), "added": len(completer.complete_view(camera))}
     return Section(tuple(rows), facts)
@@ -190,20 +191,15 @@ def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float 
     """
     even, depths = camera.even(), DepthRange.of(base)
 
-    def look(disparity: float) -> tuple[float, Camera]:
-        view = extremes(even, disparity, depths)[1]
-        return hole_area_ratio(renderer.render(base, view).alpha), view
-
     low, high = 0.0, MAX_DISPARITY
-    if not look(low)[0] < share < look(high)[0]:
-        raise InputError(f"no view up to disparity {MAX_DISPARITY:g} has {share:.0%} holes")
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        found, view = look(middle)
+        view = extremes(even, middle, depths)[1]
+        found = hole_area_ratio(renderer.render(base, view).alpha)
         low, high = (middle, high) if found < share else (low, middle)
         if abs(found / share - 1) < CLOSE:
-            break
-    return middle, view
+            return middle, view
+    raise InputError(f"no view up to disparity {MAX_DISPARITY:g} has {share:.0%} holes")
 
 
 def video_section(
