@@ -25,10 +25,10 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
+from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
-from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer
