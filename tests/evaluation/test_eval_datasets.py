@@ -91,13 +91,9 @@ def booster(scene: Path) -> Path:
     for name in ("im0.png", "im1.png"):
         photo(scene / "camera_00" / name)
         photo(scene / "camera_02" / name)
-    left, right = (
-        [[FOCAL, 0, 22, 0], [0, FOCAL, 18, 0], [0, 0, 1, 0]],
-        [[FOCAL, 0, 25, -3200.0], [0, FOCAL, 18, 0], [0, 0, 1, 0]],
-    )
     text = '<?xml version="1.0"?>\n<opencv_storage>\n'
-    for name, rows in (("proj_matL", left), ("proj_matR", right)):
-        data = " ".join(f"{float(v):.17e}" for row in rows for v in row)
+    for name, cx, shift in (("proj_matL", 22, 0), ("proj_matR", 25, -3200)):
+        data = f"{FOCAL:e} 0 {cx} {shift} 0 {FOCAL} 18 0 0 0 1 0"
         text += f'<{name} type_id="opencv-matrix"><rows>3</rows><cols>4</cols><dt>d</dt><data>{data}</data></{name}>\n'
     (scene / "calib_00-02.xml").write_text(text + "<baselineLR>8.0e+01</baselineLR>\n</opencv_storage>\n")
     disparity = np.full((HEIGHT, WIDTH), 7.0, np.float32)
@@ -123,11 +119,6 @@ def wildrgbd(scene: Path, eyes: Sequence[Eye] = EYES, scale: float = 0.15) -> Pa
     return scene
 
 
-def quaternion(eye: Eye) -> list[float]:
-    """wxyz of world-to-camera."""
-    return [np.cos(eye.turn / 2), 0, -np.sin(eye.turn / 2), 0]
-
-
 def colmap(
     folder: Path, names: Sequence[str], eyes: Sequence[Eye] = EYES, *, binary: bool, bend: float | None = None
 ) -> None:
@@ -140,7 +131,7 @@ def colmap(
     for number, (name, eye) in enumerate(zip(names, eyes, strict=False)):
         shift = -eye.to_world[:3, :3].T @ np.array(eye.at)
         seen = [(*eye.pixel(point)[:2], key) for point, key in zip(world, ids, strict=True)] + [(1.0, 1.0, -1)]
-        images.append((number + 1, [*quaternion(eye), *shift], name, seen))
+        images.append((number + 1, [np.cos(eye.turn / 2), 0, -np.sin(eye.turn / 2), 0, *shift], name, seen))
     if binary:
         model = 2 if bend is not None else 1
         (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 4, model, WIDTH, HEIGHT, *lens))
@@ -242,17 +233,12 @@ def assert_lands(case: Case, eyes: Sequence[Eye], index: int, order: Sequence[in
 # -- the registry, and roots of something else -----------------------------------------------------------------------
 
 
-def test_registry_agrees_with_the_papers_tables() -> None:
+def test_registry_agrees_with_the_papers_tables_and_knows_near_names() -> None:
     assert {dataset.title: dataset.paper_images for dataset in DATASETS.values()} == paper.IMAGES
     assert all(get_dataset(name).name == name and get_dataset(name).terms for name in DATASETS)
-
-
-@pytest.mark.parametrize(
-    ("typed", "hint"), [("midlebury", "did you mean middlebury"), ("LLFF", "llff"), ("x", "there are middlebury")]
-)
-def test_a_misspelt_dataset_gets_the_nearest_name(typed: str, hint: str) -> None:
-    with pytest.raises(InputError, match=hint):
-        get_dataset(typed)
+    for typed, hint in (("midlebury", "did you mean middlebury"), ("LLFF", "llff"), ("x", "there are middlebury")):
+        with pytest.raises(InputError, match=hint):
+            get_dataset(typed)
 
 
 @pytest.mark.parametrize("there", TREES)
@@ -280,58 +266,53 @@ def test_roots_without_anything(name: str, tmp_path: Path) -> None:
     assert "looks like" not in error_of(name, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("name", "missing", "says"),
-    [
-        ("middlebury", "Piano-perfect/calib.txt", "calib.txt: no such calibration"),
-        ("middlebury", "Piano-perfect/im1.png", "im1.png: no such photo"),
-        ("middlebury", "Piano-perfect/disp0.pfm", "no disp0GT.pfm or disp0.pfm: unpack the ground truth"),
-        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "calib_00-02.xml: no such calibration"),
-        ("booster", "train/balanced/Bathroom/camera_02/im1.png", "im1.png: no such photo"),
-        ("booster", "train/balanced/Bathroom/disp_00.npy", "give train/balanced"),
-        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "cam_poses.txt: no such list of poses"),
-        ("wildrgbd", "apple/scenes/scene_000/metadata", "metadata: no such description"),
-        ("wildrgbd", "apple/scenes/scene_000/depth/00001.png", "00001.png: no such depth map"),
-        ("eth3d", "courtyard/dslr_calibration_undistorted/images.txt", "images.txt: no such part of a COLMAP model"),
-        ("eth3d", "courtyard/images/dslr_images_undistorted/DSC_0002.JPG", "DSC_0002.JPG: no such photo"),
-        ("llff", "fern/images_4/image001.png", "5 rows, but there are 4 photos"),
-        ("tanks", "Truck/sparse/0/cameras.bin", "expected cameras, images, points3D"),
-        ("tanks", "Truck/images/000003.jpg", "000003.jpg: no such photo"),
-    ],
-)
-def test_a_missing_file_is_named(name: str, missing: str, says: str, tmp_path: Path) -> None:
+MIDDLEBURY, BOOSTER, WILD = "Piano-perfect", "train/balanced/Bathroom", "apple/scenes/scene_000"
+MODEL = "courtyard/dslr_calibration_undistorted"
+BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content or None where it is gone, the message
+    ("middlebury", f"{MIDDLEBURY}/calib.txt", None, "calib.txt: no such calibration"),
+    ("middlebury", f"{MIDDLEBURY}/im1.png", None, "im1.png: no such photo"),
+    ("middlebury", f"{MIDDLEBURY}/disp0.pfm", None, "no disp0GT.pfm or disp0.pfm"),
+    ("booster", f"{BOOSTER}/calib_00-02.xml", None, "calib_00-02.xml: no such calibration"),
+    ("booster", f"{BOOSTER}/camera_02/im1.png", None, "im1.png: no such photo"),
+    ("booster", f"{BOOSTER}/disp_00.npy", None, "give train/balanced"),
+    ("wildrgbd", f"{WILD}/cam_poses.txt", None, "cam_poses.txt: no such list of poses"),
+    ("wildrgbd", f"{WILD}/metadata", None, "metadata: no such description"),
+    ("wildrgbd", f"{WILD}/depth/00001.png", None, "00001.png: no such depth map"),
+    ("eth3d", f"{MODEL}/images.txt", None, "images.txt: no such part of a COLMAP model"),
+    ("eth3d", "courtyard/images/dslr_images_undistorted/DSC_0002.JPG", None, "DSC_0002.JPG: no such photo"),
+    ("llff", "fern/images_4/image001.png", None, "5 rows, but there are 4 photos"),
+    ("tanks", "Truck/sparse/0/cameras.bin", None, "expected cameras, images, points3D"),
+    ("tanks", "Truck/images/000003.jpg", None, "000003.jpg: no such photo"),
+    ("middlebury", f"{MIDDLEBURY}/calib.txt", "cam0=[1 2]\n", "calib.txt: "),
+    ("booster", f"{BOOSTER}/calib_00-02.xml", "<opencv_storage><proj_matL/></opencv_storage>", "calib_00-02.xml: "),
+    ("booster", f"{BOOSTER}/calib_00-02.xml", "no XML", "calib_00-02.xml: "),
+    ("wildrgbd", f"{WILD}/metadata", '{"w": 4, "h": 3, "K": [1, 2]}', "metadata: "),
+    ("wildrgbd", f"{WILD}/cam_poses.txt", "0 1 2 3\n", "cam_poses.txt: "),
+    ("wildrgbd", f"{WILD}/cam_poses.txt", "0 " + "nan " * 16, "cam_poses.txt: "),
+    ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 40 40\n", "cameras.txt: "),
+    ("eth3d", f"{MODEL}/images.txt", "1 0 0 0 0 0 0 0 4 a.jpg\n\n", "images.txt: "),
+    ("eth3d", f"{MODEL}/points3D.txt", "1 2\n", "points3D.txt: "),
+    ("llff", "fern/poses_bounds.npy", "not NumPy", "poses_bounds.npy: "),
+    ("tanks", "Truck/sparse/0/images.bin", "\x09" + "\0" * 20, "images.bin: "),
+    ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30, "points3D.bin: "),
+]
+
+
+@pytest.mark.parametrize(("name", "file", "content", "says"), BROKEN)
+def test_a_missing_or_damaged_file_is_named(
+    name: str, file: str, content: str | None, says: str, tmp_path: Path
+) -> None:
     TREES[name](tmp_path)
-    (tmp_path / missing).unlink()
+    (tmp_path / file).unlink()
+    if content is not None:
+        (tmp_path / file).write_bytes(content.encode("latin-1"))
     assert says in error_of(name, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "file", "content"),
-    [
-        ("middlebury", "Piano-perfect/calib.txt", "cam0=[1 2]\n"),
-        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "<opencv_storage><proj_matL/></opencv_storage>"),
-        ("booster", "train/balanced/Bathroom/calib_00-02.xml", "no XML"),
-        ("wildrgbd", "apple/scenes/scene_000/metadata", '{"w": 4, "h": 3, "K": [1, 2]}'),
-        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "0 1 2 3\n"),
-        ("wildrgbd", "apple/scenes/scene_000/cam_poses.txt", "0 " + "nan " * 16),
-        ("eth3d", "courtyard/dslr_calibration_undistorted/cameras.txt", "4 PINHOLE 48 36 40 40\n"),
-        ("eth3d", "courtyard/dslr_calibration_undistorted/images.txt", "1 0 0 0 0 0 0 0 4 a.jpg\n\n"),
-        ("eth3d", "courtyard/dslr_calibration_undistorted/points3D.txt", "1 2\n"),
-        ("llff", "fern/poses_bounds.npy", "not NumPy"),
-        ("tanks", "Truck/sparse/0/images.bin", "\x09" + "\0" * 20),
-        ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30),
-    ],
-)
-def test_a_damaged_file_is_named(name: str, file: str, content: str, tmp_path: Path) -> None:
-    TREES[name](tmp_path)
-    (tmp_path / file).write_bytes(content.encode("latin-1"))
-    assert Path(file).name in error_of(name, tmp_path)
 
 
 @pytest.mark.parametrize(("name", "make"), [("wildrgbd", wildrgbd), ("eth3d", eth3d), ("llff", llff), ("tanks", tanks)])
 def test_a_scene_with_one_photo_is_refused(name: str, make: Callable[..., Path], tmp_path: Path) -> None:
     make(tmp_path / "one", EYES[:1])
-    assert "at least two photos with a pose are needed, 1 found" in error_of(name, tmp_path)
+    assert "at least two photos" in error_of(name, tmp_path)
 
 
 def test_a_lens_that_bends_is_refused(tmp_path: Path) -> None:
@@ -374,13 +355,12 @@ def test_middlebury_2014(truth: str, tmp_path: Path) -> None:
     assert not bool(case.depth().valid[0, 0])
 
 
-def test_of_perfect_and_imperfect_the_perfect_one_is_taken(tmp_path: Path) -> None:
+def test_of_perfect_and_imperfect_the_perfect_one_is_taken_and_two_sizes_of_one_scene_are_refused(
+    tmp_path: Path,
+) -> None:
     for name in ("Piano-perfect", "Piano-imperfect", "Couch-imperfect"):
         middlebury_2014(tmp_path / name)
     assert [case.name for case in cases("middlebury", tmp_path)] == ["Couch-imperfect", "Piano-perfect"]
-
-
-def test_two_sizes_of_one_scene_are_refused(tmp_path: Path) -> None:
     for name in ("trainingQ", "trainingH"):
         middlebury_2014(tmp_path / name / "Piano")
     assert "give the folder of one size" in error_of("middlebury", tmp_path)

@@ -9,9 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.evaluation.case import Case
+from spackle.evaluation.case import Case, Points
 
 MIN_PIXELS = 8  # fewer give no scale
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
@@ -50,12 +51,15 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
     if base_is_truth:
         return SAME
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
-    if case.depth is not None and (found := _from_depth(case, z_base, seen)):
+    found = None
+    if case.depth is not None:
+        found = _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")
+    if found is None and case.points is not None:
+        found = _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")
+    if found is None and case.bounds is not None and seen.any():
+        found = _of_bounds(case.bounds, z_base[seen])
+    if found is not None:
         return found
-    if case.points is not None and (found := _from_points(case, z_base, seen)):
-        return found
-    if case.bounds is not None and seen.any():
-        return _from_bounds(case.bounds, z_base[seen])
     sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
     has = ", ".join(name for name, value in sources.items() if value is not None)
     reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "no depth of it is known"
@@ -91,41 +95,37 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     return Camera(lens.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
 
 
-def _from_depth(case: Case, z_base: Tensor, seen: Tensor) -> Alignment | None:
-    """The map's nearest pixel to each of the base's."""
-    assert case.depth is not None
-    known = case.depth()
+def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
+    """By the map's nearest pixel to each of the base's."""
     (height, width), (rows, columns) = z_base.shape, known.depth.shape
     y = ((torch.arange(height) + 0.5) * rows / height).long()
     x = ((torch.arange(width) + 0.5) * columns / width).long()
     z, valid = known.depth[y][:, x], known.valid[y][:, x] & seen
-    return _from_ratios(z[valid] / z_base[valid], "depth")
+    return z[valid] / z_base[valid]
 
 
-def _from_points(case: Case, z_base: Tensor, seen: Tensor) -> Alignment | None:
-    """The base's pixel that each point falls into."""
-    assert case.points is not None
+def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
+    """By the base's pixel that each point falls into."""
     if case.camera is None:
         raise ValueError(f"{case.name} has points but no camera whose pixels they are in")
-    points, (height, width) = case.points(), z_base.shape
+    height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
     inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)
     x, y = cells[inside].unbind(1)
     known = seen[y, x]
-    return _from_ratios(points.z[inside][known] / z_base[y, x][known], "points")
+    return points.z[inside][known] / z_base[y, x][known]
 
 
-def _from_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
+def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
     """None where there are too few."""
     ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
     if len(ratios) < MIN_PIXELS:
         return None
     scale = ratios.median()
-    spread = MAD_TO_SIGMA * float((ratios / scale - 1).abs().median())
-    return Alignment(float(scale), len(ratios), spread, source)
+    return Alignment(float(scale), len(ratios), MAD_TO_SIGMA * float((ratios / scale - 1).abs().median()), source)
 
 
-def _from_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
+def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
     """Rough: between what makes the nearest depths the same, and what makes the farthest the same."""
     near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
     low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)

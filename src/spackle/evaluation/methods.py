@@ -66,11 +66,6 @@ class View:
 Method = Callable[[Shot], Iterator[View]]  # the views of a shot, in its order, one at a time: there may be many
 
 
-def _base_alone(shot: Shot) -> Iterator[View]:
-    for before in shot.before:
-        yield View(before.rgb, before.alpha, 0)
-
-
 def _per_view(shot: Shot, network: ResidualNet | None, precision: Precision = "auto") -> Iterator[View]:
     """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
     completer = shot.completer(network, precision)
@@ -166,7 +161,7 @@ def make_method(
         prediction, unit = direct_ft()
         return partial(_direct_ft, prediction=prediction, unit=unit)
     methods: dict[str, Callable[[], Method]] = {
-        "base": lambda: _base_alone,
+        "base": lambda: lambda shot: (View(before.rgb, before.alpha, 0) for before in shot.before),
         "spackle": lambda: partial(_per_view, network=network, precision=precision),
         "spackle-scene": lambda: partial(_one_scene, network=network, precision=precision),
         "seeds": lambda: partial(_per_view, network=None),

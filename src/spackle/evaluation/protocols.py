@@ -64,9 +64,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
     Raises:
         ValueError: no Gaussian stands in front of the camera, or a disparity that no path has.
     """
-    lens = prediction.camera
-    even = lens.even()
-    reach = DepthRange.of(prediction.gaussians)
+    even, reach = prediction.camera.even(), DepthRange.of(prediction.gaussians)
     return [
         Wanted(f"{disparity:g}", name, camera)
         for disparity in disparities
@@ -96,7 +94,8 @@ def measure(
             for index, view in zip(own, method(shot), strict=True):
                 figures = {"har_before": holes[index], **_counts(view, len(prediction.gaussians))}
                 figures |= _quality(view.rgb, wanted[index].truth, before[index], gauges, remarks)
-                rows.append(Row(setting, wanted[index].name, name, {k: _finite(v) for k, v in figures.items()}))
+                finite = {key: value if math.isfinite(value) else None for key, value in figures.items()}
+                rows.append(Row(setting, wanted[index].name, name, finite))
                 if index == shown:
                     pictures[name] = view.rgb
     return Measured(rows, list(dict.fromkeys(remarks)), wanted[shown], pictures)
@@ -118,8 +117,10 @@ def _quality(
     """The metrics that were asked for and can be: those with a truth want one."""
     figures: dict[str, float] = {}
     hole = hole_mask(before.alpha)
-    names = [name for name in gauges.metrics if truth is not None or not METRICS[name].truth]
-    for name in names:
+    places: dict[str, Tensor | None] = {"": None, "_hole": hole, "_outside": ~hole}
+    for name in gauges.metrics:
+        if METRICS[name].truth and truth is None:
+            continue
         if name in gauges.published:
             try:
                 figures[name] = gauges.published[name](rgb, truth if METRICS[name].truth else None)
@@ -127,16 +128,10 @@ def _quality(
                 figures[name] = math.nan
                 remarks.append(f"{name} failed: {reason_in_a_line(error)}")
         elif truth is not None and name == "psnr":
-            places = {"psnr": None, "psnr_hole": hole, "psnr_outside": ~hole}
-            figures |= {place: psnr(rgb, truth, mask) for place, mask in places.items()}
+            figures |= {f"psnr{place}": psnr(rgb, truth, mask) for place, mask in places.items()}
         elif truth is not None and name == "ssim":
             similarity = ssim_map(rgb, truth)
-            places = {"ssim": None, "ssim_hole": hole, "ssim_outside": ~hole}
-            figures |= {place: ssim_average(similarity, mask) for place, mask in places.items()}
+            figures |= {f"ssim{place}": ssim_average(similarity, mask) for place, mask in places.items()}
         elif truth is not None and name == "distance" and gauges.features is not None:
             figures[name] = hole_distance(gauges.features, rgb, truth, hole)
     return figures
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -83,7 +83,8 @@ def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str,
     height = sum(picture.height + LINE + GAP for picture in pictures.values()) + LINE
     canvas = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(canvas)
-    draw.text((4, 3), f"{run.title}, {run.config['protocol']}, by {_plain(ranking.says)}", "black", font_size=FONT)
+    says = ranking.says.replace("↑", "(higher is better)").replace("↓", "(lower is better)")  # the font has no arrows
+    draw.text((4, 3), f"{run.title}, {run.config['protocol']}, by {says}", "black", font_size=FONT)
     y = LINE
     for name in names:
         shown = by_name[name].facts["shown"]
@@ -101,11 +102,6 @@ def column_title(run: Run, name: str) -> str:
     if name == TRUTH:
         return TRUTH
     return f"base ({run.base})" if name == "base" else METHODS[name].title
-
-
-def _plain(text: str) -> str:
-    """The default font has no arrows."""
-    return text.replace("↑", "(higher is better)").replace("↓", "(lower is better)")
 
 
 def _label(draw: ImageDraw.ImageDraw, text: str, x: int, y: int) -> None:

@@ -150,10 +150,9 @@ def read_model(folder: Path) -> Model:
     """
     binary = (folder / "cameras.bin").is_file()
     at = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images", "points3D")]
-    cameras = _whole(at[0], cameras_bin if binary else cameras_txt)
     images = _whole(at[1], images_bin if binary else images_txt)
     points = _whole(at[2], points_bin if binary else points_txt)
-    lenses = {camera[0]: _lens(at[0], camera) for camera in cameras}
+    lenses = {camera[0]: _lens(at[0], camera) for camera in _whole(at[0], cameras_bin if binary else cameras_txt)}
     try:
         views = [_view(lenses[camera], name, pose, observed) for pose, camera, name, observed in images]
     except (KeyError, ValueError) as error:
