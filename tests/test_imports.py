@@ -47,7 +47,7 @@ TOLERATED = {("evaluation", "app"), ("training", "app")}
 
 # Names that more than one class still has. The list may only become shorter.
 SHARED_NAMES = {
-    *("Block", "DirectFt", "Drawn", "Found", "Look", "Measured", "Method", "Plan", "Record", "Row", "Source", "Start"),
+    *("DirectFt", "Drawn", "Found", "Look", "Measured", "Method", "Plan", "Row", "Source"),
     "View",
 }
 

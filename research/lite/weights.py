@@ -12,7 +12,7 @@ from recipe import RANDOM, LiteRecipe
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.bases.lite.network import SCALE, STAGES, Block, Encoder, LiteNet, Size, load_networks
+from spackle.bases.lite.network import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 
@@ -160,7 +160,7 @@ def freeze(network: LiteNet, stages: int) -> LiteNet:
         for part in (network.encoder.stem, *network.encoder.stages[:stages]):
             part.requires_grad_(False)
         for part in network.encoder.modules():
-            if isinstance(part, Block):
+            if isinstance(part, MBConv):
                 part.depthwise.requires_grad_(False)
     return network
 

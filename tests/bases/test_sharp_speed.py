@@ -20,7 +20,7 @@ from torch.utils._pytree import tree_leaves
 import spackle
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.compiled import GraphedForward, compile_forward
-from spackle.bases.sharp.encoder import WINDOWS, Block
+from spackle.bases.sharp.encoder import WINDOWS, TransformerBlock
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput, compose, make_start
 from spackle.image import Photo
 
@@ -61,7 +61,7 @@ def test_a_compiled_forward_shares_the_weights_of_a_network_that_stays_as_it_is(
     assert all(module._compiled_call_impl is None for module in network.modules())
     assert all(a is b for a, b in zip(twin.parameters(), network.parameters(), strict=True))
     tokens = torch.randn(2, 65, MICRO.embed, generator=torch.Generator().manual_seed(0))
-    one, other = (next(m for m in n.modules() if isinstance(m, Block)) for n in (twin, network))
+    one, other = (next(m for m in n.modules() if isinstance(m, TransformerBlock)) for n in (twin, network))
     with torch.no_grad():
         torch.testing.assert_close(one(tokens), other(tokens), rtol=1e-5, atol=1e-5)
 

@@ -32,7 +32,7 @@ from sites import Site, serve
 
 from spackle import cli
 from spackle.app.weights import get_weights
-from spackle.downloads import WEIGHTS, Record, check_recorded, download, installed, transfer, weights_folder
+from spackle.downloads import WEIGHTS, DownloadRecord, check_recorded, download, installed, transfer, weights_folder
 from spackle.errors import InputError
 from spackle.progress import Reporter
 
@@ -87,9 +87,9 @@ def refused(url: str, target: Path, *parts: str) -> None:
     assert not os.path.isfile(target)
 
 
-def is_whole(target: Path, site: Site, record: Record) -> None:
+def is_whole(target: Path, site: Site, record: DownloadRecord) -> None:
     assert target.read_bytes() == site.content
-    assert record == Record(site.url, len(site.content), hashlib.sha256(site.content).hexdigest())
+    assert record == DownloadRecord(site.url, len(site.content), hashlib.sha256(site.content).hexdigest())
     assert check_recorded(target) == record
     assert names_in(target) == {"weights.pt", "weights.pt.json"}
 

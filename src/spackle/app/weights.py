@@ -16,7 +16,7 @@ from spackle.bases.sharp.layers import CONFIGS
 from spackle.downloads import (
     WEIGHTS,
     KnownWeights,
-    Record,
+    DownloadRecord,
     check_recorded,
     download,
     known_weights,
@@ -108,14 +108,14 @@ def _place(known: KnownWeights, output: Path | None) -> Path:
     return output if named else output / known.file
 
 
-def _result(known: KnownWeights, path: Path, record: Record | None, reporter: Reporter, *, new: bool) -> None:
+def _result(known: KnownWeights, path: Path, record: DownloadRecord | None, reporter: Reporter, *, new: bool) -> None:
     """For scripts; no digest where there is no record of the download."""
     sha256 = None if record is None else record.sha256
     size = os.path.getsize(path)
     reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
 
 
-def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> Record | None:
+def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> DownloadRecord | None:
     """What is said of a file that is there; its record, if any."""
     with reporter.stage("check", {}):
         record = check_recorded(path)
@@ -126,7 +126,7 @@ def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> Record 
     return record
 
 
-def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> Record:
+def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> DownloadRecord:
     noticed = False
     with reporter.transfer(known.name) as step:
 
@@ -146,7 +146,7 @@ def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> 
             raise
 
 
-def _summary(known: KnownWeights, record: Record) -> str:
+def _summary(known: KnownWeights, record: DownloadRecord) -> str:
     return f"{known.name}: {decimal(record.size)}, SHA-256 {record.sha256}"
 
 

@@ -22,6 +22,7 @@ from spackle.image import MAX_PIXELS, check_file, read_image
 
 Array = NDArray[Any]
 StrPath = str | os.PathLike[str]
+Quantity = Literal["depth", "disparity"]
 
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
@@ -38,7 +39,7 @@ class DepthMap:
     valid: Tensor  # [H, W] bool
     K: Tensor | None  # [3, 3] intrinsics in pixels of this map, as the calibration says them
     quantum: float | None  # step of integer values: metres of depth, or 1/m of inverse depth
-    quantity: Literal["depth", "disparity"]  # what was stored, hence the unit of `quantum`
+    quantity: Quantity  # what was stored, hence the unit of `quantum`
     path: Path
     note: str = ""  # for the report: what a photo's own depth map was
 
@@ -80,12 +81,8 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     values = np.where(np.isfinite(stored), stored, 0)
     if negative := int((values < 0).sum()):
         raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
-    if lens is None:
-        quantity: Literal["depth", "disparity"] = "depth"
-        depth, valid, unit = _as_depth(stored, is_png, path)
-    else:
-        quantity = "disparity"
-        depth, valid, unit = _as_disparity(stored, is_png, lens, path)
+    quantity: Quantity = "depth" if lens is None else "disparity"
+    depth, valid, unit = _as_disparity(stored, is_png, lens, path) if lens else _as_depth(stored, is_png, path)
     with np.errstate(over="ignore"):  # too far for float32 becomes inf, hence unknown
         metres = torch.from_numpy(depth.astype(np.float32))
     # A depth without a finite inverse is none (a file with its bytes swapped is full of them).
@@ -95,8 +92,7 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
     step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
-    K = None if lens is None else lens.K
-    return DepthMap(metres.where(known, 0.0), known, K, quantum, quantity, Path(path))
+    return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, Path(path))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,12 +221,13 @@ def _read(path: StrPath) -> tuple[Array, bool]:
             file.seek(0)
             if magic.startswith(b"\x89PNG"):
                 return read_image(path, lambda image: _png_values(image, path)), True
-            if magic.startswith(b"\x93NUMPY"):
-                return _read_npy(file, path), False
-            if magic.startswith(b"PK\x03\x04"):
-                return _read_npz(file, path), False
-            if magic.startswith((b"Pf", b"PF")):
-                return _read_pfm(file, path), False
+            for starts, read in (
+                ((b"\x93NUMPY",), _read_npy),
+                ((b"PK\x03\x04",), _read_npz),
+                ((b"Pf", b"PF"), _read_pfm),
+            ):
+                if magic.startswith(starts):
+                    return read(file, path), False
     except InputError:
         raise
     except Exception as error:  # NumPy and zip at work on a stranger's bytes raise anything
@@ -266,12 +263,17 @@ def _read_npy(file: IO[bytes], path: StrPath) -> Array:
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {dtype} is not a depth map: give float32 metres")
     _check_size(shape, path)
-    count = shape[0] * shape[1]
-    data = file.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        raise InputError(f"{path}: cut off: {shape[1]}×{shape[0]} values are announced, {len(data)} bytes are there")
+    data = _read_values(file, shape, dtype.itemsize, path)
     values = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
     return np.ascontiguousarray(values, dtype.newbyteorder("="))
+
+
+def _read_values(file: IO[bytes], shape: tuple[int, ...], item: int, path: StrPath) -> bytes:
+    """The bytes of an array of items of so many bytes each."""
+    data = file.read(shape[0] * shape[1] * item)
+    if len(data) < shape[0] * shape[1] * item:
+        raise InputError(f"{path}: cut off: {shape[1]}×{shape[0]} values are announced, {len(data)} bytes are there")
+    return data
 
 
 def _read_npz(file: IO[bytes], path: StrPath) -> Array:
@@ -290,8 +292,6 @@ def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
         raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")
     (width, height), endian = map(int, size), "<" if float(scale[0]) < 0 else ">"
     _check_size((height, width), path)
-    data = file.read(4 * width * height)
-    if len(data) < 4 * width * height:
-        raise InputError(f"{path}: cut off: {width}×{height} values are announced, {len(data)} bytes are there")
+    data = _read_values(file, (height, width), 4, path)
     values = np.frombuffer(data, f"{endian}f4").reshape(height, width)[::-1]
     return np.ascontiguousarray(values, np.float32)

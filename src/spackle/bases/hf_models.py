@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from spackle.bases.depth_map import DepthMap
+from spackle.bases.depth_map import DepthMap, Quantity
 from spackle.bases.protocol import NEAREST_M, nearest
 from spackle.errors import InputError
 
@@ -97,7 +97,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
     valid = known & (depth > 0) & torch.isfinite(1 / depth)
     if not valid.any():
         raise InputError(f"{who} predicts no depth above zero: its weights are broken, or not for photos")
-    quantity: Literal["depth", "disparity"] = "depth" if meaning == "metres" else "disparity"
+    quantity: Quantity = "depth" if meaning == "metres" else "disparity"
     return DepthMap(depth.where(valid, 0.0), valid, None, None, quantity, photo)
 
 

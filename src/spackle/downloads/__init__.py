@@ -17,7 +17,7 @@ AGAIN = "run `spackle weights get` again"
 
 
 @dataclasses.dataclass(frozen=True)
-class Record:
+class DownloadRecord:
     """What was downloaded; lies beside the file as NAME.json.
 
     The digest is that of the first download: it shows damage and later change, not a download that was bad at once.
@@ -42,7 +42,7 @@ def weights_folder() -> Path:
         raise InputError("no home folder for downloaded weights: name a folder in SPACKLE_WEIGHTS") from error
 
 
-def download(url: str, path: str | os.PathLike[str], progress: Progress | None = None) -> Record:
+def download(url: str, path: str | os.PathLike[str], progress: Progress | None = None) -> DownloadRecord:
     """Fetch `url` (http or https, without a password) to `path` in a folder that exists, and write its record.
 
     A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
@@ -59,7 +59,7 @@ def download(url: str, path: str | os.PathLike[str], progress: Progress | None =
     part = _beside(target, ".part")
     try:
         with hold(_beside(target, ".lock")):
-            record = Record(url, *receive(url, part, progress or (lambda done, total: None)))
+            record = DownloadRecord(url, *receive(url, part, progress or (lambda done, total: None)))
             # The record first: a kill in between leaves a file that its record refuses, not one without.
             write_json(dataclasses.asdict(record), _beside(target, ".json"))
             os.replace(part, target)
@@ -72,19 +72,19 @@ def download(url: str, path: str | os.PathLike[str], progress: Progress | None =
         raise InputError(f"{path}: cannot write: {reason}: make room or choose another folder") from error
 
 
-def read_record(path: str | os.PathLike[str]) -> Record | None:
+def read_record(path: str | os.PathLike[str]) -> DownloadRecord | None:
     """The record beside a file; None where none lies there, InputError for one that makes no sense."""
     place = _beside(_real(path), ".json")
     try:
         fields = read_json(place)
         if fields is None or "sha256" not in fields:  # somebody's notes on a file of their own
             return None
-        return Record(str(fields["url"]), int(fields["size"]), str(fields["sha256"]))
+        return DownloadRecord(str(fields["url"]), int(fields["size"]), str(fields["sha256"]))
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:  # the last: a size of 1e400
         raise InputError(f"{place}: this record of a download cannot be read: delete it and {AGAIN}") from error
 
 
-def check_recorded(path: str | os.PathLike[str]) -> Record | None:
+def check_recorded(path: str | os.PathLike[str]) -> DownloadRecord | None:
     """Hold a file against its record: size first, then every byte. None where it has none.
 
     InputError where they differ, or one of them cannot be read.

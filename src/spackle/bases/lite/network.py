@@ -54,7 +54,7 @@ class SameConv(nn.Conv2d):
         return super().forward(pad(x, self.margins) if any(self.margins) else x)
 
 
-class Block(nn.Module):
+class MBConv(nn.Module):
     """MBConv: wider by a 1×1, spatial mixing channel by channel, narrower by a 1×1; plus itself where it fits."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, expansion: int) -> None:
@@ -83,7 +83,7 @@ class Encoder(nn.Module):
         for count, kernel, stride, expansion, outputs in STAGES[size]:
             blocks = []
             for n in range(count):
-                blocks.append(Block(inputs, outputs, kernel, stride if n == 0 else 1, expansion))
+                blocks.append(MBConv(inputs, outputs, kernel, stride if n == 0 else 1, expansion))
                 inputs = outputs
             self.stages.append(nn.Sequential(*blocks))
 

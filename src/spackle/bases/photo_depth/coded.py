@@ -6,7 +6,9 @@ import dataclasses
 import io
 import math
 import warnings
-from typing import Any, Literal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.bases.depth_map import ASPECT_TOLERANCE, grid_step
+from spackle.bases.depth_map import ASPECT_TOLERANCE, Quantity, grid_step
 from spackle.errors import reason_in_a_line
 from spackle.image import LENSES, MAX_PIXELS
 
@@ -74,7 +76,7 @@ class BrokenDepth(Exception):
 class Scale:
     """Codes to values, along a straight line."""
 
-    quantity: Literal["depth", "disparity"]
+    quantity: Quantity
     first: float  # value of the lowest code: metres of depth, or 1/m of disparity
     last: float  # value of the highest code
     lowest: float = 0.0
@@ -141,17 +143,23 @@ class CodedDepth:
 
 def read_codes(picture: bytes) -> tuple[Array, int]:
     """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
+    with decoding(), Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+        check_pixels(*image.size)
+        if image.mode.startswith("I"):
+            return np.asarray(image).astype(np.uint16), 65535
+        return np.asarray(image.convert("L")), 255
+
+
+@contextmanager
+def decoding() -> Iterator[None]:
+    """BrokenDepth for whatever a decoder raises over a stranger's bytes; its warnings are not worth a line."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # broken EXIF of a depth map: not worth a line
-            with Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
-                check_pixels(*image.size)
-                if image.mode.startswith("I"):
-                    return np.asarray(image).astype(np.uint16), 65535
-                return np.asarray(image.convert("L")), 255
+            warnings.simplefilter("ignore")
+            yield
     except BrokenDepth:
         raise
-    except Exception as error:  # a decoder at work on a stranger's bytes raises anything
+    except Exception as error:
         raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
 
 

@@ -184,25 +184,29 @@ def find_depth_item(data: Bytes) -> DepthItem | None:
     found = dict(_Cursor(data, (meta[0] + 4, meta[1])).boxes())
     if not {b"pitm", b"iinf", b"iref", b"iprp"} <= set(found):
         return None
-    primary = _primary(_Cursor(data, found[b"pitm"]))
+    cursor = _Cursor(data, found[b"pitm"])
+    primary = cursor.number(4 if cursor.full()[0] else 2)
     references = list(_references(_Cursor(data, found[b"iref"])))
     properties = _properties(data, found[b"iprp"])
     auxiliary = [source for kind, source, targets in references if kind == b"auxl" and primary in targets]
-    depth = [item for item in auxiliary if _is_depth(data, properties.get(item, []))]
+    depth = []
+    for item in auxiliary:
+        kinds = (_Cursor(data, (a + 4, b)).text() for kind, (a, b) in properties.get(item, []) if kind == b"auxC")
+        if any(kind in DEPTH_TYPES for kind in kinds):
+            depth.append(item)
     if not depth:
         return None
     if len(depth) > 1:  # whose XMP describes the one that the decoder picks is unknown
         return DepthItem(b"", UPRIGHT, UPRIGHT)
     own, of_primary = (_turn(data, properties.get(item, [])) for item in (depth[0], primary))
     describing = {source for kind, source, targets in references if kind == b"cdsc" and depth[0] in targets}
-    xmp = _xmp(data, found, describing)
+    try:  # empty where there is none, or none that can be reached
+        describing &= set(_xmp_items(_Cursor(data, found[b"iinf"])))
+        xmp = next(_packets(data, found, describing), b"")
+    except MalformedBoxes:
+        xmp = b""
     # Apple rotates the picture and leaves the map as the sensor saw it.
     return DepthItem(xmp, own or UPRIGHT, (own is None and of_primary) or UPRIGHT)
-
-
-def _primary(cursor: _Cursor) -> int:
-    version, _ = cursor.full()
-    return cursor.number(4 if version else 2)
 
 
 def _references(cursor: _Cursor) -> Iterator[tuple[bytes, int, list[int]]]:
@@ -229,11 +233,6 @@ def _properties(data: Bytes, span: Span) -> dict[int, list[tuple[bytes, Span]]]:
     return found
 
 
-def _is_depth(data: Bytes, properties: list[tuple[bytes, Span]]) -> bool:
-    kinds = (_Cursor(data, (begin + 4, end)).text() for kind, (begin, end) in properties if kind == b"auxC")
-    return any(kind in DEPTH_TYPES for kind in kinds)
-
-
 def _turn(data: Bytes, properties: list[tuple[bytes, Span]]) -> Turn | None:
     """Rotations and mirrorings, in the order in which they apply; None where there is not one."""
     tables, turn = {b"irot": BY_IROT, b"imir": BY_IMIR}, None
@@ -244,14 +243,6 @@ def _turn(data: Bytes, properties: list[tuple[bytes, Span]]) -> Turn | None:
     return turn
 
 
-def _xmp(data: Bytes, meta: dict[bytes, Span], items: set[int]) -> bytes:
-    """The first XMP among these items; empty where there is none, or none that can be reached."""
-    try:
-        return next(_packets(data, meta, items & set(_xmp_items(_Cursor(data, meta[b"iinf"])))), b"")
-    except MalformedBoxes:
-        return b""
-
-
 def _xmp_items(cursor: _Cursor) -> Iterator[int]:
     cursor.number(4 if cursor.full()[0] else 2)
     for box, span in cursor.boxes():
@@ -259,13 +250,8 @@ def _xmp_items(cursor: _Cursor) -> Iterator[int]:
         version = entry.full()[0] if box == b"infe" else 0
         if version not in (2, 3):
             continue
-        item, _, kind, _, content = (
-            entry.number(version * 2 - 2),
-            entry.take(2),
-            entry.take(4),
-            entry.text(),
-            entry.text(),
-        )
+        item, _, kind = entry.number(version * 2 - 2), entry.take(2), entry.take(4)
+        _, content = entry.text(), entry.text()
         if kind == b"mime" and content == XMP_TYPE:
             yield item
 

@@ -6,13 +6,22 @@ import base64
 import binascii
 import dataclasses
 import os
-import warnings
 from itertools import accumulate
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from spackle.bases.photo_depth.coded import Array, BrokenDepth, CodedDepth, Lens, Scale, check_pixels, read_codes
+from spackle.bases.depth_map import Quantity
+from spackle.bases.photo_depth.coded import (
+    Array,
+    BrokenDepth,
+    CodedDepth,
+    Lens,
+    Scale,
+    check_pixels,
+    decoding,
+    read_codes,
+)
 from spackle.bases.photo_depth.containers import (
     Bytes,
     MalformedBoxes,
@@ -25,24 +34,17 @@ from spackle.bases.photo_depth.containers import (
     to_number,
     xmp_of,
 )
-from spackle.errors import reason_in_a_line
 
 PIXELS, DEPTH = "http://ns.apple.com/pixeldatainfo/1.0/ ", "http://ns.apple.com/depthData/1.0/ "
 
 # Core Video's formats of depth maps, half and full floats; any other is a matte, a gain map or a mask.
-_FORMATS: dict[str, Literal["depth", "disparity"]] = {
-    "hdis": "disparity",
-    "fdis": "disparity",
-    "hdep": "depth",
-    "fdep": "depth",
-}
+_FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep": "depth", "fdep": "depth"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Description:
     """What an auxiliary image's XMP says of a depth map."""
 
-    quantity: Literal["depth", "disparity"]
     scale: Scale | None  # None: the range is not given
     lens: Lens | None
     source: str
@@ -51,8 +53,7 @@ class Description:
 def find_apple(data: Bytes) -> CodedDepth | None:
     """The depth map among the further pictures of a JPEG, told from the others by its XMP."""
     for begin, end in further_pictures(data):
-        described = describe(xmp_of(data, begin))
-        if described is None:
+        if (described := describe(xmp_of(data, begin))) is None:
             continue
         if described.scale is None:
             raise BrokenDepth("does not say its range: FloatMinValue or FloatMaxValue is missing")
@@ -68,18 +69,17 @@ def describe(packet: bytes) -> Description | None:
     if PIXELS.encode().strip() not in packet:
         return None
     tree = parse_xmp(packet)
-    quantity = _quantity(tree)
-    if quantity is None:
+    if (quantity := _quantity(tree)) is None:
         return None
     first, last = (tree.number(f"{PIXELS}Float{end}Value") for end in ("Min", "Max"))
     lowest, highest = (tree.number(f"{PIXELS}Int{end}Value") for end in ("Min", "Max"))
     scale = None if first is None or last is None else Scale(quantity, first, last, lowest or 0.0, highest)
     accuracy = tree.find(f"{DEPTH}Accuracy")
     source = f"Apple {quantity}, {accuracy if accuracy in ('absolute', 'relative') else 'of unknown accuracy'}"
-    return Description(quantity, scale, _apple_lens(tree), source)
+    return Description(scale, _apple_lens(tree), source)
 
 
-def _quantity(tree: Node) -> Literal["depth", "disparity"] | None:
+def _quantity(tree: Node) -> Quantity | None:
     native, kind = tree.find(f"{PIXELS}NativeFormat"), tree.find(f"{PIXELS}AuxiliaryImageType")
     if native is not None:
         if native.isascii() and native.isdigit() and len(native) <= 10:  # four characters, written as the number
@@ -229,28 +229,21 @@ def find_in_heif(data: Bytes, path: str | os.PathLike[str]) -> CodedDepth | None
         return None
     codes, full, stated = _decode(path)
     described = describe(item.xmp)
-    scale, source = _meaning(described, stated)
     lens = None if described is None else described.lens
-    return CodedDepth(codes, full, scale, source, lens, item.own_turn, item.turn)
+    return CodedDepth(codes, full, *_meaning(described, stated), lens, item.own_turn, item.turn)
 
 
 def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
     """Codes [H, W] with the item's own rotation applied, the highest code, and HEVC's depth information."""
     import pillow_heif
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            images = pillow_heif.open_heif(os.fspath(path), hdr_to_16bit=False).info["depth_images"]
-            if not images:
-                raise BrokenDepth("is announced, but missing")
-            check_pixels(*images[0].size)
-            codes = np.array(images[0])
-            return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
-    except BrokenDepth:
-        raise
-    except Exception as error:  # a decoder at work on a stranger's bytes raises anything
-        raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
+    with decoding():
+        images = pillow_heif.open_heif(os.fspath(path), hdr_to_16bit=False).info["depth_images"]
+        if not images:
+            raise BrokenDepth("is announced, but missing")
+        check_pixels(*images[0].size)
+        codes = np.array(images[0])
+        return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
 
 
 def _meaning(described: Description | None, stated: dict[str, Any]) -> tuple[Scale, str]:

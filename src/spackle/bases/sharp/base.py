@@ -112,21 +112,18 @@ class SharpBase:
         """What the network says about a photo; `to_metric` makes Gaussians of it."""
         image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
         with own_arithmetic(self.device):
-            return self._forward(image, photo.focal_px / photo.width, progress)
-
-    def _forward(self, image: Tensor, disparity_factor: float, progress: Progress | None) -> SharpOutput:
-        """By the compiled network, if it was asked for and can be had."""
-        if self.compiled:
-            try:
-                self._translation = self._translation or compile_forward(self.network)
-                return self._translation(image, disparity_factor, self.windows, progress)
-            except RuntimeError as error:  # no compiler, or one that cannot do it
-                if memory_is_short(error):
-                    raise
-                self.compiled, self._translation, self.compile_problem = False, None, reason_in_a_line(error)
-                LOG.warning("SHARP runs without --compile: %s", self.compile_problem)
-        output: SharpOutput = self.network(image, disparity_factor, self.windows, progress)
-        return output
+            factor = photo.focal_px / photo.width
+            if self.compiled:
+                try:
+                    self._translation = self._translation or compile_forward(self.network)
+                    return self._translation(image, factor, self.windows, progress)
+                except RuntimeError as error:  # no compiler, or one that cannot do it
+                    if memory_is_short(error):
+                        raise
+                    self.compiled, self._translation, self.compile_problem = False, None, reason_in_a_line(error)
+                    LOG.warning("SHARP runs without --compile: %s", self.compile_problem)
+            output: SharpOutput = self.network(image, factor, self.windows, progress)
+            return output
 
 
 def usual_windows(device: torch.device) -> int:

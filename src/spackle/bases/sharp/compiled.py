@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from spackle.bases.protocol import Progress
-from spackle.bases.sharp.encoder import WINDOWS, Block
-from spackle.bases.sharp.network import DepthNetwork, SharpNetwork, SharpOutput, Start
+from spackle.bases.sharp.encoder import WINDOWS, TransformerBlock
+from spackle.bases.sharp.network import DepthNetwork, InitialGaussians, SharpNetwork, SharpOutput
 
 WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels and take their workspaces
 
@@ -32,7 +32,7 @@ def compile_forward(network: SharpNetwork, backend: str = "inductor") -> Forward
     """
     twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
     depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
-    blocks = [module for module in twin.modules() if isinstance(module, Block)]
+    blocks = [module for module in twin.modules() if isinstance(module, TransformerBlock)]
     for module in (*blocks, depth.decoder, depth.head, twin.feature_model):
         module.compile(backend=backend, dynamic=False)
     return GraphedForward(twin) if next(network.parameters()).device.type == "cuda" else twin
@@ -59,7 +59,9 @@ class GraphedForward:
         if progress:
             progress(WINDOWS, WINDOWS)
         start = self.output.start  # the next replay writes over it
-        kept = Start(*(t.clone() for t in (start.disparity_map, start.disparity, start.color, start.unscale)))
+        kept = InitialGaussians(
+            *(t.clone() for t in (start.disparity_map, start.disparity, start.color, start.unscale))
+        )
         return SharpOutput(kept, self.output.deltas.clone())
 
     def _capture(self, image: Tensor, batch: int) -> None:

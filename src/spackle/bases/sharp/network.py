@@ -23,7 +23,7 @@ HIDDEN = 32  # channels before the last layer of the depth head
 class SharpOutput:
     """What the network says about one picture."""
 
-    start: Start  # Gaussians on the two surfaces
+    start: InitialGaussians  # Gaussians on the two surfaces
     deltas: Tensor  # [14, 2, side/2, side/2] float32, to be applied to them
 
 
@@ -31,7 +31,7 @@ class SharpOutput:
 class Seen:
     """What encoder and depth network make of one picture: all that the Gaussian decoder goes by."""
 
-    start: Start
+    start: InitialGaussians
     picture: Tensor  # [1, 5, side, side] float32 in -1..1: sRGB, and the disparity of both layers
     maps: list[Tensor]  # the encoder's, fine to coarse: [1, C, side/2, side/2] to [1, C, side/32, side/32]
 
@@ -179,7 +179,7 @@ COLOR_GAIN = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
-class Start:
+class InitialGaussians:
     """Gaussians on the predicted surfaces, one for each 2×2 pixels and layer, before any delta."""
 
     disparity_map: Tensor  # [1, 2, side, side] of the scaled depths, an input of the feature network
@@ -188,14 +188,14 @@ class Start:
     unscale: Tensor  # float64 without an axis: multiplies means and scales to undo the scaling of the depths
 
 
-def make_start(image: Tensor, depth: Tensor) -> Start:
+def make_start(image: Tensor, depth: Tensor) -> InitialGaussians:
     """Where the Gaussians of a picture [1, 3, side, side] with depth layers [1, 2, side, side] begin."""
     factor = NEAREST / (depth.min().double() + SMALLEST_INVERSE)  # stays on its device: nobody waits for it
     disparity = 1.0 / (depth * factor).clamp_max(FARTHEST)
-    return Start(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
+    return InitialGaussians(disparity, max_pool2d(disparity, STRIDE)[0], avg_pool2d(image, STRIDE)[0], 1.0 / factor)
 
 
-def compose(start: Start, deltas: Tensor) -> Gaussians:
+def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     """Apply deltas [14, 2, H, W]; the Gaussians come layer by layer, each in row-major order.
 
     Means are (x·z, y·z, z), where x and y run from -1 to 1 over the picture.
