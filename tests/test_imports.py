@@ -47,7 +47,7 @@ TOLERATED = {("evaluation", "app"), ("training", "app")}
 
 # Names that more than one class still has. The list may only become shorter.
 SHARED_NAMES = {
-    *("DirectFt", "Drawn", "Found", "Look", "Measured", "Method", "Plan", "Row", "Source"),
+    *("DirectFt", "Drawn", "Found", "Measured", "Method", "Plan", "Row", "Source"),
     "View",
 }
 

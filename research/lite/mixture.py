@@ -16,7 +16,7 @@ from synthetic_scenes import TRIES, SyntheticScenes, Warn
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from spackle.bases.lite.base import LiteBase, Look, scaled_size
+from spackle.bases.lite.base import InputScale, LiteBase, scaled_size
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import load_photo
@@ -144,11 +144,11 @@ class GuessedPhotos:
     def fill(self, base: LiteBase, progress: Callable[[int, int], None], warn: Warn) -> None:
         """Guess what is missing; a photo that cannot be read is named and left out."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        looks = [Look(pixels, network) for pixels in LOOKS_PX for network in range(len(base.networks))]
+        looks = [InputScale(pixels, network) for pixels in LOOKS_PX for network in range(len(base.networks))]
         for index, photo in enumerate(self.photos):
             if not self._file(index).is_file():
                 try:
-                    guess = sure_inverse_depth(base.looks(load_photo(photo).rgb, looks))
+                    guess = sure_inverse_depth(base.at_scales(load_photo(photo).rgb, looks))
                 except (InputError, ValueError) as error:
                     warn(f"passed over: {error}")
                     continue

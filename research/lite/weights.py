@@ -173,7 +173,7 @@ def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
     """Write networks into one file, which `spackle.bases.lite.network.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
-    precision. `Look.network` counts them in this order.
+    precision. `InputScale.network` counts them in this order.
 
     Raises:
         InputError: where the file cannot be written.

@@ -14,12 +14,12 @@ from torch.nn.functional import interpolate
 from weights import save_networks
 
 import spackle
-from spackle.bases.lite.base import FARTHEST, LOOKS, NEAREST_M, SHIPPED, LiteBase, merged, network_size
+from spackle.bases.lite.base import FARTHEST, INPUT_SCALES, NEAREST_M, SHIPPED, LiteBase, merged, network_size
 from spackle.bases.lite.network import SCALE, STRIDE, LiteNet, Size, load_networks
 from spackle.errors import InputError
 from spackle.image import Photo
 
-BOTH_WAYS = [look for look in LOOKS if look.mirrored]
+BOTH_WAYS = [scale for scale in INPUT_SCALES if scale.mirrored]
 
 
 @functools.cache
@@ -61,7 +61,7 @@ def test_a_mirrored_photo_has_nearly_the_mirrored_depth_and_quite_where_all_size
     rgb, *_ = motorcycle()
     seen, mirrored = (shipped().inverse_depth(picture).log() for picture in (rgb, rgb.flip(1)))
     assert float((mirrored - seen.flip(1)).abs().mean()) < 0.02
-    seen, mirrored = (shipped().looks(picture, BOTH_WAYS).mean(0) for picture in (rgb, rgb.flip(1)))
+    seen, mirrored = (shipped().at_scales(picture, BOTH_WAYS).mean(0) for picture in (rgb, rgb.flip(1)))
     torch.testing.assert_close(mirrored, seen.flip(1), rtol=1e-3, atol=1e-4)
 
 
@@ -85,7 +85,7 @@ def test_depth_lies_in_the_range_that_the_report_names() -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(480, 640), (1536, 864), (40, 3000), (17, 17), (1, 1)])
 def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(height: int, width: int) -> None:
-    for pixels in {look.pixels for look in LOOKS}:
+    for pixels in {scale.pixels for scale in INPUT_SCALES}:
         tall, wide = network_size(height, width, pixels)
         assert tall % STRIDE == 0
         assert wide % STRIDE == 0
@@ -127,13 +127,13 @@ def test_stored_weights_are_those_of_the_networks_but_for_rounding(tmp_path: Pat
 
 def test_each_look_is_by_its_own_network_and_one_network_alone_does_without_the_others() -> None:
     networks, rgb = [some_network("lite0", 1), some_network("lite0", 2)], motorcycle()[0][:96, :128]
-    seen = LiteBase(networks, torch.device("cpu")).looks(rgb, LOOKS)
+    seen = LiteBase(networks, torch.device("cpu")).at_scales(rgb, INPUT_SCALES)
     alone = [LiteBase([network], torch.device("cpu")) for network in networks]
-    for look, said in zip(LOOKS, seen, strict=True):
-        own = alone[look.network].looks(rgb, [dataclasses.replace(look, network=0), LOOKS[-1]])[0]
-        assert torch.equal(said, own)
-    first = [number for number, look in enumerate(LOOKS) if look.network == 0]
-    expected = merged(seen[first], [LOOKS[number].tilt for number in first]).exp()
+    for scale, outputs in zip(INPUT_SCALES, seen, strict=True):
+        own = alone[scale.network].at_scales(rgb, [dataclasses.replace(scale, network=0), INPUT_SCALES[-1]])[0]
+        assert torch.equal(outputs, own)
+    first = [number for number, scale in enumerate(INPUT_SCALES) if scale.network == 0]
+    expected = merged(seen[first], [INPUT_SCALES[number].tilt for number in first]).exp()
     torch.testing.assert_close(alone[0].inverse_depth(rgb), expected)
 
 

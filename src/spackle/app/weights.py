@@ -15,8 +15,8 @@ from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shape
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.downloads import (
     WEIGHTS,
-    KnownWeights,
     DownloadRecord,
+    KnownWeights,
     check_recorded,
     download,
     known_weights,

@@ -23,8 +23,8 @@ FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky 
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
-    """One way of looking at a photo."""
+class InputScale:
+    """A size at which a network sees a photo."""
 
     pixels: int  # of what the network sees of it, nearly
     network: int = 0  # which of the networks that a file has
@@ -34,15 +34,15 @@ class Look:
 
 # One after the other; both have learned from up to 256×320. Small shows them more of a thing at once, large its
 # outlines: the mean of what they say errs less than the best alone. The largest costs most, its mirror gains nothing.
-LOOKS = (
-    Look(64 * 96),
-    Look(96 * 128),
-    Look(192 * 256),
-    Look(192 * 256, network=1),
-    Look(256 * 320),
-    Look(448 * 608, mirrored=False, tilt=False),
+INPUT_SCALES = (
+    InputScale(64 * 96),
+    InputScale(96 * 128),
+    InputScale(192 * 256),
+    InputScale(192 * 256, network=1),
+    InputScale(256 * 320),
+    InputScale(448 * 608, mirrored=False, tilt=False),
 )
-COARSE = (3, 4)  # how the whole lies is what is left of a look in so many cells, the longer side having more
+COARSE = (3, 4)  # how the whole lies is what is left of an output in so many cells, the longer side having more
 
 
 class LiteBase:
@@ -59,7 +59,7 @@ class LiteBase:
         """Read the networks in a file that lite's training wrote, the package's own by default.
 
         Args:
-            path: the file; those of its networks are asked that `LOOKS` counts.
+            path: the file; those of its networks are asked that `INPUT_SCALES` counts.
             device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:
@@ -69,7 +69,7 @@ class LiteBase:
         return cls(load_networks(path or SHIPPED), target)
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        """Gaussians of the pixels of the photo at its working size, as `rgbd.lift` makes them."""
+        """Gaussians of the pixels of the photo at its working size, as `lift` makes them."""
         photo = resize_photo(photo)
         inverse_depth = self.inverse_depth(photo.rgb)
         depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
@@ -83,37 +83,39 @@ class LiteBase:
         return dataclasses.replace(prediction, notes=notes)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
-        """What the networks say of a photo [H, W, 3], sRGB in 0..1, in all of `LOOKS`: the mean of the logarithms.
+        """What the networks say of a photo [H, W, 3], sRGB in 0..1, at all `INPUT_SCALES`: the mean logarithm.
 
         Returns [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
         """
-        looks = [look for look in LOOKS if look.network < len(self.networks)]
-        return merged(self.looks(rgb, looks), [look.tilt for look in looks]).exp()
+        scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
+        return merged(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
 
     @torch.no_grad()
-    def looks(self, rgb: Tensor, looks: Sequence[Look]) -> Tensor:
-        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] by each of n looks, as fine as the last."""
+    def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
+        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n scales, as fine as the last."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
-        said = [self._say(picture, look) for look in looks]
-        finest = said[-1].shape
-        return torch.cat([interpolate(look[None, None], size=finest, mode="bilinear") for look in said])[:, 0].cpu()
+        outputs = [self._ask(picture, scale) for scale in scales]
+        finest = outputs[-1].shape
+        return torch.cat([interpolate(scale[None, None], size=finest, mode="bilinear") for scale in outputs])[
+            :, 0
+        ].cpu()
 
-    def _say(self, picture: Tensor, look: Look) -> Tensor:
+    def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W] that is seen at (h, w)."""
-        size = network_size(picture.shape[2], picture.shape[3], look.pixels)
+        size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
-        ways = torch.cat([seen, seen.flip(-1)]) if look.mirrored else seen
+        ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
         with own_arithmetic(self.device):
-            said = self.networks[look.network](ways.contiguous(memory_format=torch.channels_last))
-        straight, *mirrored = said.float()
+            outputs = self.networks[scale.network](ways.contiguous(memory_format=torch.channels_last))
+        straight, *mirrored = outputs.float()
         return torch.stack([straight, *(one.flip(-1) for one in mirrored)]).mean(0)
 
 
-def merged(looks: Tensor, tilt: Sequence[bool]) -> Tensor:
-    """[h, w] the mean of looks [n, h, w], but what is coarse in it is the mean of those that have a say in it."""
-    cells = COARSE if looks.shape[1] <= looks.shape[2] else COARSE[::-1]
-    coarse = interpolate(interpolate(looks[None], size=cells, mode="area"), size=looks.shape[1:], mode="bicubic")[0]
-    return (looks - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
+def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
+    """[h, w] the mean of outputs [n, h, w], but what is coarse in it is the mean of those that have a say in it."""
+    cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
+    coarse = interpolate(interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic")[0]
+    return (outputs - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
 
 
 def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
