@@ -138,13 +138,12 @@ class Supply:
             camera.pop("folder")
         return digest_of((SAMPLES_VERSION, facts, list(self.shares), list(self.names)))
 
-    def samples(self, folder: Path, train: Step, validation: Step, warn: Callable[[str], None]) -> SampleFiles:
+    def samples(self, folder: Path, progress: Step, warn: Callable[[str], None]) -> SampleFiles:
         """The samples in a folder, which many recipes may share; what is missing is made.
 
         Args:
             folder: for a folder of the digest's name, with train/ and validation/ in it.
-            train: called with the views that are there, of how many.
-            validation: likewise.
+            progress: called with the views that are there, of how many.
             warn: called with each view that was passed over, and why.
 
         Raises:
@@ -152,11 +151,10 @@ class Supply:
         """
         data, digest = self.data, self.digest
 
-        def fill(name: str, seed: int, views: int, progress: Step) -> list[Path]:
+        def fill(name: str, seed: int, views: int) -> list[Path]:
             place = folder / digest / name
             # Other seeds, other views: no view is in both.
-            cache = Cache(place, self.sources, self.shares, seed, data.crops, data.cells)
-            files = cache.fill(views, progress, warn)
+            files = Cache(place, self.sources, self.shares, seed, data.crops, data.cells).fill(views, progress, warn)
             if not files:
                 raise InputError(
                     f"{place}: none of {views} views gave a sample: photos must be readable, larger than "
@@ -164,8 +162,8 @@ class Supply:
                 )
             return files
 
-        validated = fill(VALIDATION, 2 * data.seed + 1, data.validation_views, validation)
-        learned = fill(TRAIN, 2 * data.seed, data.views, train)
+        validated = fill(VALIDATION, 2 * data.seed + 1, data.validation_views)
+        learned = fill(TRAIN, 2 * data.seed, data.views)
         return SampleFiles(learned, validated, digest)
 
 

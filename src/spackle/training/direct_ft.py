@@ -59,19 +59,24 @@ class PseudoPhotos:
 
     @staticmethod
     def of(data: DataRecipe, location: Path, weights_sha256: str) -> PseudoPhotos:
-        """Divide a dataset: whole photos, in a random order of `data.seed`.
-
-        Args:
-            data: views, validation_views and seed count.
-            location: of the dataset (see `only_dataset`).
-            weights_sha256: of the checkpoint whose decoder learns.
+        """Divide a dataset at a place by whole photos, in a random order of `data.seed`.
 
         Raises:
-            InputError: no finished dataset, one that teaches nothing, one of another base or of other weights, or one
-                with a single photo.
+            InputError: no finished dataset, one that teaches nothing, one of another base or of other weights than
+                those that learn, or one with a single photo.
         """
         files = PseudoViews(location).files
-        _check_base(files, weights_sha256)
+        base = files.manifest.config.get("base", {})
+        if base.get("name") != BASE:
+            raise InputError(
+                f"{location}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
+                "build one with --base sharp"
+            )
+        if base.get("weights") != weights_sha256:
+            raise InputError(
+                f"{location}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
+                "give them with -c, or build a dataset with these"
+            )
         photos, per_photo = len(files), len(files.samples[0][1].holes)
         if photos < 2:
             raise InputError(f"{location}: a single photo, but one must learn and another judge: build it with more")
@@ -81,25 +86,15 @@ class PseudoPhotos:
         digest = digest_of((files.manifest.digest, learned, order[:held]))
         return PseudoPhotos(files, tuple(learned), tuple(order[:held]), digest)
 
+    def views(self, place: int, indices: Sequence[int] | None = None) -> list[DatasetView]:
+        """Some or all views of a photo, of which 0 is its own; InputError where a shard is missing or damaged."""
+        group = self.files.group(place)
+        return [group.view(index) for index in (range(group.views) if indices is None else indices)]
+
     def drawn(self, place: int, rng: np.random.Generator) -> list[DatasetView]:
-        """`VIEWS_AT_ONCE` views of a photo: its own, and others at random; all of them where there are fewer.
-
-        Raises:
-            InputError: a shard that is missing or damaged.
-        """
-        group = self.files.group(place)
-        others = 1 + rng.permutation(group.views - 1)[: VIEWS_AT_ONCE - 1]
-        return [group.view(index) for index in [0, *sorted(int(other) for other in others)]]
-
-    def all(self, place: int) -> list[DatasetView]:
-        """Every view of a photo; InputError likewise."""
-        group = self.files.group(place)
-        return [group.view(index) for index in range(group.views)]
-
-    def widest(self, place: int) -> list[DatasetView]:
-        """A photo's own view and the one with the largest hole; InputError likewise."""
-        group, holes = self.files.group(place), self.files.samples[place][1].holes
-        return [group.view(index) for index in (0, int(np.argmax(holes)))]
+        """`VIEWS_AT_ONCE` views of a photo: its own, and others at random; all of them where there are fewer."""
+        others = 1 + rng.permutation(len(self.files.samples[place][1].holes) - 1)[: VIEWS_AT_ONCE - 1]
+        return self.views(place, [0, *sorted(int(other) for other in others)])
 
 
 def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
@@ -147,7 +142,7 @@ class DirectFt(ViewMethod):
     def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
         """All views of one photo, likewise."""
         (item,) = items
-        return self._render(network, self.photos.all(self.photos.validation[item]))
+        return self._render(network, self.photos.views(self.photos.validation[item]))
 
     def _render(self, decoder: nn.Module, views: Sequence[DatasetView]) -> ViewBatch:
         return render_photo(decoder, self.base, views, self.objective.renderer)
@@ -161,7 +156,8 @@ class DirectFt(ViewMethod):
         """[H, W, 3] sRGB: of some photos their own view and the one with the largest hole, a row each."""
         places, rows = self.photos.validation, []
         for place in places[:: max(1, 2 * len(places) // PICTURED)][: PICTURED // 2]:
-            done = self._render(network, self.photos.widest(place))
+            widest = int(np.argmax(self.photos.files.samples[place][1].holes))
+            done = self._render(network, self.photos.views(place, (0, widest)))
             rows += [torch.cat(row, dim=1) for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
         shown = [_reduced(row, len(self.columns.split(","))) for row in rows]
         widest = max(row.shape[1] for row in shown)
@@ -245,21 +241,6 @@ def _only_dataset(data: DataRecipe) -> Path:
             "give a dataset of `spackle dataset build --base sharp`"
         )
     return data.pseudo
-
-
-def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
-    """InputError unless the dataset's renderings and masks are those of the weights that are to learn."""
-    base, location = files.manifest.config.get("base", {}), files.location
-    if base.get("name") != BASE:
-        raise InputError(
-            f"{location}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
-            "build one with --base sharp"
-        )
-    if base.get("weights") != weights_sha256:
-        raise InputError(
-            f"{location}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
-            "give them with -c, or build a dataset with these"
-        )
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:

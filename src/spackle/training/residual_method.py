@@ -161,11 +161,11 @@ def _make_samples(context: RunContext[Recipe], supply: Supply) -> SampleFiles:
     skipped = _Skipped(reporter)
     if not context.ranks.first:
         context.ranks.wait()
-        return supply.samples(folder, _ignore, _ignore, skipped.add)
+        return supply.samples(folder, lambda done, total: None, skipped.add)
     make_folder(folder)
     reporter.say(f"samples of {supply.data.views + supply.data.validation_views} views in {folder}")
     with reporter.stage("samples", {}) as step:
-        samples = supply.samples(folder, step, step, skipped.add)
+        samples = supply.samples(folder, step, skipped.add)
     if skipped.views:
         reporter.say(f"{skipped.views} views were passed over, for {len(skipped.reasons)} reasons (above)")
     reporter.say(f"{len(samples.train)} samples to learn from, {len(samples.validation)} to be judged by")
@@ -185,7 +185,3 @@ class _Skipped:
         if reason not in self.reasons:
             self.reasons.add(reason)
             self.reporter.say(f"passed over: {reason}")
-
-
-def _ignore(done: int, total: int) -> None:
-    """Report no progress."""

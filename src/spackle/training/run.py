@@ -30,9 +30,9 @@ from spackle.training.checkpoint import (
     remove_run,
 )
 from spackle.training.direct_ft import plan_direct_ft
-from spackle.training.method import Method, Plan, RunContext, Start
+from spackle.training.method import Plan, RunContext, Start
 from spackle.training.ranks import joined_ranks
-from spackle.training.recipe import AnyRecipe, DeviceName, load_recipe, plain
+from spackle.training.recipe import AnyRecipe, load_recipe, plain
 from spackle.training.residual_method import plan_residual
 from spackle.training.trainer import Callbacks, Logs, Trainer, open_logs
 
@@ -96,7 +96,11 @@ def train(
     Raises:
         InputError: a file or folder that cannot be used, a loss that is no number.
     """
-    kind = _device_kind(recipe.run.device)
+    kind, gpu = recipe.run.device, torch.cuda.is_available()
+    if kind == "cuda" and not gpu:
+        raise InputError("run.device=cuda: torch finds no GPU here; use run.device=cpu")
+    if kind == "auto":
+        kind = "cuda" if gpu else "cpu"
     with joined_ranks(kind) as ranks, contextlib.ExitStack() as stack:
         if recipe.optim.batch % ranks.count:
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {ranks.count} processes")
@@ -114,12 +118,6 @@ def train(
         if overwrite and ranks.first:
             remove_run(output)
         return _run(context, start, found)
-
-
-def _device_kind(name: DeviceName) -> str:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("run.device=cuda: torch finds no GPU here; use run.device=cpu")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 
 def _find_checkpoint(context: RunContext[Any], plan: Plan) -> Checkpoint | None:
@@ -155,7 +153,9 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), output / RUN)
 
     def validated(progress: Progress) -> None:
-        say(_summary(progress, method))
+        found, aim = progress.history[-1], method.aim
+        best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
+        say(f"step {progress.step}: validation {aim} {found[aim]:.4f} ({best}){method.describe(found)}")
         write(progress)
 
     with (
@@ -174,10 +174,3 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         write(trainer.progress, why)
         say(f"{_END[why]}, step {trainer.progress.step} -> {output}")
     return why
-
-
-def _summary(progress: Progress, method: Method) -> str:
-    """The last validation in a line."""
-    found = progress.history[-1]
-    best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
-    return f"step {progress.step}: validation {method.aim} {found[method.aim]:.4f} ({best}){method.describe(found)}"

@@ -48,15 +48,9 @@ class Sample:
     def of(
         base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, target: Tensor, valid: Tensor
     ) -> Sample:
-        """A whole view.
+        """A whole view: frozen Gaussians and their rendering from `camera`; `photo_camera` is that of the base's photo.
 
-        Args:
-            base: frozen Gaussians.
-            rendering: of them from `camera`.
-            camera: the view.
-            photo_camera: the camera of the photo that the base comes from.
-            target: [H, W, 3] sRGB, the truth.
-            valid: [H, W] bool, where it is known.
+        The truth is `target` [H, W, 3] sRGB where `valid` [H, W] says so.
         """
         rendering, cues = rendering.detach(), Cues.of(rendering)
         seeds = make_seeds(cues, camera, photo_camera)
@@ -110,14 +104,12 @@ class Sample:
         steepest = float(((torch.maximum(middle.abs(), (size - middle).abs()) + 0.15 * size) / focal).max())
         stretch = max(self.camera.focal) * math.hypot(1.0, steepest)
         reach = FAINTEST * self.base.scales.amax(-1) * stretch / z.clamp_min(1e-6) + 1.0
-        near = torch.zeros(len(uv), dtype=torch.bool)
         wide = max_pool2d(self.tiles.float()[None, None], 3, stride=1, padding=1)[0, 0] > 0
         # Most blobs are smaller than a tile; one whose centre lies in a tile beside a wanted one may touch it.
         x, y = (uv / TILE).floor().long().unbind(-1)
         inside = (x >= -1) & (y >= -1) & (x <= columns) & (y <= rows) & (z > 0)
         small = reach < TILE
-        at = wide[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]
-        near = inside & small & at
+        near = inside & small & wide[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]
         big = ~small & (z > 0) & (uv[:, 0] > -reach) & (uv[:, 1] > -reach)
         big &= (uv[:, 0] < self.camera.width + reach) & (uv[:, 1] < self.camera.height + reach)
         return dataclasses.replace(self, base=self.base.select(near | big))

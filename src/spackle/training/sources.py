@@ -40,7 +40,7 @@ def reverse_view(prediction: BasePrediction, seen: Tensor, photo: Tensor, viewer
 
     Args:
         prediction: the photo's Gaussians and camera.
-        seen: [N] bool, which of them the virtual camera sees: see `seen_from`.
+        seen: [N] bool, which of them the virtual camera `viewer` sees: see `seen_from`.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
@@ -99,15 +99,9 @@ class Source(Protocol):
     @property
     def name(self) -> str:
         """What it is called in messages."""
-        ...
 
     def view(self, rng: np.random.Generator) -> Sample:
-        """A view, the same for the same state of `rng`.
-
-        Raises:
-            InputError: a file that cannot be used.
-        """
-        ...
+        """A view, the same for the same state of `rng`; InputError for a file that cannot be used."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +117,8 @@ class Composites:
         height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
         rgb, inverse_depth = composite(rng, self._photo, height, width)
         focal = film_to_pixels(float(rng.uniform(*FOCAL_MM)), width, height)
-        depth = _exact(1.0 / inverse_depth)
+        every = torch.ones_like(inverse_depth, dtype=torch.bool)
+        depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
         return _reverse(rng, rgb, depth, Camera.from_focal(focal, width, height), self.disparity, self.renderer)
 
     def _photo(self, rng: np.random.Generator) -> Tensor:
@@ -198,11 +193,7 @@ class PseudoViews:
         return self.files.manifest.digest
 
     def view(self, rng: np.random.Generator) -> Sample:
-        """A view, the same for the same state of `rng`; its rendering is the stored one.
-
-        Raises:
-            InputError: a shard that is missing or damaged.
-        """
+        """As `Source` has it; its rendering is the stored one."""
         photo, index = self._open[int(rng.integers(len(self._open)))]
         found = self.files.group(photo).view(index, with_base=True)
         assert found.base is not None
@@ -264,7 +255,3 @@ def _reverse(
     seen = seen_from(prediction.gaussians, viewer, renderer)
     seen = with_backing(seen, prediction.gaussians.means[:, 2], camera.height, camera.width)
     return reverse_view(prediction, seen, rgb, viewer, renderer)
-
-
-def _exact(depth: Tensor) -> DepthMap:
-    return DepthMap(depth, torch.ones_like(depth, dtype=torch.bool), None, None, "depth", Path("composite"))
