@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from command import Run, names_in
-from test_dataset_build import SHORT, build, content, is_alive, write_inputs
+from dataset_builds import build, content, dying_build, is_alive, refused
 
 from spackle.bases.open import BaseSettings
 from spackle.dataset import ray as on_ray
@@ -34,14 +34,6 @@ context = ray.init("local", num_cpus=2, num_gpus=0, include_dashboard=False, log
 print(context.address_info["address"], flush=True)
 sys.stdin.read()
 """
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six photos, their depth, and the dataset that one process makes of them."""
-    place = write_inputs(tmp_path_factory.mktemp("ray"), 6)
-    assert build(place, place / "whole").code == 0
-    return place
 
 
 @pytest.fixture(scope="module")
@@ -85,19 +77,19 @@ def on(address: str, place: Path, output: Path, *more: object) -> Run:
 # The same bytes -----------------------------------------------------------------------------------
 
 
-def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, tmp_path: Path) -> None:
+def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, whole: Path, tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGTERM)
     done = on("local", place, tmp_path / "out")
     assert done.code == 0, done.err
     assert done.out == ""
     assert len(done.lines) == 2, done.err  # nothing of Ray's own
-    assert content(tmp_path / "out") == content(place / "whole")
+    assert content(tmp_path / "out") == content(whole)
     assert not ray.is_initialized()
     assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_photos_of_a_killed_worker_are_made_again_by_another(
-    place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(on_ray, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
     done = on(address, place, tmp_path / "out")
@@ -105,12 +97,12 @@ def test_photos_of_a_killed_worker_are_made_again_by_another(
     assert len(done.lines) == 3
     assert f"{place}/photos/3.png: at this photo a worker died, and another takes its place" in done.lines[0]
     assert names_in(tmp_path / "notes") == {"0"}  # one was killed
-    assert content(tmp_path / "out") == content(place / "whole")
+    assert content(tmp_path / "out") == content(whole)
 
 
 @pytest.mark.slow
 def test_a_photo_that_kills_every_worker_ends_the_build_which_goes_on_later(
-    place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(on_ray, "RemoteMaker", dying(2, 99, tmp_path / "notes"))
@@ -119,27 +111,20 @@ def test_a_photo_that_kills_every_worker_ends_the_build_which_goes_on_later(
     assert f"{place}/photos/3.png: at this photo a worker died for the 4th time" in done.lines[-1]
     assert names_in(tmp_path / "notes") == {"0", "1", "2", "3"}
     assert build(place, tmp_path / "out").code == 0
-    assert content(tmp_path / "out") == content(place / "whole")
+    assert content(tmp_path / "out") == content(whole)
 
 
 @pytest.mark.slow
-def test_workers_and_their_cluster_end_with_a_killed_build(place: Path, tmp_path: Path) -> None:
+def test_workers_and_their_cluster_end_with_a_killed_build(place: Path, whole: Path, tmp_path: Path) -> None:
     note = tmp_path / "processes"
-    words = ["spackle", "dataset", "build", "--photos", place / "photos", "--depth", place / "depth", *SHORT]
-    words += ["-o", tmp_path / "out", "--ray", "local", "--workers", 2]
-    code = f"""
-import os, subprocess, sys
-sys.argv = {[str(word) for word in words]!r}
-import spackle.dataset.build as build
+    patch = f"""
 def dying(*arguments):
     with open({str(note)!r}, "w") as file:
         subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
-    os.kill(os.getpid(), 9)
-build._Build._note = dying
-from spackle.cli import main
-main()
-"""
-    process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    die()
+build._Build._note = dying"""
+    more = ("--ray", "local", "--workers", 2)
+    process = dying_build(tmp_path / "script.py", patch, place, tmp_path / "out", *more)
     assert process.wait() == -signal.SIGKILL
     # Ray's own agents take a minute.
     pids = [pid for pid, args in below(process.pid, note.read_text()) if "agent" not in args.lower()]
@@ -149,7 +134,7 @@ main()
         assert time.monotonic() < deadline, "a process of the cluster goes on"
         time.sleep(0.1)
     assert build(place, tmp_path / "out").code == 0
-    assert content(tmp_path / "out") == content(place / "whole")
+    assert content(tmp_path / "out") == content(whole)
 
 
 def below(top: int, listing: str) -> list[tuple[int, str]]:
@@ -162,14 +147,6 @@ def below(top: int, listing: str) -> list[tuple[int, str]]:
 # What cannot be -----------------------------------------------------------------------------------
 
 
-def test_without_ray_there_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    done = on("local", place, tmp_path / "out")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "--ray local: needs a package: pip install 'spackle-nvs[ray]'" in done.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_address_where_nobody_answers_is_a_line(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,19 +156,16 @@ def test_an_address_where_nobody_answers_is_a_line(
         nobody.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{nobody.getsockname()[1]}"
         done = on(address, place, tmp_path / "out")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert f"--ray {address}: no cluster: no answer within 1 seconds: is one running there" in done.err
+    refused(done, f"--ray {address}: no cluster: no answer within 1 seconds")
     monkeypatch.setattr(on_ray, "ANSWER_S", 60.0)
     done = on("nowhere", place, tmp_path / "out")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "--ray nowhere: no cluster: ValueError: " in done.err
+    refused(done, "--ray nowhere: no cluster: ValueError: ")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_cluster_without_room_is_a_line(place: Path, address: str, tmp_path: Path) -> None:
     done = on(address, place, tmp_path / "out", "--workers", 3)
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert f"--ray {address}: room for 2 of 3 workers, which take 1 CPUs each, on 1 nodes" in done.err
+    refused(done, f"--ray {address}: room for 2 of 3 workers")
     assert not (tmp_path / "out").exists()
 
 

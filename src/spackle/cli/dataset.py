@@ -74,7 +74,7 @@ def dataset_build(
     settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
     options = DatasetOptions(
         settings,
-        ViewChoices(seed, views, trajectory, disparity),
+        ViewChoices(seed, views, trajectory, disparity),  # type: ignore[arg-type]  # a kind, by its parser
         images=images,
         sample=sample,
         inpainter=inpainter,

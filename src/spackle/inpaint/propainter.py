@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -54,7 +54,7 @@ class PropainterInpainter:
         if not MIN_SIDE <= self._side <= MAX_SIDE:
             raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self._side}")
         version = _package_version()
-        self.files = weight_files(options.weights)
+        self.files: Mapping[str, Path] = weight_files(options.weights)
         self._networks = [_network(name, file) for name, file in self.files.items()]
         self._device = pick_device(options.device)
         self.version = f"1, pytorchcv {version}, long side {self._side}"

@@ -1,0 +1,30 @@
+"""A dataset that several files read."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from dataset_builds import build, write_inputs
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five photos and their depth."""
+    return write_inputs(tmp_path_factory.mktemp("dataset"))
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> Path:
+    """A dataset of them, built in one go by one process."""
+    done = build(place, place / "whole")
+    assert done.code == 0, done.err
+    (place / "said").write_text(done.err)
+    return place / "whole"
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+    """The dataset, to be damaged."""
+    return shutil.copytree(whole, tmp_path / "copy")

@@ -1,0 +1,266 @@
+"""What a dataset holds: every damage is found, every view is read once, and looks as it was drawn."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import sys
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from command import names_in, run
+from dataset_builds import VIEWS, refused
+from PIL import Image
+from scenes import box_before_wall, psnr, shifted
+from torch.utils.data import DataLoader
+
+from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
+from spackle.dataset.encode import (
+    decode_alpha,
+    decode_depth,
+    decode_gaussians,
+    encode_alpha,
+    encode_depth,
+    encode_gaussians,
+)  # fmt: skip
+from spackle.dataset.sample import END, pack, unpack
+from spackle.dataset.shards import load_manifest
+from spackle.dataset.views import APART, PathChoice, ViewChoices, draw_path, path_cameras
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.render import get_renderer
+from spackle.residual import hole_mask
+
+# Shards -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # its own
+def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
+    with tarfile.open(whole / "shard-000000.tar") as archive:
+        members = archive.getmembers()
+    names = [member.name for member in members]
+    keys = [name.partition(".")[0] for name in names]
+    assert keys == sorted(keys)
+    assert set(keys) == {"000000", "000001"}
+    assert names[:3] == ["000000.json", "000000.photo.png", "000000.base.safetensors"]
+    kinds = ("rgb", "target", "mask", "alpha", "depth")
+    assert set(names[3:]) >= {f"000000.{index:02d}.{kind}.png" for index in range(VIEWS) for kind in kinds}
+    assert {(m.mtime, m.uid, m.gid, m.uname, m.mode) for m in members} == {(0, 0, 0, "", 0o644)}
+    webdataset = pytest.importorskip("webdataset")
+    shards = [str(path) for path in sorted(whole.glob("*.tar"))]
+    groups = list(webdataset.WebDataset(shards, shardshuffle=False))
+    assert [group["__key__"] for group in groups] == [f"{number:06d}" for number in range(5)]
+    for number, group in enumerate(groups):
+        own = DatasetFiles(whole).group(number)
+        assert {f"{own.key}.{n}": data for n, data in group.items() if not n.startswith("__")} == dict(own.files)
+
+
+def test_the_files_say_what_the_paper_asks_for(whole: Path) -> None:
+    group = DatasetFiles(whole).group(4)
+    facts = group.facts
+    assert facts["photo"]["name"] == "deep/1.png"
+    assert facts["trajectory"]["kind"] in TRAJECTORIES
+    assert 0.1 <= facts["trajectory"]["disparity"] <= 0.6
+    assert facts["inpainter"]["name"] == "geometry"
+    assert facts["base"]["gaussians"] == len(group.base())
+    for index, view in enumerate(facts["views"]):
+        assert view.keys() >= {"K", "world_to_camera", "position", "width", "height", "depth_range", "hole"}
+        with Image.open(io.BytesIO(group.files[f"{group.key}.{index:02d}.mask.png"])) as mask:
+            assert set(np.unique(np.array(mask))) <= {0, 255}
+            assert float((np.array(mask) == 255).mean()) == view["hole"]
+
+
+def test_what_is_read_is_what_was_drawn(whole: Path, place: Path) -> None:
+    group = DatasetFiles(whole).group(0)
+    for index in range(group.views):
+        sample = group.view(index, with_base=True)
+        assert sample.base is not None
+        drawn = get_renderer().render(sample.base, sample.camera)
+        assert psnr(drawn.rgb, sample.rendering.rgb) > 55
+        assert float((drawn.alpha - sample.rendering.alpha).abs().max()) < 0.01
+        assert torch.equal(sample.mask, hole_mask(sample.rendering.alpha))
+        assert torch.equal(sample.target[~sample.mask], sample.rendering.rgb[~sample.mask])
+        if bool(sample.mask.any()):  # no hole is left black
+            assert float(sample.target[sample.mask].amax(-1).min()) > 0.2
+    first = group.view(0)
+    assert first.camera.world_to_camera.tolist() == torch.eye(4).tolist()
+    stored = torch.from_numpy(np.array(Image.open(place / "photos" / "0.png"))).float() / 255
+    assert torch.equal(first.photo, stored)
+    assert psnr(first.rendering.rgb, first.photo) > 25
+
+
+def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
+    assert run("dataset", "verify", copy).code == 0
+    manifest, rng = load_manifest(copy), np.random.default_rng(0)
+    for shard in manifest.shards:
+        path = copy / shard.file
+        original = path.read_bytes()
+        places = [0, len(original) - 1, len(original) - len(END), *rng.integers(0, len(original), 6).tolist()]
+        for place in places:
+            path.write_bytes(original[:place] + bytes([original[place] ^ 1]) + original[place + 1 :])
+            done = run("dataset", "verify", copy)
+            assert (done.code, len(done.lines)) == (1, 1)
+            hit = [s for s in shard.samples if s.offset <= place < s.offset + s.size]
+            expected = f"sample {hit[0].key} ({hit[0].photo}) is damaged" if hit else "damaged after its last sample"
+            assert f"{shard.file}: {expected}" in done.err
+        path.write_bytes(original)
+
+
+def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) -> None:
+    whole = (copy / "shard-000000.tar").read_bytes()
+    (copy / "shard-000000.tar").write_bytes(whole[: len(whole) // 2])
+    (copy / "shard-000001.tar").unlink()
+    (copy / "shard-000002.tar").write_bytes((copy / "shard-000002.tar").read_bytes() + b"x")
+    done = run("dataset", "verify", copy)
+    assert done.code == 1
+    for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: not there", "bytes instead of"):
+        assert words in done.err
+    with pytest.raises(InputError, match="000001"):
+        list(ViewDataset(copy))
+    text = (copy / "manifest.json").read_text()
+    (copy / "manifest.json").write_text(text.replace('"0.png"', '"9.png"'))
+    refused(run("dataset", "verify", copy), "manifest.json")
+    refused(run("dataset", "info", copy / "nothing"), "manifest.json: not there")
+    (copy / "manifest.json").unlink()
+    (copy / "manifest.json").mkdir()
+    refused(run("dataset", "info", copy), f"{copy}/manifest.json: cannot be read: Is a directory")
+
+
+def test_info_and_preview(whole: Path, tmp_path: Path) -> None:
+    done = run("dataset", "info", whole)
+    assert done.code == 0
+    assert f"5 photos, {5 * VIEWS} views, 3 shards" in done.out
+    assert "holes of each view: 0.0%" in done.out
+    done = run("dataset", "preview", whole, "-o", tmp_path / "look", "--photos", 2, "--views", 3)
+    assert done.code == 0, done.err
+    assert names_in(tmp_path / "look") == {"sheet.png", "trajectory.mp4"}
+    with Image.open(tmp_path / "look" / "sheet.png") as sheet:
+        assert sheet.size == (3 * 72, 2 * 3 * 54)
+
+
+# Readers ------------------------------------------------------------------------------------------
+
+
+def names_of(samples: list[DatasetView]) -> list[tuple[str, int]]:
+    return [(sample.key, sample.index) for sample in samples]
+
+
+def test_ranks_and_workers_read_every_view_once(whole: Path) -> None:
+    every = {(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)}
+    assert names_of(list(ViewDataset(whole))) == sorted(every)
+    for shuffle in (0, 7):
+        for ranks in (1, 2, 3, 7):
+            parts = [list(ViewDataset(whole, shuffle=shuffle, rank=r, ranks=ranks)) for r in range(ranks)]
+            seen = [name for part in parts for name in names_of(part)]
+            assert len(seen) == len(every)
+            assert set(seen) == every
+    loaders = [DataLoader(ViewDataset(whole, rank=r, ranks=2), batch_size=None, num_workers=2) for r in range(2)]
+    assert sorted(name for loader in loaders for name in names_of(list(loader))) == sorted(every)
+    with pytest.raises(ValueError, match="rank"):
+        ViewDataset(whole, rank=2, ranks=2)
+
+
+def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: Path) -> None:
+    def order(seed: int, epoch: int) -> list[tuple[str, int]]:
+        dataset = ViewDataset(whole, shuffle=8, seed=seed)
+        dataset.set_epoch(epoch)
+        return names_of(list(dataset))
+
+    assert order(0, 0) == order(0, 0)
+    assert len({tuple(order(seed, epoch)) for seed in (0, 1) for epoch in (0, 1)}) == 4
+
+
+def test_samples_are_values_of_the_house(whole: Path) -> None:
+    sample = next(iter(ViewDataset(whole, with_base=True)))
+    assert isinstance(sample.camera, Camera)
+    assert isinstance(sample.base, Gaussians)
+    assert sample.rendering.rgb.shape == sample.target.shape == (54, 72, 3)
+    assert sample.mask.dtype == torch.bool
+    assert next(iter(ViewDataset(whole))).base is None
+
+
+def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fsspec = pytest.importorskip("fsspec")
+    memory = fsspec.filesystem("memory")
+    for path in whole.iterdir():
+        memory.pipe(f"/there/{path.name}", path.read_bytes())
+    assert names_of(list(ViewDataset("memory://there"))) == names_of(list(ViewDataset(whole)))
+    assert run("dataset", "verify", "memory://there").code == 0
+    refused(run("dataset", "info", "nothing://there"), "nothing://there/manifest.json")
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    refused(run("dataset", "info", "memory://there"), "pip install fsspec")
+
+
+# Views and encoding -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("views", [2, 3, 5, 19, 20])
+def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind, views: int) -> None:
+    camera = Camera.from_focal(80.0, 96, 72)
+    cameras = path_cameras(PathChoice(kind, 0.4), camera, DepthRange(2.0, 3.0), views)
+    assert len(cameras) == views
+    assert cameras[0] is camera
+    eyes = torch.stack([view.position.double() for view in cameras])
+    apart = torch.cdist(eyes, eyes) + torch.eye(views)
+    assert float(apart.min()) > APART
+    with pytest.raises(ValueError, match="different views"):
+        path_cameras(PathChoice(kind, 0.0), camera, DepthRange(2.0, 3.0), views)
+
+
+def test_a_photos_path_depends_on_the_photo_and_the_seed() -> None:
+    drawn = [draw_path(ViewChoices(), hashlib.sha256(bytes([n])).hexdigest()) for n in range(40)]
+    assert {path.kind for path in drawn} == set(TRAJECTORIES)
+    assert all(0.1 <= path.disparity <= 0.6 for path in drawn)
+    path = draw_path(ViewChoices(), "ab")
+    assert draw_path(ViewChoices(), "ab") == path != draw_path(ViewChoices(seed=1), "ab")
+    assert draw_path(ViewChoices(trajectory="swipe"), "ab") == PathChoice("swipe", path.disparity)
+
+
+def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:
+    rng = np.random.default_rng(0)
+    z = torch.from_numpy(np.exp(rng.uniform(np.log(0.05), np.log(2e4), (40, 50)))).float()
+    alpha = torch.from_numpy(rng.uniform(0, 1, (40, 50))).float()
+    alpha[0] = 0
+    data, (near, far) = encode_depth(z, alpha)
+    back = decode_depth(data, near, far)
+    known = alpha > 0
+    assert bool((back[~known] == 0).all())
+    error = ((back - z).abs() / z)[known]
+    assert float(error.max()) < np.log(far / near) / 131068 + 1e-6 < 1.1e-4
+    alpha[1] = 0.95 + torch.linspace(-2e-5, 2e-5, 50)
+    mask = hole_mask(alpha)
+    back = decode_alpha(encode_alpha(alpha, mask, 0.95))
+    assert torch.equal(hole_mask(back), mask)
+    assert float((back - alpha).abs().max()) <= 1 / 65535
+    nothing, limits = encode_depth(torch.zeros(4, 4), torch.zeros(4, 4))
+    assert not bool(decode_depth(nothing, *limits).any())
+
+
+def test_gaussians_come_back_and_look_the_same() -> None:
+    scene = box_before_wall()
+    base = scene.base()
+    data = encode_gaussians(base)
+    back = decode_gaussians(data)
+    assert len(data) < 35 * len(base) + 1000
+    assert torch.equal(back.means, base.means)
+    torch.testing.assert_close(back.scales, base.scales, rtol=3e-4, atol=0)
+    view = shifted(scene.camera, 0.4)
+    before, after = (get_renderer().render(gaussians, view) for gaussians in (base, back))
+    assert psnr(before.rgb, after.rgb) > 60
+    assert len(decode_gaussians(encode_gaussians(Gaussians.empty()))) == 0
+    with pytest.raises(ValueError, match="no Gaussians"):
+        decode_gaussians(b"nothing")
+
+
+def test_archives_come_back_and_follow_one_another() -> None:
+    one, other = [("a.txt", b"1" * 600), ("a.png", b"")], [("b.txt", b"2" * 512)]
+    assert unpack(pack(one)) == dict(one)
+    assert unpack(pack(one) + pack(other) + END) == dict(one + other)
+    with pytest.raises(ValueError, match="archive"):
+        unpack(b"nothing" * 100)

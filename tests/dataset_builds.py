@@ -1,0 +1,71 @@
+"""Small datasets: photos with depth, builds of them, and builds that are killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from command import Run, run
+from photos import metres, picture, write_depth
+from PIL import Image
+
+VIEWS = 4
+SHORT = ["--base", "rgbd", "--views", VIEWS, "--shard-size", 2, "--threads", 1]
+
+
+def write_inputs(place: Path, count: int = 5, width: int = 72, height: int = 54) -> Path:
+    """Photos in a folder and its subfolder, and their depth."""
+    for number in range(count):
+        name = f"{'deep/' if number == 1 else ''}{number}"
+        path = place / "photos" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.clip(picture(width, height).astype(int) + 8 * number, 0, 255).astype(np.uint8)
+        Image.fromarray(pixels).save(path)
+        write_depth(place / "depth" / f"{name}.npy", metres(width, height))
+    return place
+
+
+def words_of(place: Path, output: Path, *more: object) -> list[object]:
+    options = ["--photos", place / "photos", "--depth", place / "depth", "-o", output]
+    return ["dataset", "build", *options, *SHORT, *more]
+
+
+def build(place: Path, output: Path, *more: object) -> Run:
+    return run(*words_of(place, output, *more))
+
+
+def refused(done: Run, *said: str) -> None:
+    """A command that ended with one line, which names what is wrong."""
+    assert (done.code, len(done.lines)) == (2, 1), done.err
+    for words in said:
+        assert words in done.err
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def dying_build(script: Path, patch: str, place: Path, output: Path, *more: object) -> subprocess.Popen[bytes]:
+    """A build in a process of its own, in which `patch` makes `die()` be called."""
+    script.write_text(f"""
+import multiprocessing, os, subprocess, sys
+import spackle.dataset.build as build, spackle.dataset.maker as maker
+sys.argv = {["spackle", *map(str, words_of(place, output, *more))]!r}
+def die(*arguments):
+    os.kill(os.getpid(), 9)
+if __name__ == "__main__":
+{chr(10).join("    " + line for line in patch.splitlines())}
+    from spackle.cli import main
+    main()
+""")
+    return subprocess.Popen([sys.executable, script], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process still does anything; one that nobody has waited for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
