@@ -16,12 +16,22 @@ from spackle.gaussians import Gaussians
 
 TrajectoryKind = Literal["swipe", "shake", "rotate", "rotate_forward"]
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
+PathUnit = Literal["metres", "disparity"]
+UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
 
 NEAR_QUANTILE = 0.001  # z_near: sets how far the eye may go
 FOCUS_QUANTILE = 0.1  # depth that the camera keeps looking at
 MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
 MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
 MAX_ZOOM = 0.15  # forward motion of rotate_forward, in units of z_near
+
+MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
+UP = (0.0, -1.0, 0.0)  # where nobody says otherwise: the photo's
+SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
+LEAST_STEP = 1e-6  # seconds between two keys
+STILL = 1e-100  # slopes below it are none; their inverse would overflow
+LEAST_TILT = 1e-3  # radians between the view and its up
+Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,17 +135,6 @@ def _eyes(kind: TrajectoryKind, side: float, forward: float, frames: int) -> Ten
     else:
         xyz = [side * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
     return torch.stack(xyz, dim=-1)
-
-
-PathUnit = Literal["metres", "disparity"]
-UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
-MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
-UP = (0.0, -1.0, 0.0)  # where nobody says otherwise: the photo's
-SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
-LEAST_STEP = 1e-6  # seconds between two keys
-STILL = 1e-100  # slopes below it are none; their inverse would overflow
-LEAST_TILT = 1e-3  # radians between the view and its up
-Array = NDArray[np.float64]
 
 
 class PathError(ValueError):

@@ -51,14 +51,7 @@ class Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw.
-
-        Args:
-            ctx: keeps what the gradient needs.
-            view: the camera.
-            wanted: [rows, columns] bool, the tiles to draw.
-            tensors: rgb, depth and alpha of `onto` (or None), then the five of each set; all float32.
-        """
+        """Draw; `tensors` are rgb, depth and alpha of `onto` (or None), then the five of each set, all float32."""
         under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
         sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
         onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
@@ -72,9 +65,7 @@ class Draw(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """From the gradients of the three images to those of the tensors that asked for one."""
-        saved = ctx.saved_tensors
-        outputs = tuple(as_array(t) for t in saved[:3])
-        fields = saved[3:]
+        outputs, fields = tuple(as_array(t) for t in ctx.saved_tensors[:3]), ctx.saved_tensors[3:]
         needs = ctx.needs_input_grad[2:]
         under = [
             keep_undrawn(gradient, ctx.drawing.wanted) if need else None

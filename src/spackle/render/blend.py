@@ -106,6 +106,8 @@ LANES = PATCH * PATCH
 STOP = np.float32(TRANSMITTANCE_STOP)
 SLACK = np.float32(1e-3)  # pixels; room for rounding
 SIDE = np.float32(TILE)
+RECORD = BLUE + 1  # floats in a record
+CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
 
 
 @kernel
@@ -180,10 +182,6 @@ def place_of(row: int, column: int) -> int:
     """Where a plane keeps a pixel of the tile."""
     patch = row // PATCH * PATCHES + column // PATCH
     return patch * LANES + row % PATCH * PATCH + column % PATCH
-
-
-RECORD = BLUE + 1  # floats in a record
-CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
 
 
 @kernel

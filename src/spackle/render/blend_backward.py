@@ -19,7 +19,7 @@ Array = npt.NDArray[Any]
 # v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
 SUMS = 10
 
-# The workspace is one flat buffer of planes, as in `patch`, but with the pixels row by row: the light that is
+# The workspace is one flat buffer of planes, as in `blend`, but with the pixels row by row: the light that is
 # left, what lies behind the Gaussian in hand, the gradients of red, green, blue, depth and alpha.
 BEHIND = 1 * PLANE
 GRADIENTS = 2 * PLANE

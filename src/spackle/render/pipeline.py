@@ -64,14 +64,9 @@ class Drawing:
 def draw(
     sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
 ) -> Drawing:
-    """Draw sets of Gaussians as one, in the wanted tiles, over a copy of `onto`.
+    """Draw sets of Gaussians as one, in the wanted tiles [rows, columns] bool, over a copy of `onto`.
 
-    Args:
-        sets: any number of sets.
-        view: the camera.
-        wanted: [rows, columns] bool, see `wanted_tiles`.
-        onto: what the other tiles show; black and empty where None.
-        keep_linear: keep the colour before sRGB, which the gradient needs.
+    The other tiles are black and empty where `onto` is None. The gradient needs the colour before sRGB (`keep_linear`).
     """
     canvas = Canvas.prepare(view, onto, keep_linear)
     splats, spans = project(sets, view, wanted)
@@ -110,9 +105,6 @@ def project(
     """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
 
     Args:
-        sets: any number of sets.
-        view: the camera.
-        wanted: [rows, columns] bool, see `wanted_tiles`.
         splats: where they go, from number `first` on; new ones where None.
         first: how many are there already.
 

@@ -17,6 +17,7 @@ from spackle.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 
 Array = npt.NDArray[Any]
+Numbers = Array | tuple[Any, ...]
 
 # A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy
 # from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square of this
@@ -26,6 +27,22 @@ RECORD = 12  # floats in a record
 
 SPARE = 1 << 16  # Gaussians
 BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place
+
+# What is measured of a block of Gaussians is one flat buffer of planes, because the compiler then knows that they do
+# not overlap: first the record's, then the box of tiles touched. All are float32, which holds a box exactly.
+LEFT, RIGHT, TOP, BOTTOM = range(DEPTH + 1, DEPTH + 5)
+BLOCK = 256  # Gaussians: the buffer stays in the first-level cache
+BUFFER = (BOTTOM + 1) * BLOCK
+
+ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half
+LN_2 = math.log(2.0)
+# ln((1 + t) / (1 - t)) is 2t + 2t³/3 + 2t⁵/5 + …; what is left out is below float64's last digit for t² < 0.0295.
+L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
+
+ONCE, TWICE, THRICE = np.uint64(1), np.uint64(2), np.uint64(3)
+LOG2_E = math.log2(math.e)
+LOG_FAINT = math.log(ALPHA_MIN)
+FINITE = 1e30  # larger values would overflow float32 further on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,25 +105,6 @@ class Splats:
 def count_before(wanted: Array) -> Array:
     """How many tiles are wanted above and to the left of each corner, [rows + 1, columns + 1] int32."""
     return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
-
-
-Numbers = Array | tuple[Any, ...]
-
-# What is measured of a block of Gaussians is one flat buffer of planes, because the compiler then knows that they do
-# not overlap: first the record's, then the box of tiles touched. All are float32, which holds a box exactly.
-LEFT, RIGHT, TOP, BOTTOM = range(DEPTH + 1, DEPTH + 5)
-BLOCK = 256  # Gaussians: the buffer stays in the first-level cache
-BUFFER = (BOTTOM + 1) * BLOCK
-
-ROOT_HALF_BITS = np.int32(0x3F3504F3)  # of the square root of a half
-LN_2 = math.log(2.0)
-# ln((1 + t) / (1 - t)) is 2t + 2t³/3 + 2t⁵/5 + …; what is left out is below float64's last digit for t² < 0.0295.
-L3, L5, L7, L9, L11, L13, L15, L17, L19 = (2.0 / k for k in range(3, 20, 2))
-
-ONCE, TWICE, THRICE = np.uint64(1), np.uint64(2), np.uint64(3)
-LOG2_E = math.log2(math.e)
-LOG_FAINT = math.log(ALPHA_MIN)
-FINITE = 1e30  # larger values would overflow float32 further on
 
 
 @kernel

@@ -34,7 +34,7 @@ def project_backward(
     """Gradients of Gaussians start..stop of one set; arithmetic is float64 as in `project_chunk`.
 
     Args:
-        table: [N, SUMS], what the pixels give to each Gaussian of the set (see `walk`). All
+        table: [N, SUMS], what the pixels give to each Gaussian of the set (see SUMS). All
             zeros mean that no pixel saw it; the gradients are then left as they are.
     """
     factor, axes, jacobian, local = np.empty((2, 3)), np.empty((3, 3)), np.zeros((2, 3)), np.empty(3)
