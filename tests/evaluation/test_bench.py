@@ -93,7 +93,7 @@ def test_times_are_medians_of_runs_that_add_up_and_spread_over_the_measured_imag
     assert (found["share"], found["merged"]) == (0.02, 1020)
     assert set(BASE_PATH + EXTRA) == set(STAGES)
     spread = results().spread("0.4", "base_ms")
-    assert dataclasses.astuple(spread) == pytest.approx((3, 9800 / 3, 2100, 2800, 4200))
+    assert spread == pytest.approx((3, 9800 / 3, 2100, 2800, 4200))
     image = results().images[1]
     assert ImageCost.of(json.loads(json.dumps(image.plain()))) == image
     with pytest.raises(KeyError):

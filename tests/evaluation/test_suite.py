@@ -203,6 +203,11 @@ def test_sections_are_measured_once_and_gathered(tmp_path: Path) -> None:
     assert row["median"] == pytest.approx(np.median(row["values"]))
     text = (output / "suite.md").read_text()
     assert all(f"**{name}.**" in text or f"| {name} | " in text for name in TITLES)
+    other = json.loads((output / "sections" / "renderer.json").read_text()) | {"inputs": {"weights": "others"}}
+    (output / "sections" / "sharp.json").write_text(json.dumps(other))
+    assert run(*words, "--only", "renderer").code == 0
+    kept = json.loads((output / "suite.json").read_text())["sections"]
+    assert kept.keys() == {"limits", "renderer", "sharp"}  # what is not asked for stays, whatever its weights were
     refused = run(*words[:3], 32 + SIDE, *words[4:])
     assert (refused.code, f"side: {SIDE} -> {32 + SIDE}" in refused.err) == (2, True)
 

@@ -142,10 +142,10 @@ def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter:
 
 
 def load_part(path: Path, inputs: object, decode: Callable[[Any], T]) -> T | None:
-    """What an earlier run measured; None where it is not there, or of other inputs."""
+    """What an earlier run measured; None where it is not there, or of other inputs than these (None: of any)."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return decode(content["found"]) if content["inputs"] == inputs else None
+        return decode(content["found"]) if inputs in (None, content["inputs"]) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

@@ -7,7 +7,7 @@ import itertools
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -103,8 +103,7 @@ class ImageCost:
         return ImageCost(str(content["name"]), dict(content["facts"]), views, content["problem"])
 
 
-@dataclasses.dataclass(frozen=True)
-class Spread:
+class Spread(NamedTuple):
     """Of a figure over images."""
 
     n: int
@@ -138,14 +137,13 @@ class Efficiency:
     def plain(self) -> dict[str, Any]:
         """Ready for JSON: everything, and the medians beside it."""
         keys = itertools.product(self.settings, self.measured[0].views[0].figures())
-        spreads = [{"setting": s, "figure": name} | dataclasses.asdict(self.spread(s, name)) for s, name in keys]
+        spreads = [{"setting": s, "figure": name} | self.spread(s, name)._asdict() for s, name in keys]
         problems = {image.name: image.problem for image in self.images if image.problem is not None}
         images = [image.plain() for image in self.images]
         return {"config": dict(self.config), "problems": problems, "spreads": spreads, "images": images}
 
 
-@dataclasses.dataclass(frozen=True)
-class TimedBase:
+class TimedBase(NamedTuple):
     """A photo's Gaussians, and how long they took."""
 
     prediction: BasePrediction

@@ -126,11 +126,13 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
     return "complete"
 
 
-def _inputs(name: str, options: SuiteOptions) -> dict[str, Any]:
-    """Everything that decides a section's figures besides the suite's configuration."""
+def _inputs(name: str, options: SuiteOptions) -> dict[str, Any] | None:
+    """Everything that decides a section's figures besides the suite's configuration; None: the section is not asked."""
     base = options.base
-    if name != "sharp" or not options.sharp:
+    if name != "sharp":
         return {}
+    if not options.sharp or (options.only and name not in options.only):
+        return None
     settings = {"precision": base.precision, "low_memory": base.low_memory, "windows": base.windows}
     weights = weights_digest(base.files["checkpoint"])
     return {"weights": weights, **settings, "compiled": base.compiled, "runs": options.base_runs or 1}

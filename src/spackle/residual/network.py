@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import itertools
@@ -69,8 +68,6 @@ class ResidualNet(nn.Module):
 
     The last layers start at zero, so an untrained network returns the seeds unchanged.
     """
-
-    compiled = False  # see `compile_network`
 
     def __init__(self) -> None:
         super().__init__()
@@ -173,7 +170,7 @@ def predict_deltas(
     device = cues.mask.device
     dtype = pick_dtype(precision, device)
     chosen = torch.ones_like(cues.mask) if dense else cues.mask
-    able = isinstance(network, ResidualNet) and not network.compiled and device.type == "cpu" and not dense
+    able = isinstance(network, ResidualNet) and device.type == "cpu" and not dense
     few = cast(ResidualNet, network) if able else None
     field = cues.alpha.new_zeros(*cues.mask.shape, DELTA_CHANNELS)
     for inner, outer in crops_around(chosen, STRIDE):
@@ -185,22 +182,6 @@ def predict_deltas(
             found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
         field[there][own] = found.float()
     return field
-
-
-def compile_network(network: ResidualNet, backend: str = "inductor") -> ResidualNet:
-    """The same network, sharing its weights, that `torch.compile` translates when it is first asked.
-
-    It takes a C++ compiler on a processor, and minutes rather than seconds, but not again for each size; a machine that
-    cannot do it says so by a RuntimeError at the first call. Values differ from the network's by rounding.
-
-    Args:
-        network: stays as it is.
-        backend: one of PyTorch's; "eager" translates nothing.
-    """
-    twin = copy.copy(network)
-    twin.compiled = True
-    twin.compile(dynamic=True, backend=backend)
-    return twin
 
 
 def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
