@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -27,10 +26,10 @@ from urllib.error import URLError
 from urllib.request import Request
 
 import pytest
+from command import Run, run
 from rich.console import Console
 from sites import Site, serve
 
-from spackle import cli
 from spackle.app.weights import get_weights
 from spackle.downloads import WEIGHTS, DownloadRecord, check_recorded, download, installed, transfer, weights_folder
 from spackle.errors import InputError
@@ -186,37 +185,24 @@ def test_a_file_that_changed_starts_over(site: Site, begun: Path, size: int, if_
     assert ranges(site) == [f"bytes={BREAK}-", *([] if if_range else [None])]
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda part, version: version.unlink(),
-        lambda part, version: version.write_text("{"),
-        lambda part, version: version.write_text("[]"),
-        lambda part, version: version.write_text('{"size": "large"}'),
-        lambda part, version: version.write_text("[" * 100_000),
-        lambda part, version: version.write_text(version.read_text().replace(str(len(CONTENT)), "1e400")),
-        lambda part, version: version.write_text(re.sub('"etag": .*', '"etag": 5,', version.read_text())),
-        lambda part, version: version.write_text(version.read_text().replace("127.0.0.1", "127.0.0.2")),
-        lambda part, version: part.unlink(),
-        lambda part, version: part.write_bytes(b""),
-        lambda part, version: part.write_bytes(b"x" * (len(CONTENT) + 1)),
-    ],
-    ids=[
-        "no version",
-        "cut off",
-        "no fields",
-        "few fields",
-        "too deep",
-        "endless",
-        "no tag",
-        "other address",
-        "no part",
-        "empty",
-        "too long",
-    ],
-)
-def test_what_cannot_be_gone_on_with_is_dropped(site: Site, begun: Path, spoil: Callable[[Path, Path], object]) -> None:
-    spoil(begun.with_name("weights.pt.part"), begun.with_name("weights.pt.part.json"))
+SPOILT: dict[str, Callable[[Path, Path], object]] = {
+    "no version": lambda part, version: version.unlink(),
+    "cut off": lambda part, version: version.write_text("{"),
+    "no fields": lambda part, version: version.write_text("[]"),
+    "few fields": lambda part, version: version.write_text('{"size": "large"}'),
+    "too deep": lambda part, version: version.write_text("[" * 100_000),
+    "endless": lambda part, version: version.write_text(version.read_text().replace(str(len(CONTENT)), "1e400")),
+    "no tag": lambda part, version: version.write_text(re.sub('"etag": .*', '"etag": 5,', version.read_text())),
+    "elsewhere": lambda part, version: version.write_text(version.read_text().replace("127.0.0.1", "127.0.0.2")),
+    "no part": lambda part, version: part.unlink(),
+    "empty": lambda part, version: part.write_bytes(b""),
+    "too long": lambda part, version: part.write_bytes(b"x" * (len(CONTENT) + 1)),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
+def test_what_cannot_be_gone_on_with_is_dropped(site: Site, begun: Path, spoil: str) -> None:
+    SPOILT[spoil](begun.with_name("weights.pt.part"), begun.with_name("weights.pt.part.json"))
     is_whole(begun, site, download(site.url, begun))
     assert ranges(site) == [None]
 
@@ -375,7 +361,7 @@ def test_https_is_not_given_up_on_the_way() -> None:
     "url",
     [
         "",
-        "weights.pt",
+        "a.pt",
         "file:///etc/hostname",
         "ftp://a.org/w.pt",
         "data:,x",
@@ -530,15 +516,6 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 # The commands
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What a command line came to."""
-
-    code: object
-    out: str
-    err: str
-
-
 @pytest.fixture
 def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of weights, not there yet."""
@@ -546,17 +523,8 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "weights"
 
 
-def run(*arguments: object) -> Run:
-    """`spackle weights`, within this process."""
-    out, err = io.StringIO(), io.StringIO()
-    code: object = 0
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.setattr(sys, "argv", ["spackle", "weights", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = end.code or 0
-    return Run(code, out.getvalue(), err.getvalue())
+def weights_command(*arguments: object) -> Run:
+    return run("weights", *arguments)
 
 
 def refuses(result: Run, *words: object) -> None:
@@ -571,49 +539,49 @@ def test_get_tells_scripts_where_the_file_lies(site: Site, weights: Path) -> Non
     for digest, new in ((known, True), (known, False), (None, False)):
         if digest is None:
             (weights / f"{FILE}.json").unlink()
-        result = run("get", "sharp", "--url", site.url, "--json")
+        result = weights_command("get", "sharp", "--url", site.url, "--json")
         assert result.code == 0, result.err
         told = {"name": "sharp", "file": str(weights / FILE), "bytes": len(CONTENT)}
         assert json.loads(result.out) == {**told, "sha256": digest, "downloaded": new}
-    failed = run("get", "blunt", "--json")
+    failed = weights_command("get", "blunt", "--json")
     assert (failed.code, list(json.loads(failed.out))) == (2, ["error"])
 
 
 def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Path) -> None:
     assert installed("sharp") is None
-    first = run("get", "sharp", "--url", site.url)
+    first = weights_command("get", "sharp", "--url", site.url)
     assert first.code == 0, first.err
     assert installed("sharp") == weights / FILE
     assert set(os.listdir(weights)) == {FILE, f"{FILE}.json"}
     assert first.err.count("research only") == first.err.count("LICENSE_MODEL") == 1
     last = first.err.splitlines()[-1]
     assert all(part in last for part in ("1.0 MB", hashlib.sha256(CONTENT).hexdigest(), str(weights / FILE)))
-    again = run("get", "sharp", "--url", site.url)
+    again = weights_command("get", "sharp", "--url", site.url)
     assert (again.code, len(again.err.splitlines())) == (0, 1)
     assert all(part in again.err for part in ("already", "intact", str(weights / FILE)))
     assert len(site.requests) == 1
-    forced = run("get", "sharp", "--url", site.url, "--force")
+    forced = weights_command("get", "sharp", "--url", site.url, "--force")
     assert forced.err.count("research only") == 1
     assert len(site.requests) == 2
 
 
 def test_get_refuses_a_damaged_file_and_force_repairs_it(site: Site, weights: Path) -> None:
-    assert run("get", "sharp", "--url", site.url).code == 0
+    assert weights_command("get", "sharp", "--url", site.url).code == 0
     damage(weights / FILE)
-    refuses(run("get", "sharp", "--url", site.url), weights / FILE, "delete it")
-    assert run("get", "sharp", "--url", site.url, "--force").code == 0
+    refuses(weights_command("get", "sharp", "--url", site.url), weights / FILE, "delete it")
+    assert weights_command("get", "sharp", "--url", site.url, "--force").code == 0
     assert (weights / FILE).read_bytes() == CONTENT
 
 
 def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -> None:
     weights.mkdir()
     (weights / FILE).write_bytes(b"mine")
-    result = run("get", "sharp", "--url", closed())  # leaves a file of your own
+    result = weights_command("get", "sharp", "--url", closed())  # leaves a file of your own
     assert result.code == 0
     assert "unchecked" in result.err
     assert (weights / FILE).read_bytes() == b"mine"
     for output, path in (("a/b", f"a/b/{FILE}"), ("a/c.pt", "a/c.pt"), ("a/d.PT", "a/d.PT")):
-        result = run("get", "sharp", "--url", site.url, "-o", tmp_path / output)
+        result = weights_command("get", "sharp", "--url", site.url, "-o", tmp_path / output)
         assert result.code == 0, result.err
         assert check_recorded(tmp_path / path)
         assert "--checkpoint" in result.err
@@ -621,20 +589,24 @@ def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -
 
 
 def test_get_in_one_line_where_it_fails(site: Site, weights: Path) -> None:
-    refuses(run("get", "nothing"), "nothing", "sharp")
-    refuses(run("get", "sharp", "--url", closed()), closed(), "check the network")
-    refuses(run("get", "sharp", "--url", "file:///etc/hostname"), "file:///etc/hostname")
-    refuses(run("get", "sharp", "--url", ""), "'': not an address")
-    refuses(run("get", "sharp", "--url", "http://me:secret@127.0.0.1:1/"), "address at 127.0.0.1 with", "password")
+    refuses(weights_command("get", "nothing"), "nothing", "sharp")
+    refuses(weights_command("get", "sharp", "--url", closed()), closed(), "check the network")
+    refuses(weights_command("get", "sharp", "--url", "file:///etc/hostname"), "file:///etc/hostname")
+    refuses(weights_command("get", "sharp", "--url", ""), "'': not an address")
+    refuses(
+        weights_command("get", "sharp", "--url", "http://me:secret@127.0.0.1:1/"),
+        "address at 127.0.0.1 with",
+        "password",
+    )
     site.status = 404
-    refuses(run("get", "sharp", "--url", site.url), site.url, "404")
+    refuses(weights_command("get", "sharp", "--url", site.url), site.url, "404")
     assert not weights.exists()
 
 
 @pytest.mark.parametrize(("small", "capital"), [("a.pt", "b.PT"), ("a.safetensors", "b.SAFETENSORS")])
 def test_make_takes_suffixes_in_capitals(tmp_path: Path, small: str, capital: str) -> None:
     for name in (small, capital):
-        result = run("make", tmp_path / name, "--size", "tiny")
+        result = weights_command("make", tmp_path / name, "--size", "tiny")
         assert result.code == 0, result.err
     assert (tmp_path / small).stat().st_size == (tmp_path / capital).stat().st_size
     assert zipfile.is_zipfile(tmp_path / capital) == small.endswith(".pt")  # a .pt file is a zip archive
@@ -648,22 +620,22 @@ def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monk
         patch.setattr(
             Reporter, "say", lambda self, line: interrupt() if "1.0 MB" in line else print(line, file=sys.stderr)
         )
-        result = run("get", "sharp", "--url", site.url)
+        result = weights_command("get", "sharp", "--url", site.url)
     assert result.code == 130
     assert "goes on from there" in result.err
-    assert run("get", "sharp", "--url", site.url).code == 0
+    assert weights_command("get", "sharp", "--url", site.url).code == 0
     assert ranges(site)[1] is not None
 
 
 def test_list_says_what_is_here(site: Site, weights: Path) -> None:
     def listed() -> str:
-        result = run("list")
+        result = weights_command("list")
         assert (result.code, result.err) == (0, "")
         assert all(part in result.out for part in ("sharp", FILE, "research only", str(weights)))
         return result.out
 
     assert "not here" in listed()
-    assert run("get", "sharp", "--url", site.url).code == 0
+    assert weights_command("get", "sharp", "--url", site.url).code == 0
     assert "1.0 MB, whole" in listed()
     (weights / FILE).write_bytes(CONTENT[:-1])
     assert "damaged" in listed()
