@@ -8,13 +8,16 @@ import io
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import av
 import pytest
 
 from spackle import cli
 
+SHORT = ("--frames", "3")
 FILES = {"base.ply", "scene.ply", "video.mp4", "report.json"}
 
 
@@ -52,3 +55,29 @@ def report_of(folder: Path) -> dict[str, Any]:
 
 def names_in(folder: Path) -> set[str]:
     return set(os.listdir(folder))
+
+
+def shortened(options: Sequence[object]) -> tuple[object, ...]:
+    """Options of three frames, but where views are given: these are the frames."""
+    return tuple(options) if "--cameras" in options else (*SHORT, *options)
+
+
+def predicted(photo: Path, depth: Path, out: Path, *options: object) -> Run:
+    """`spackle predict` that has to succeed, three frames long."""
+    result = run("predict", "-i", photo, "--depth", depth, "-o", out, *shortened(options))
+    assert result.code == 0, result.err
+    return result
+
+
+def refuses(result: Run, *named: object) -> None:
+    """One line that names the culprit."""
+    assert (result.code, result.out, len(result.lines)) == (2, "", 1), result.err
+    assert result.lines[0].startswith("error: ")
+    for name in named:
+        assert str(name) in result.lines[0]
+
+
+def decode(video: Path) -> list[av.VideoFrame]:
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        return list(container.decode(video=0))

@@ -50,10 +50,3 @@ def base_of(tmp_path: Path, *options: object) -> tuple[dict[str, Any], Run]:
     result = predict(tmp_path, *options)
     assert result.code == 0, result.err
     return report_of(tmp_path / "out" / Path(str(options[options.index("-i") + 1])).stem)["base"], result
-
-
-def refuses(result: Run, *named: object) -> None:
-    """One line that names the culprit."""
-    assert (result.code, len(result.lines)) == (2, 1), result.err
-    for name in named:
-        assert str(name) in result.err

@@ -1,0 +1,468 @@
+"""`open_base`: which base a photo gets and why, whose lens counts, and what stops a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import portraits
+import pytest
+import torch
+from photos import HEIGHT, WIDTH, calibration, metres, write_depth, write_photo
+from safetensors.torch import load_file, save_file
+from scenes import same_bits
+from sharp_weights import gaussians_of, write_tiny
+from stand_in import StandIn, write_lite
+
+import spackle
+from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.hf import HfBase
+from spackle.bases.lite.base import LiteBase
+from spackle.bases.open import AUTO, KINDS, BaseError, BaseSettings, Choice, open_base
+from spackle.bases.photo_depth import load_photo_depth
+from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.layers import TINY
+from spackle.device import MemoryShort
+from spackle.downloads import WEIGHTS
+from spackle.errors import InputError
+from spackle.image import Photo, load_photo
+
+SHARP_FILE = "sharp_2572gikvuh.pt"
+NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Weights of both networks, which show no scene."""
+    folder = tmp_path_factory.mktemp("weights")
+    return {"sharp": write_tiny(folder / SHARP_FILE), "lite": write_lite(folder / "lite.safetensors")}
+
+
+@pytest.fixture(autouse=True)
+def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine without SHARP, and with weights of lite that belong to the test."""
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
+    lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
+    monkeypatch.setattr("spackle.bases.lite.base.SHIPPED", lite)
+    return lite
+
+
+@pytest.fixture
+def sharp(tmp_path: Path, made: dict[str, Path]) -> Path:
+    """Weights of SHARP where a download puts them."""
+    (tmp_path / "weights").mkdir()
+    return Path(shutil.copy(made["sharp"], tmp_path / "weights"))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """SHARP and models of the hub in no time, from files that are not read; holds what was asked for."""
+    asked: list[dict[str, Any]] = []
+
+    def load(name: str) -> Callable[..., StandIn]:
+        return lambda path, **options: (asked.append({"path": path, **options}), StandIn(name or f"hf:{path}"))[1]
+
+    monkeypatch.setattr(SharpBase, "load", load("sharp"))
+    monkeypatch.setattr(HfBase, "load", load(""))
+    return asked
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    return write_photo(tmp_path / "photo.png")
+
+
+def portrait(path: Path) -> Path:
+    """A photo with depth in it."""
+    return portraits.write(path, portraits.apple_jpeg(portraits.codes()))
+
+
+def broken_portrait(path: Path) -> Path:
+    """A photo with something in it that was depth once."""
+    image = portraits.png(portraits.codes())
+    return portraits.write(path, portraits.gdepth_jpeg(image[:60] + bytes(30) + image[90:]))
+
+
+def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, Choice]:
+    """A photo's Gaussians by a base that is opened for it alone."""
+    return open_base(BaseSettings(**settings), ([] if log is None else log).append).predict(load_photo(path))
+
+
+# The order of auto, and why.
+
+
+def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
+    tmp_path: Path, photo: Path, made: dict[str, Path]
+) -> None:
+    choice = pick(photo)[1]
+    assert (choice.base, choice.why, choice.passed_over) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
+    assert choice.news == choice.line
+    assert "--depth FILE, `spackle weights get sharp`" in choice.line
+    (tmp_path / "weights").mkdir()
+    shutil.copy(made["sharp"], tmp_path / "weights")
+    prediction, choice = pick(photo)
+    assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(TINY))
+    assert prediction.notes["weights"] == SHARP_FILE
+    inside = portrait(tmp_path / "portrait.jpg")
+    prediction, choice = pick(inside)
+    assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
+    assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
+    named, by_name = pick(inside, name="rgbd")
+    assert (by_name.why, by_name.news) == ("--base rgbd", "")
+    assert same_bits(named.gaussians, prediction.gaussians)
+    given, choice = pick(inside, depth=write_depth(tmp_path / "depth.npy"))
+    assert (choice.base, choice.why, choice.news) == ("rgbd", "--depth", "")
+    assert float(given.gaussians.means[0, 2]) == pytest.approx(metres()[0, 0], rel=1e-5)
+
+
+def test_weights_and_options_that_a_person_gave_reach_sharp(
+    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]]
+) -> None:
+    given = write_tiny(tmp_path / "mine.pt")
+    choice = pick(photo, checkpoint=given)[1]
+    assert (choice.base, choice.why, quick.pop()["path"]) == ("sharp", "-c", given)
+    words: dict[str, Any] = {"precision": "fp32", "windows": 9, "compiled": True}
+    assert pick(photo, **words)[1].base == "sharp"
+    assert quick == [{"path": sharp, "low_memory": False, "device": None, **words}]
+    assert pick(portrait(tmp_path / "p.jpg"), **words)[1].base == "rgbd"
+    sharp.unlink()
+    assert pick(photo, **words)[1].base == "lite"
+    assert len(quick) == 1
+
+
+def test_a_machine_without_a_home_has_no_sharp(photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("no home")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    for name in ("SPACKLE_WEIGHTS", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert pick(photo)[1].why == f"{NO_DEPTH}, {NO_SHARP}"
+    with pytest.raises(InputError, match="SPACKLE_WEIGHTS"):
+        pick(photo, name="sharp")
+    spackle.predict(photo, network=None)
+
+
+def test_a_base_is_loaded_once_and_not_before_a_photo_needs_it(
+    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LiteBase, "load", lambda *args, **options: pytest.fail("loaded"))
+    base = open_base(BaseSettings())
+    base.predict(load_photo(portrait(tmp_path / "p.jpg")))
+    assert not quick
+    news = [base.predict(load_photo(photo))[1].news for _ in range(2)]
+    assert [bool(line) for line in news] == [True, False]
+    assert len(quick) == 1
+    model = open_base(BaseSettings("hf:me/small", precision="fp32", device="cpu"))
+    names = [model.predict(load_photo(photo))[1].base for _ in range(2)]
+    assert names == ["hf:me/small"] * 2
+    assert quick[1:] == [{"path": "me/small", "precision": "fp32", "device": "cpu"}]
+
+
+def test_other_weights_of_lite_and_one_choice_for_a_whole_clip(tmp_path: Path, photo: Path, shipped: Path) -> None:
+    before = pick(photo, name="lite")[0].gaussians
+    mine = tmp_path / "mine.safetensors"
+    save_file({name: 1.5 * tensor for name, tensor in load_file(shipped).items()}, mine)
+    assert not same_bits(pick(photo, name="lite", checkpoint=mine)[0].gaussians, before)
+    base = open_base(BaseSettings())
+    prediction, choice = base.predict(load_photo(photo))
+    kept, again = base.only(choice).predict(load_photo(portrait(tmp_path / "p.jpg")))
+    assert (choice.base, again.base) == ("lite", "lite")
+    assert len(kept.gaussians) == len(prediction.gaussians)
+
+
+# Whose lens counts.
+
+
+def test_a_persons_focal_length_beats_the_map_which_beats_the_photo(tmp_path: Path) -> None:
+    photo, disparity = write_photo(tmp_path / "im0.png"), tmp_path / "disp0.npy"
+    np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
+    calibration(tmp_path / "calib.txt", 80, 200, 1.5)
+    loaded = load_depth(disparity)
+    for depth in (disparity, loaded):
+        prediction, _ = pick(photo, depth=depth)
+        assert (prediction.camera.focal[0], prediction.lens_source) == (80, "calibration")
+        ours, _ = open_base(BaseSettings(depth=depth)).predict(load_photo(photo, focal_px=60))
+        assert (ours.camera.focal[0], ours.lens_source) == (60, "")
+        # depth = baseline · focal / (disparity + doffs)
+        torch.testing.assert_close(
+            ours.gaussians.means[: WIDTH * HEIGHT, 2], 0.75 * prediction.gaussians.means[: WIDTH * HEIGHT, 2]
+        )
+        scene = spackle.predict(load_photo(photo, focal_px=60), depth=depth, network=None)
+        assert scene.camera.focal[0] == 60
+        assert same_bits(scene.base, ours.gaussians)
+    twice_as_fine = dataclasses.replace(load_photo(photo, focal_px=60), focal_source="EXIF")
+    assert open_base(BaseSettings(depth=loaded)).predict(twice_as_fine)[0].camera.focal[0] == 80
+
+
+def test_a_persons_focal_length_beats_that_of_the_depth_in_the_photo(tmp_path: Path) -> None:
+    matrix = (70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0)
+    data = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp(matrix=matrix))
+    photo = portraits.write(tmp_path / "photo.jpg", data)
+    depths = []
+    for focal, source, given in ((70, "the photo's depth", None), (50, "", 50.0)):
+        for settings in (BaseSettings(), BaseSettings(depth=load_photo_depth(photo))):
+            prediction, _ = open_base(settings).predict(load_photo(photo, focal_px=given))
+            assert (prediction.camera.focal[0], prediction.lens_source) == (focal, source)
+            depths.append(prediction.gaussians.means[: WIDTH * HEIGHT, 2])
+    for one in depths:  # its metres depend on no lens
+        torch.testing.assert_close(one.median(), depths[0].median(), rtol=1e-3, atol=0)
+
+
+# Auto falls back where a base cannot be used.
+
+
+def test_broken_depth_in_the_photo_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photo, log = broken_portrait(tmp_path / "photo.jpg"), list[str]()
+    choice = pick(photo, log)[1]
+    assert (choice.base, choice.why) == ("lite", f"the depth in the photo cannot be used, {NO_SHARP}")
+    assert choice.passed_over[0].startswith(f"the depth in the photo: {photo}: ")
+    assert [line.startswith(f"photo.jpg: going on without the depth in the photo: {photo}: ") for line in log] == [True]
+    with pytest.raises(InputError, match=r"photo\.jpg"):
+        pick(photo, name="rgbd")
+
+    def wrong(path: Path) -> DepthMap:
+        depth = torch.full((WIDTH, HEIGHT), 2.0)
+        return DepthMap(depth, depth > 0, None, None, "depth", path)
+
+    monkeypatch.setattr("spackle.bases.open.load_photo_depth", wrong)
+    assert f"{HEIGHT}×{WIDTH} but photo {photo} is {WIDTH}×{HEIGHT}" in pick(photo)[1].passed_over[0]
+    with pytest.raises(InputError, match=f"{HEIGHT}×{WIDTH}"):
+        pick(photo, name="rgbd")
+
+
+def garbage(file: Path) -> str:
+    file.write_bytes(b"not weights at all")
+    return "neither a PyTorch checkpoint"
+
+
+def unlike_its_record(file: Path) -> str:
+    record = f'{{"url": "https://x", "size": {file.stat().st_size}, "sha256": "{"0" * 64}"}}'
+    file.with_name(f"{file.name}.json").write_text(record)
+    return "SHA-256 is not that of what was downloaded"
+
+
+def of_another_network(file: Path) -> str:
+    torch.save({"weight": torch.zeros(3)}, file)
+    return "not SHARP's weights"
+
+
+@pytest.mark.parametrize("damage", [garbage, unlike_its_record, of_another_network])
+def test_damaged_weights_of_sharp_are_passed_over_once_for_all_photos(
+    tmp_path: Path, photo: Path, sharp: Path, damage: Callable[[Path], str]
+) -> None:
+    said, log = damage(sharp), list[str]()
+    base = open_base(BaseSettings(), log.append)
+    choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
+    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used"] * 2
+    assert (len(log), said in log[0], said in choices[0].passed_over[0]) == (1, True, True)
+    assert choices[0].lasting
+    for settings in ({"name": "sharp"}, {"checkpoint": sharp}):
+        with pytest.raises(BaseError, match=said):
+            pick(photo, **settings)
+
+
+def hungry(*args: object, **options: object) -> None:
+    raise MemoryShort("not enough memory for SHARP: try --low-memory")
+
+
+@pytest.mark.parametrize("when", ["load", "predict"])
+def test_too_little_memory_is_passed_over_once_and_stops_a_base_that_is_named(
+    photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    monkeypatch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
+    log: list[str] = []
+    base = open_base(BaseSettings(), log.append)
+    for _ in range(2):
+        choice = base.predict(load_photo(photo))[1]
+        assert (choice.base, choice.lasting) == ("lite", False)
+    assert len(log) == 1
+    with pytest.raises(BaseError, match="not enough memory for SHARP"):
+        pick(photo, name="sharp")
+
+
+def test_what_fails_for_one_photo_is_tried_for_the_next(
+    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict_box = StandIn.predict
+
+    def picky(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        found = predict_box(self, photo, progress)
+        if photo.path.stem == "b":
+            raise InputError(f"{photo.path}: not this one")
+        if photo.path.stem == "c":
+            far = dataclasses.replace(found.gaussians, means=found.gaussians.means * torch.inf)
+            return dataclasses.replace(found, gaussians=far)
+        return found
+
+    monkeypatch.setattr(StandIn, "predict", picky)
+    log: list[str] = []
+    base = open_base(BaseSettings(), log.append)
+    names = [base.predict(load_photo(write_photo(tmp_path / f"{name}.png")))[1].base for name in "abcd"]
+    assert names == ["sharp", "lite", "lite", "sharp"]
+    assert ("not this one" in log[0], "range of float32" in log[1]) == (True, True)
+    assert len(quick) == 1
+    for name in "bc":
+        with pytest.raises(InputError, match=rf"{name}\.png") as caught:
+            pick(tmp_path / f"{name}.png", name="sharp")
+        assert not isinstance(caught.value, BaseError)
+
+
+def test_everything_may_fail_one_after_the_other(tmp_path: Path, sharp: Path, shipped: Path) -> None:
+    photo = broken_portrait(tmp_path / "photo.jpg")
+    garbage(sharp)
+    choice = pick(photo)[1]
+    assert (choice.base, len(choice.passed_over)) == ("lite", 2)
+    assert choice.why == "the depth in the photo cannot be used, SHARP cannot be used"
+    shipped.write_bytes(b"nothing")
+    log: list[str] = []
+    with pytest.raises(InputError, match=r"lite\.safetensors"):
+        pick(photo, log)
+    assert len(log) == 2
+
+
+def test_weights_that_change_before_they_are_read_stop_the_run(
+    photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def change(path: Path, **options: Any) -> StandIn:
+        sharp.write_bytes(sharp.read_bytes() + b"more")
+        return StandIn("sharp")
+
+    monkeypatch.setattr(SharpBase, "load", change)
+    for name in (AUTO, "sharp"):
+        with pytest.raises(BaseError, match="changed while this was running"):
+            pick(photo, name=name)
+
+
+# What is named never gives way to another.
+
+
+def test_depth_that_is_given_or_named_is_not_passed_over(tmp_path: Path, photo: Path) -> None:
+    inside = portrait(tmp_path / "a.jpg")
+    np.save(tmp_path / "bad.npy", np.zeros((HEIGHT, WIDTH), np.float32))
+    (tmp_path / "depths").mkdir()
+    for depth, named in ((tmp_path / "bad.npy", "bad.npy"), (tmp_path / "depths", "no depth map in")):
+        with pytest.raises(InputError, match=named):
+            pick(inside, depth=depth)
+    with pytest.raises(InputError, match="there is none in the photo") as caught:
+        pick(photo, name="rgbd")
+    assert not isinstance(caught.value, BaseError)
+    ours = load_depth(write_depth(tmp_path / "depths" / "photo.npy"))
+    base = open_base(BaseSettings("rgbd"))
+    by_call, _ = base.predict(load_photo(photo), depth=ours)
+    assert same_bits(by_call.gaussians, pick(photo, depth=tmp_path / "depths")[0].gaussians)
+
+
+@pytest.mark.parametrize(
+    ("settings", "option"),
+    [
+        ({"name": "lite", "depth": Path("d.npy")}, "--depth d.npy: the lite base"),
+        ({"name": "lite", "calib": Path("c.txt")}, "--calib c.txt: the lite base"),
+        ({"name": "lite", "precision": "bf16"}, "--precision bf16: the lite base"),
+        ({"name": "lite", "low_memory": True}, "--low-memory: the lite base"),
+        ({"name": "lite", "windows": 9}, "--windows 9: the lite base"),
+        ({"name": "lite", "checkpoint": Path("gone.safetensors")}, "gone.safetensors"),
+        ({"name": "hf:a/b", "depth": Path("d.npy")}, "--depth d.npy: the hf base"),
+        ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "-c x.pt: the hf base"),
+        ({"name": "hf:a/b", "low_memory": True}, "--low-memory: the hf base"),
+        ({"name": "hf:a/b", "compiled": True}, "--compile: the hf base"),
+        ({"name": "hf:"}, "names no model"),
+        ({"name": "hf"}, "there are auto, rgbd, sharp, lite, hf:NAME"),
+        ({"name": "shrap"}, r"did you mean sharp\?"),
+        ({"name": "sharp"}, "spackle weights get sharp.*-c FILE"),
+        ({"name": "sharp", "checkpoint": Path("x.pt"), "depth": Path("d.npy")}, "--depth d.npy: the sharp base"),
+        ({"name": "sharp", "checkpoint": Path("x.pt"), "calib": Path("c.txt")}, "--calib c.txt: the sharp base"),
+        ({"name": "rgbd", "checkpoint": Path("x.pt")}, "-c x.pt: the rgbd base"),
+        ({"checkpoint": Path("gone.pt")}, "gone.pt"),
+        ({"calib": Path("c.txt")}, "--calib c.txt: is for a disparity map"),
+        ({"depth": Path("d.npy"), "low_memory": True}, "--low-memory: the rgbd base"),
+        ({"depth": Path("d.npy"), "compiled": True}, "--compile: the rgbd base"),
+        ({"precision": "fp8"}, "fp8"),
+        ({"windows": 36}, "--windows must be between 1 and 35, got 36"),
+        ({"windows": 2, "low_memory": True}, "--windows 2: low memory"),
+    ],
+    ids=str,
+)
+def test_what_a_base_has_no_use_for_is_refused(settings: dict[str, Any], option: str) -> None:
+    with pytest.raises(InputError, match=option):
+        open_base(BaseSettings(**settings))
+
+
+# What results say of a base.
+
+
+def write_model(folder: Path) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text("{}")
+    (folder / "model.safetensors").write_bytes(b"weights")
+    (folder / "README.md").write_text("about it")
+    return folder
+
+
+def test_a_models_folder_counts_by_its_files_and_not_by_its_place(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "one" / "small")
+    settings = BaseSettings(f"hf:{folder}")
+    assert set(settings.files) == {"config.json", "model.safetensors"}
+    assert (settings.public_name, settings.title) == ("hf:small", "hf:small")
+    assert BaseSettings("hf:me/small").public_name == "hf:me/small"
+    prints = open_base(settings).fingerprints
+    (folder / "README.md").write_text("more about it")
+    assert open_base(settings).fingerprints == prints
+    (folder / "config.json").write_text("other")
+    assert open_base(settings).fingerprints != prints
+
+
+def test_tables_call_weights_apples_where_they_came_from_apple(tmp_path: Path) -> None:
+    file, record = tmp_path / "my_sharp.pt", tmp_path / "my_sharp.pt.json"
+    file.write_bytes(b"weights")
+    unknown = "a network of SHARP's shape, from the photo alone, by weights of unknown origin: my_sharp.pt"
+    assert BaseSettings("sharp", checkpoint=file).says == unknown
+    for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].says)):
+        record.write_text(json.dumps({"url": url, "size": 7, "sha256": sha256(b"weights").hexdigest()}))
+        assert BaseSettings("sharp", checkpoint=file).says == says
+    assert BaseSettings("lite", checkpoint=file).says == KINDS["lite"].says
+
+
+# In Python.
+
+
+def test_python_needs_nothing_but_the_photo_and_logs_what_it_took(
+    tmp_path: Path, sharp: Path, quick: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "spackle")
+    inside = spackle.predict(portrait(tmp_path / "a.jpg"), network=None)
+    assert same_bits(inside.base, spackle.predict(load_photo(tmp_path / "a.jpg"), network=None).base)
+    assert not quick
+    caplog.clear()
+    spackle.predict(broken_portrait(tmp_path / "b.jpg"), network=None)
+    assert [asked["path"] for asked in quick] == [sharp]
+    warning, info = caplog.records
+    assert (warning.levelname, info.levelname) == ("WARNING", "INFO")
+    assert warning.getMessage().startswith("b.jpg: going on without the depth in the photo: ")
+    assert info.getMessage().startswith("b.jpg: base sharp (")
+    sharp.unlink()
+    scene = spackle.predict(write_photo(tmp_path / "c.png"), network=None)
+    caplog.clear()
+    named = spackle.predict(tmp_path / "c.png", base=spackle.LiteBase.load(), network=None)
+    assert same_bits(scene.base, named.base)
+    assert not caplog.records
+
+
+def test_python_takes_depth_or_a_base_and_photos_that_have_no_file(tmp_path: Path, photo: Path) -> None:
+    loaded = load_photo(photo)
+    drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
+    assert same_bits(spackle.predict(drawn, network=None).base, spackle.predict(loaded, network=None).base)
+    with pytest.raises(ValueError, match="not both"):
+        spackle.predict(photo, write_depth(tmp_path / "d.npy"), base=spackle.LiteBase.load())
+    with pytest.raises(ValueError, match=r"base='lite': give a base that is loaded"):
+        spackle.predict(photo, base="lite")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="gone"):
+        spackle.predict(tmp_path / "gone.jpg")
