@@ -35,7 +35,7 @@ from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.methods import Shot, make_method
 from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
-from spackle.evaluation.results import Mean, Record, Row
+from spackle.evaluation.results import ImageResult, Mean, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.run import examine, problem_of
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
@@ -103,10 +103,10 @@ def test_without_pyiqa_each_of_its_metrics_says_so(
     error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake_pyiqa(monkeypatch, error=error)
-    opened = open_metrics(["niqe", "lpips"], "cpu", download=False)
-    assert opened.metrics == {}
-    assert {name: why.startswith(says) for name, why in opened.missing.items()} == {"niqe": True, "lpips": True}
-    assert open_metrics([], "cpu", download=False).missing == {}
+    metrics, states = open_metrics(["niqe", "lpips"], "cpu", download=False)
+    assert metrics == {}
+    assert {name: why.startswith(f"not run: {says}") for name, why in states.items()} == {"niqe": True, "lpips": True}
+    assert open_metrics([], "cpu", download=False) == ({}, {})
 
 
 def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,16 +124,16 @@ def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: py
         return metric
 
     fake_pyiqa(monkeypatch, create)
-    opened = open_metrics(list(DEFINITIONS), "cpu", download=False)
-    assert (opened.version, opened.missing) == ("9.9", {})
+    metrics, states = open_metrics(list(DEFINITIONS), "cpu", download=False)
+    assert states == dict.fromkeys(DEFINITIONS, "pyiqa 9.9")
     assert asked["lpips"] == (torch.device("cpu"), {"net": "alex", "version": "0.1"})
     assert asked["musiq"][1] == {"pretrained": "koniq10k"}
     assert asked["clipiqa"][1] == {"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False}
     assert (asked["niqe"][1], asked["dists"][1]) == ({"test_y_channel": True}, {})
     picture, truth = torch.full((5, 7, 3), 1.5), torch.full((5, 7, 3), 0.25)
     picture[0, 1, 2] = 0.0
-    assert opened.metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
-    assert opened.metrics["niqe"](truth, None) == pytest.approx(0.25)
+    assert metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
+    assert metrics["niqe"](truth, None) == pytest.approx(0.25)
     first, second = seen[0]
     assert first.shape == second.shape == (1, 3, 5, 7)
     assert (float(first[0, 2, 0, 1]), float(first.max()), len(seen[1])) == (0, 1, 1)
@@ -149,11 +149,11 @@ def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatc
 
     fake_pyiqa(monkeypatch, create)
     lookup = socket.getaddrinfo
-    opened = open_metrics(["niqe", "musiq", "clipiqa"], "cpu", download=False)
+    metrics, states = open_metrics(["niqe", "musiq", "clipiqa"], "cpu", download=False)
     assert socket.getaddrinfo is lookup
-    assert opened.missing["niqe"].startswith("weights: not on this machine")
-    assert "'koniq'" in opened.missing["musiq"]
-    assert math.isnan(opened.metrics["clipiqa"](torch.zeros(4, 4, 3), None))
+    assert states["niqe"].startswith("not run: weights: not on this machine")
+    assert "'koniq'" in states["musiq"]
+    assert math.isnan(metrics["clipiqa"](torch.zeros(4, 4, 3), None))
 
 
 # --- tables
@@ -164,7 +164,7 @@ def results(title: str, protocol: str, methods: list[str], figures: Figures) -> 
     settings = ["near"] if protocol == "near-view" else ["0.3", "0.4", "0.5"]
     rows = tuple(Row(s, v, m, figures[m]) for s in settings for m in methods for v in ("left", "right"))
     facts = {"base_gaussians": 1000}
-    records = (Record("a", facts, rows), Record("b", facts, rows), Record("c", problem="c: broken"))
+    records = (ImageResult("a", facts, rows), ImageResult("b", facts, rows), ImageResult("c", problem="c: broken"))
     config = {
         "title": title,
         "protocol": protocol,
@@ -241,7 +241,7 @@ def test_results_that_do_not_go_together_are_refused() -> None:
 
 def test_a_mean_leaves_out_what_is_not_finite_and_counts_it() -> None:
     rows = tuple(Row("near", str(k), "base", {"psnr": value}) for k, value in enumerate((10.0, None, 20.0)))
-    assert Results({}, (Record("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
+    assert Results({}, (ImageResult("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
     assert Results({}, ()).mean("psnr", "base", "near") == Mean(None, 0, 0)
 
 

@@ -20,8 +20,8 @@ from evaluation_data import write_boxes
 from PIL import Image
 
 from spackle.evaluation.plots import SCENES, STYLES, Series, draw, evenly, overhead_plot
-from spackle.evaluation.report import BUDGET, MOST, Source, encode, fitting, make_report, size_of
-from spackle.evaluation.results import Record, Row
+from spackle.evaluation.report import BUDGET, MOST, ReportSource, encode, fitting, make_report, size_of
+from spackle.evaluation.results import ImageResult, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.table import BEST, Table
 from spackle.evaluation.tables import make_tables
@@ -100,7 +100,7 @@ def results(near: bool, count: int = 11, title: str = "Middlebury", name: str = 
     for scene in range(count):
         views = [(s, m, v) for s in settings for m in METHODS for v in ("left", "right")]
         rows = tuple(Row(s, v, m, figures(near, m, scene)) for s, m, v in views)
-        records.append(Record(name.format(scene), facts, rows))
+        records.append(ImageResult(name.format(scene), facts, rows))
     config: dict[str, Any] = {
         "title": title,
         "terms": f"cite {title}",
@@ -111,7 +111,7 @@ def results(near: bool, count: int = 11, title: str = "Middlebury", name: str = 
         "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
         "metrics": {"niqe": "not run: pyiqa is not installed"},
     }
-    return Results(config, (*records, Record("gone", problem="gone.png: <b>damaged</b>", remarks=())))
+    return Results(config, (*records, ImageResult("gone", problem="gone.png: <b>damaged</b>", remarks=())))
 
 
 def picture(index: int, size: tuple[int, int] = (48, 32)) -> Mapping[str, bytes]:
@@ -119,7 +119,7 @@ def picture(index: int, size: tuple[int, int] = (48, 32)) -> Mapping[str, bytes]
 
 
 def report(*runs: Results, **more: Any) -> str:
-    return make_report([Source(one, picture, {"spackle": "9.9"}, {"cpu": EVIL}) for one in runs], **more)
+    return make_report([ReportSource(one, picture, {"spackle": "9.9"}, {"cpu": EVIL}) for one in runs], **more)
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +213,7 @@ def test_many_evaluations_still_fit() -> None:
 
 def test_many_images_make_no_large_page() -> None:
     run = results(near=True, count=400)
-    text = make_report([Source(run, lambda index: {})])
+    text = make_report([ReportSource(run, lambda index: {})])
     assert len(text) < 1_500_000
     assert f"{SCENES} of 400 scenes, spread evenly." in text
     assert re.search(r"\d+ of 1,600 images and views", text)

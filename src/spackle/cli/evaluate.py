@@ -36,24 +36,29 @@ Residual = Annotated[
 Limit = Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")]
 Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
 Precision = Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")]
+Disparity = Annotated[
+    str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
+]
+Output = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: named by the choices."),
+]
+Html = Annotated[bool, typer.Option("--html", help="Write report.html there too: one page with all of it.")]
+Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image or view takes.")]
 
 
 def evaluate(
     context: typer.Context,
     dataset: Dataset,
     root: Root,
-    protocol: Annotated[
-        str, typer.Option(help="large-view: holes at wide moves; near-view: against true second photos.")
-    ] = "large-view",
+    protocol: Annotated[str, typer.Option(help="large-view (wide moves) or near-view (second photos).")] = "large-view",
     methods: Annotated[
         str,
         typer.Option(
             metavar="A,B,…", help="Of base, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft; with commas."
         ),
     ] = "base,spackle",
-    disparity: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
-    ] = "0.3,0.4,0.5",
+    disparity: Disparity = "0.3,0.4,0.5",
     metrics: Annotated[
         str | None,
         typer.Option(
@@ -67,23 +72,16 @@ def evaluate(
     low_memory: LowMemory = False,
     residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
-    features: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet 1.0, for the metric distance.")
-    ] = None,
+    features: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet, for distance.")] = None,
     limit: Limit = None,
     download_metrics: Annotated[
         bool, typer.Option("--download-metrics", help="Let pyiqa fetch weights (some are not for commercial use).")
     ] = False,
     device: Device = "auto",
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: evaluation-NAME-PROTOCOL."
-        ),
-    ] = None,
-    html: Annotated[bool, typer.Option("--html", help="Write OUT/report.html too: one page with all of it.")] = False,
+    output: Output = None,
+    html: Html = False,
     as_json: JsonOption = False,
-    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image takes.")] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
     from spackle.evaluation.run import evaluate as run
@@ -117,7 +115,7 @@ def evaluate(
 def tables(
     results: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate` wrote.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="T", help="A folder for the files.")],
-    html: Annotated[bool, typer.Option("--html", help="Write T/report.html too: one page with all of it.")] = False,
+    html: Html = False,
 ) -> None:
     """Put several evaluations into the same tables: tables.md and tables.tex."""
     from spackle.evaluation.run import merge_tables
@@ -145,9 +143,7 @@ def bench(
     side: Annotated[
         int, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
     ] = 1536,
-    disparity: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Of the timed views, with commas or spaces; the paper's S1, S2, S3.")
-    ] = "0.3,0.4,0.5",
+    disparity: Disparity = "0.3,0.4,0.5",
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
     precision: Precision = "auto",
@@ -159,17 +155,9 @@ def bench(
         int | None, typer.Option(help="How often the base is timed. [default: 1 for sharp, else as --runs]")
     ] = None,
     device: Device = "auto",
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="OUT",
-            help="A folder; a run in it goes on. Default: bench-NAME-BASE or bench-suite.",
-        ),
-    ] = None,
+    output: Output = None,
     as_json: JsonOption = False,
-    verbose: Annotated[bool, typer.Option("-v", "--verbose", help="Say what each view takes.")] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex.
 

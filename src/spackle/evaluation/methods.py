@@ -120,21 +120,21 @@ def _direct_ft(shot: Shot, prediction: BasePrediction, unit: float) -> Iterator[
 
 
 @dataclasses.dataclass(frozen=True)
-class About:
+class MethodNames:
     """A method's names."""
 
     title: str  # in tables
-    says: str  # in captions
+    description: str  # in captions
 
 
-METHODS: dict[str, About] = {
-    "base": About("base alone", "the base's render, holes black"),
-    "spackle": About("Spackle", "aux Gaussians for each view by itself, as in the paper"),
-    "spackle-scene": About("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
-    "seeds": About("seeds", "as Spackle, without a network: deltas of zero"),
-    "dense": About("dense grid", "an aux Gaussian for every cell, in one pass"),
-    "inpaint2d": About("2D inpainting", "the base's render, its hole inpainted by OpenCV (Telea, radius 5)"),
-    "direct-ft": About("direct FT", "the base fine-tuned on completed views, no aux Gaussians"),
+METHODS: dict[str, MethodNames] = {
+    "base": MethodNames("base alone", "the base's render, holes black"),
+    "spackle": MethodNames("Spackle", "aux Gaussians for each view by itself, as in the paper"),
+    "spackle-scene": MethodNames("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
+    "seeds": MethodNames("seeds", "as Spackle, without a network: deltas of zero"),
+    "dense": MethodNames("dense grid", "an aux Gaussian for every cell, in one pass"),
+    "inpaint2d": MethodNames("2D inpainting", "the base's render, its hole inpainted by OpenCV (Telea, radius 5)"),
+    "direct-ft": MethodNames("direct FT", "the base fine-tuned on completed views, no aux Gaussians"),
 }
 
 

@@ -34,7 +34,7 @@ class Figure:
     """A metric of a view."""
 
     title: str  # with the direction that is better
-    says: str  # its exact definition, for captions
+    definition: str  # exactly, for captions
     lower: bool  # is better
     digits: int = 4
     truth: bool = False  # needs a true second view
@@ -100,11 +100,11 @@ SPLIT = ("psnr", "ssim")  # measured over the image, in the base's hole and outs
 
 def definitions(names: tuple[str, ...]) -> list[str]:
     """A sentence for each metric."""
-    return [f"{METRICS[name].title[:-2]}: {METRICS[name].says}." for name in names]
+    return [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
 
 
 def reduction(before: float, after: float) -> float:
-    """Relative decrease of the HAR (paper, eq. 11), 1 − after / before; NaN without any hole.
+    """1 − after / before, the relative decrease of the HAR (paper, eq. 11); NaN without any hole.
 
     The paper's own numbers (tab:controlled_disocclusion) are the reduction of a dataset's mean HAR, not the mean of
     its images' reductions; so are those of our tables.
@@ -179,47 +179,41 @@ def _blur(image: Tensor) -> Tensor:
     return image
 
 
-@dataclasses.dataclass(frozen=True)
-class Published:
-    """The metrics that pyiqa can measure here, and why it cannot measure the others."""
-
-    metrics: dict[str, Metric]
-    missing: dict[str, str]
-    version: str | None  # pyiqa's
-
-
-def open_metrics(names: Sequence[str], device: str, download: bool) -> Published:
+def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dict[str, Metric], dict[str, str]]:
     """Load metrics by their names in `DEFINITIONS`; what is missing is no error.
 
     Args:
         names: which ones; none leaves pyiqa alone.
         device: "cpu" or "cuda".
         download: let pyiqa fetch weights that are not here; otherwise it is kept off the network while it looks.
+
+    Returns:
+        The metrics that can be measured here, and for each name pyiqa's version, or why it is "not run".
     """
     metrics: dict[str, Metric] = {}
-    missing: dict[str, str] = {}
+    states: dict[str, str] = {}
     if not names:
-        return Published(metrics, missing, None)
+        return metrics, states
     try:
         with _quiet():
             import pyiqa
     except Exception as error:  # torchvision, which pyiqa needs, may not be the one of the installed torch
         absent = isinstance(error, ModuleNotFoundError) and error.name == "pyiqa"
         why = NOT_INSTALLED if absent else f"pyiqa cannot be imported: {reason_in_a_line(error)}"
-        return Published(metrics, dict.fromkeys(names, why), None)
+        return metrics, dict.fromkeys(names, f"not run: {why}")
     for name in names:
         attempts: list[str] = []
         try:
             with _quiet(), contextlib.nullcontext() if download else _off_the_network(attempts):
                 options: dict[str, Any] = DEFINITIONS[name].options or {}
+                states[name] = f"pyiqa {getattr(pyiqa, '__version__', 'unknown')}"
                 metrics[name] = _measure_by(pyiqa.create_metric(name, device=torch.device(device), **options))
         except Exception as error:  # whatever a stranger's package raises is one line of the report
-            missing[name] = (
-                "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
-                if attempts
-                else f"pyiqa cannot load it: {reason_in_a_line(error)}"
-            )
-    return Published(metrics, missing, str(getattr(pyiqa, "__version__", "unknown")))
+            why = f"pyiqa cannot load it: {reason_in_a_line(error)}"
+            if attempts:
+                why = "weights: not on this machine (--download-metrics lets pyiqa fetch them)"
+            states[name] = f"not run: {why}"
+    return metrics, states
 
 
 def _measure_by(network: Callable[..., Any]) -> Metric:
@@ -237,8 +231,8 @@ def _measure_by(network: Callable[..., Any]) -> Metric:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """pyiqa and what it is made of print, log and warn while they load."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 

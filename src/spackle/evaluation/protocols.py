@@ -102,7 +102,7 @@ def measure(
 
 
 def _counts(view: View, base: int) -> dict[str, float]:
-    """Holes that are left, and Gaussians that were added."""
+    """HAR and coverage of what is left open (paper, eq. 11 and 10), and Gaussians that were added."""
     figures: dict[str, float] = {}
     if view.alpha is not None:
         figures |= {"har": hole_area_ratio(view.alpha), "coverage": 1 - hole_area_ratio(view.alpha)}

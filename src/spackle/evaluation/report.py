@@ -19,7 +19,17 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import NEAR
-from spackle.evaluation.results import IMAGES, RESULTS, TIMES, Record, Run, load_run, read_json, stem_of, write_text
+from spackle.evaluation.results import (
+    IMAGES,
+    RESULTS,
+    TIMES,
+    ImageResult,
+    Run,
+    load_run,
+    read_json,
+    stem_of,
+    write_text,
+)
 from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, rank, thumbnail
 from spackle.evaluation.table import BEST, EMPTY, Table
 from spackle.evaluation.tables import ADDING, NOT_RUN, PAPER_ROW, count_text, make_tables, method_name, ratio_text
@@ -60,7 +70,7 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Source:
+class ReportSource:
     """An evaluation, and what lies beside its figures."""
 
     run: Run
@@ -69,7 +79,7 @@ class Source:
     machine: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
-def make_report(sources: Sequence[Source], bench: Mapping[str, Any] | None = None) -> str:
+def make_report(sources: Sequence[ReportSource], bench: Mapping[str, Any] | None = None) -> str:
     """A report as HTML: one file that needs nothing else, the same bytes for the same results.
 
     Args:
@@ -95,22 +105,22 @@ def make_report(sources: Sequence[Source], bench: Mapping[str, Any] | None = Non
     return UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", page) + "\n"
 
 
-def write_report(sources: Sequence[Source], bench: Mapping[str, Any] | None, output: Path) -> None:
+def write_report(sources: Sequence[ReportSource], bench: Mapping[str, Any] | None, output: Path) -> None:
     """report.html."""
     write_text(make_report(sources, bench), output / REPORT)
 
 
-def source_of(run: Run, folder: Path, versions: Mapping[str, Any], machine: Mapping[str, Any]) -> Source:
+def source_of(run: Run, folder: Path, versions: Mapping[str, Any], machine: Mapping[str, Any]) -> ReportSource:
     """An evaluation for a report, with the pictures that lie in its folder."""
 
     def pictures(index: int) -> dict[str, bytes]:
         files = {name: picture_file(folder, index, run.records[index].name, name) for name in columns(run)}
         return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
 
-    return Source(run, pictures, versions, machine)
+    return ReportSource(run, pictures, versions, machine)
 
 
-def load_source(folder: Path) -> Source:
+def load_source(folder: Path) -> ReportSource:
     """A finished evaluation for a report.
 
     Raises:
@@ -129,7 +139,7 @@ def find_bench(folders: Sequence[Path]) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _parts(sources: Sequence[Source]) -> list[dict[str, Any]]:
+def _parts(sources: Sequence[ReportSource]) -> list[dict[str, Any]]:
     """What the page has of each evaluation."""
     count = max(LEAST, MOST // len(sources))
     rankings = [rank(source.run) for source in sources]
@@ -154,10 +164,10 @@ def findings(run: Run) -> list[str]:
     """What an evaluation found, in sentences, from means over all views."""
     lines = []
     if run.near:
-        for figure, (says, unit, digits) in HEADLINES.items():
+        for figure, (what, unit, digits) in HEADLINES.items():
             means = {method: run.mean(figure, method, NEAR).value for method in run.methods}
-            told = [f"{METHODS[m].title} {v:.{digits}f}{unit}" for m, v in means.items() if v is not None]
-            lines += [f"{says}: {', '.join(told)}."] if told else []
+            means_text = [f"{METHODS[m].title} {v:.{digits}f}{unit}" for m, v in means.items() if v is not None]
+            lines += [f"{what}: {', '.join(means_text)}."] if means_text else []
         return lines
     method = next((name for name in ADDING if name in run.methods), None)
     for move in run.config["disparities"] if method else ():
@@ -197,10 +207,10 @@ def _table(table: Table) -> dict[str, Any]:
     }
 
 
-Picked = tuple[Record, str, Mapping[str, bytes]]  # an image, which of how many it is, its pictures
+Picked = tuple[ImageResult, str, Mapping[str, bytes]]  # an image, which of how many it is, its pictures
 
 
-def _pick(source: Source, ranking: Ranking | None, count: int) -> list[Picked]:
+def _pick(source: ReportSource, ranking: Ranking | None, count: int) -> list[Picked]:
     """Images from the worst to the best, evenly between them; those without pictures are passed over."""
     records = {record.name: (index, record) for index, record in enumerate(source.run.records)}
     names = ranking.names[::-1] if ranking else [record.name for record in source.run.measured]
@@ -210,12 +220,12 @@ def _pick(source: Source, ranking: Ranking | None, count: int) -> list[Picked]:
         pictures = source.pictures(index)
         chosen = {name: pictures[name] for name in [name for name in SHOWN if name in pictures][:MOST_SHOWN]}
         last = len(names) - 1
-        said = {0: "worst", last: "best"}.get(place, f"{place + 1} of {len(names)}") if ranking and last else ""
-        cases += [(record, said, chosen)] if chosen else []
+        position = {0: "worst", last: "best"}.get(place, f"{place + 1} of {len(names)}") if ranking and last else ""
+        cases += [(record, position, chosen)] if chosen else []
     return cases
 
 
-def _case(run: Run, record: Record, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+def _case(run: Run, record: ImageResult, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     """An image: its pictures one over the other, and the figures of the view that they show."""
     shown = record.facts["shown"]
     rows = [row for row in record.rows if (row.setting, row.view) == (shown["setting"], shown["view"])]

@@ -37,7 +37,7 @@ class Row:
 
 
 @dataclasses.dataclass(frozen=True)
-class Record:
+class ImageResult:
     """One image: its rows, or why there are none."""
 
     name: str
@@ -47,10 +47,10 @@ class Record:
     remarks: tuple[str, ...] = ()  # what went wrong beside that, such as a metric that failed
 
     @staticmethod
-    def of(content: Mapping[str, Any]) -> Record:
+    def of(content: Mapping[str, Any]) -> ImageResult:
         """What `dataclasses.asdict` gave; KeyError or TypeError for anything else."""
         rows = tuple(Row(**row) for row in content["rows"])
-        return Record(**{**content, "rows": rows, "remarks": tuple(content["remarks"])})
+        return ImageResult(**{**content, "rows": rows, "remarks": tuple(content["remarks"])})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Run:
     """A dataset under a protocol."""
 
     config: Mapping[str, Any]
-    records: tuple[Record, ...]
+    records: tuple[ImageResult, ...]
 
     @property
     def title(self) -> str:
@@ -86,7 +86,7 @@ class Run:
         return str(self.config["base"]["title"])
 
     @property
-    def measured(self) -> list[Record]:
+    def measured(self) -> list[ImageResult]:
         """The images that gave figures."""
         return [record for record in self.records if record.problem is None]
 
@@ -148,16 +148,16 @@ def stem_of(index: int, name: str) -> str:
     return f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}"
 
 
-def save_record(record: Record, photo: str, seconds: float, path: Path) -> None:
+def save_record(record: ImageResult, photo: str, seconds: float, path: Path) -> None:
     """Write what became of an image, with the digest of its files."""
     write_json({"inputs": photo, "seconds": seconds, "record": dataclasses.asdict(record)}, path)
 
 
-def load_record(path: Path, photo: str) -> tuple[Record, float] | None:
+def load_record(path: Path, photo: str) -> tuple[ImageResult, float] | None:
     """What an earlier run found, and how long it took; None where it is not there, or about other files."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        found = Record.of(content["record"]), float(content["seconds"])
+        found = ImageResult.of(content["record"]), float(content["seconds"])
         return found if content["inputs"] == photo else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -171,7 +171,7 @@ def load_run(folder: Path) -> Run:
         raise InputError(f"{folder}: {state}: {RESULTS} is missing")
     content = read_json(path)
     try:
-        run = Run(dict(content["config"]), tuple(Record.of(image) for image in content["images"]))
+        run = Run(dict(content["config"]), tuple(ImageResult.of(image) for image in content["images"]))
         _ = (run.title, run.near, run.methods, run.base, run.base_gaussians)  # all are there
         return run
     except (KeyError, TypeError, ValueError, AttributeError) as error:

@@ -22,7 +22,7 @@ from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import NEAR, Wanted, large_views, measure
-from spackle.evaluation.results import Record, Run, begin, load_record, save_record, write_json, write_text
+from spackle.evaluation.results import ImageResult, Run, begin, load_record, save_record, write_json, write_text
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
@@ -71,7 +71,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
     """A line for each reason why metrics are not run, and pyiqa's terms where it is at work."""
     reasons: dict[str, list[str]] = {}
-    for name, state in evaluation.states.items():
+    for name, state in evaluation.config["metrics"].items():
         if state.startswith(NOT_RUN):
             reasons.setdefault(state, []).append(name)
     for state, names in reasons.items():
@@ -80,7 +80,7 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
         reporter.say(NOTICE)
 
 
-def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list[tuple[Record, float]] | None:
+def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list[tuple[ImageResult, float]] | None:
     """Do what is missing: each image's record and seconds; None where Ctrl-C came."""
     cases, found, begun = evaluation.cases, [], False
     with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
@@ -104,7 +104,7 @@ def _image_file(output: Path, index: int, case: Case, suffix: str) -> Path:
 
 def _do_image(
     evaluation: Evaluation, index: int, case: Case, inputs: str, output: Path, reporter: Reporter
-) -> tuple[Record, float]:
+) -> tuple[ImageResult, float]:
     """One image; a problem of its own is its record, which the next run tries again."""
     start = time.perf_counter()
     try:
@@ -114,7 +114,7 @@ def _do_image(
     except InputError as error:
         problem = problem_of(case, error, evaluation.options.root)
         reporter.say(f"passed over: {problem}")
-        return Record(case.name, problem=problem), 0.0
+        return ImageResult(case.name, problem=problem), 0.0
     for remark in record.remarks:
         reporter.say(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
@@ -126,7 +126,7 @@ def _do_image(
     return record, seconds
 
 
-def examine(case: Case, evaluation: Evaluation) -> tuple[Record, dict[str, Tensor]]:
+def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, Tensor]]:
     """All figures of an image, and what is shown of it: a picture of one view by each method, and the truth.
 
     Raises:
@@ -169,7 +169,7 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[Record, dict[str, Tenso
         "shown": {"setting": measured.shown.setting, "view": measured.shown.name},
     }
     lacks = [f"without one of its second photos: {_from_root(lack, options.root)}" for lack in loaded.lacks]
-    record = Record(case.name, facts, tuple(measured.rows), remarks=(*lacks, *measured.remarks))
+    record = ImageResult(case.name, facts, tuple(measured.rows), remarks=(*lacks, *measured.remarks))
     truth = {} if measured.shown.truth is None else {TRUTH: measured.shown.truth}
     return record, measured.pictures | truth
 
@@ -204,7 +204,7 @@ def inputs_digest(case: Case) -> str:
 
 
 def _finish(
-    evaluation: Evaluation, found: Sequence[tuple[Record, float]], output: Path, reporter: Reporter, html: bool
+    evaluation: Evaluation, found: Sequence[tuple[ImageResult, float]], output: Path, reporter: Reporter, html: bool
 ) -> None:
     """Write everything that is made of all images; results.json comes last and vouches for the rest."""
     run, options = Run(evaluation.config, tuple(record for record, _ in found)), evaluation.options
@@ -241,7 +241,7 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     Args:
         folders: outputs of `evaluate`, finished.
         output: a folder for the two files.
-        reporter: says where they lie.
+        reporter: logs where they lie.
         html: write report.html too; a folder may then hold a bench.json alone.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +151,6 @@ class Evaluation:
     network: ResidualNet | None
     renderer: Renderer
     gauges: Gauges
-    states: Mapping[str, str]  # metric → who measures it, or why nobody does
     config: dict[str, Any]  # everything that decides the figures, ready for JSON; nothing of where files lie
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
@@ -180,18 +179,17 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     wanted, features = options.wanted_metrics, None
     if options.features is not None and "distance" in wanted:
         features = load_features("squeezenet", _there(options.features, "--features"))
-    published = open_metrics([n for n in wanted if n in DEFINITIONS], options.device.type, options.download)
-    states = dict.fromkeys(wanted, OWN)
-    states |= dict.fromkeys(published.metrics, f"pyiqa {published.version}")
-    states |= {name: f"not run: {reason}" for name, reason in published.missing.items()}
+    names = [name for name in wanted if name in DEFINITIONS]
+    published, found = open_metrics(names, options.device.type, options.download)
+    states = dict.fromkeys(wanted, OWN) | found
     if "distance" in wanted and features is None:
         states["distance"] = NO_FEATURES
     if "inpaint2d" in options.methods:
         _check_opencv()
     base, renderer = open_base(options.opened), get_renderer(options.base.device)
-    gauges = Gauges(wanted, published.metrics, features)
-    config = _configuration(options, dataset, cases) | {"metrics": states}
-    return Evaluation(options, cases, base, direct, network, renderer, gauges, states, config)
+    gauges = Gauges(wanted, published, features)
+    config = _configuration(options, dataset, cases) | {"metrics": states}  # metric → who measures it, or why nobody
+    return Evaluation(options, cases, base, direct, network, renderer, gauges, config)
 
 
 def _limited(cases: Sequence[Case], limit: int | None) -> list[Case]:

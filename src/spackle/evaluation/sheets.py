@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
-from spackle.evaluation.results import Record, Run
+from spackle.evaluation.results import ImageResult, Run
 
 SIDE = 320  # pixels of a thumbnail's longer side
 GAP, LINE = 6, 22  # pixels between pictures, and of a line of text
@@ -32,7 +32,7 @@ class Ranking:
     """Images from best to worst."""
 
     names: list[str]
-    says: str  # what they were ordered by
+    criterion: str  # what they were ordered by
     values: dict[str, float]
 
 
@@ -67,7 +67,7 @@ def rank(run: Run) -> Ranking | None:
     return None
 
 
-def mean_of(record: Record, figure: str, method: str) -> float | None:
+def mean_of(record: ImageResult, figure: str, method: str) -> float | None:
     """Over an image's views; None where no view has a number."""
     values = [row.figures.get(figure) for row in record.rows if row.method == method]
     known = [value for value in values if value is not None]
@@ -83,8 +83,10 @@ def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str,
     height = sum(picture.height + LINE + GAP for picture in pictures.values()) + LINE
     canvas = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(canvas)
-    says = ranking.says.replace("↑", "(higher is better)").replace("↓", "(lower is better)")  # the font has no arrows
-    draw.text((4, 3), f"{run.title}, {run.config['protocol']}, by {says}", "black", font_size=FONT)
+    by = ranking.criterion.replace("↑", "(higher is better)").replace(
+        "↓", "(lower is better)"
+    )  # the font has no arrows
+    draw.text((4, 3), f"{run.title}, {run.config['protocol']}, by {by}", "black", font_size=FONT)
     y = LINE
     for name in names:
         shown = by_name[name].facts["shown"]

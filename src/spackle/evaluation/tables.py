@@ -130,14 +130,14 @@ def _notes(runs: Sequence[Run], metrics: Iterable[str] = ()) -> tuple[str, ...]:
 
 def _bases(runs: Sequence[Run]) -> str:
     """Which base the rows stand on, for a caption."""
-    says = dict.fromkeys(f"{run.base}: {run.config['base']['says']}" for run in runs)
-    return f"Base {'; '.join(says)}." if says else "No run."
+    bases = dict.fromkeys(f"{run.base}: {run.config['base']['says']}" for run in runs)
+    return f"Base {'; '.join(bases)}." if bases else "No run."
 
 
 def _rows_of(runs: Sequence[Run]) -> str:
     """What the rows are, and whose weights the residual has."""
     names = dict.fromkeys(method for run in runs for method in run.methods)
-    rows = "; ".join(f"{METHODS[name].title}: {METHODS[name].says}" for name in names)
+    rows = "; ".join(f"{METHODS[name].title}: {METHODS[name].description}" for name in names)
     residuals = [run.config["residual"] for run in runs]
     weights = dict.fromkeys(
         f"{one['weights']} weights {one['sha256'][:8]}" if one["sha256"] else "no weights, seeds alone"
@@ -186,7 +186,7 @@ def quality_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
 
 
 def holes_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
-    """Hole Area Ratio before and after (tab:controlled_disocclusion; eq. 10 and 11)."""
+    """Hole Area Ratio before and after (paper, eq. 11; tab:controlled_disocclusion)."""
 
     def three(run: Run, method: str, setting: str) -> Cells:
         before, after = (run.mean(figure, method, setting) for figure in ("har_before", "har"))

@@ -104,7 +104,7 @@ MAX_ERROR_PX = 2.0  # of a point's reprojection, on average over its photos
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class ColmapView:
     """A photo of a model."""
 
     name: str  # with its folder, as the model has it
@@ -117,11 +117,11 @@ class View:
 class Model:
     """A sparse reconstruction."""
 
-    views: tuple[View, ...]  # by name
+    views: tuple[ColmapView, ...]  # by name
     ids: Array  # [m] of the reliable points, ascending
     xyz: Array  # [m, 3] world
 
-    def points(self, view: View) -> Points:
+    def points(self, view: ColmapView) -> Points:
         """The reliable points that a view sees, with their depth in front of it."""
         place = np.searchsorted(self.ids, view.ids)
         place = np.minimum(place, max(0, len(self.ids) - 1))
@@ -190,7 +190,7 @@ def _lens(path: Path, camera: CameraRecord) -> Camera:
     return Camera(K, torch.eye(4, dtype=torch.float64), width, height)
 
 
-def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> View:
+def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> ColmapView:
     quaternion, shift = torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64)
     if not (torch.isfinite(quaternion).all() and torch.isfinite(shift).all() and float(quaternion.norm()) > 1e-6):
         raise ValueError(f"the pose of {name} is no rotation")
@@ -199,4 +199,4 @@ def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> View:
     seen = observed[observed["id"] >= 0]
     _, first = np.unique(seen["id"], return_index=True)  # a point may have been found twice in a photo
     seen = seen[first]
-    return View(name, dataclasses.replace(lens, world_to_camera=matrix), seen["uv"].copy(), seen["id"].copy())
+    return ColmapView(name, dataclasses.replace(lens, world_to_camera=matrix), seen["uv"].copy(), seen["id"].copy())

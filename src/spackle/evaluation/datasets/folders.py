@@ -37,8 +37,8 @@ def scene_folders(root: Path, dataset: str) -> list[Path]:
     """The scenes of a dataset at or below `root`, by their names.
 
     Raises:
-        InputError: no such folder, or none of the dataset's scenes in it; says what was expected, and which
-            other dataset it looks like.
+        InputError: no such folder, or none of the dataset's scenes in it; the message tells what was
+            expected, and which other dataset it looks like.
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the one that {dataset} was unpacked in")
