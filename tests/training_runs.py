@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
+from spackle.training.method import Method
+from spackle.training.recipe import Recipe
+from spackle.training.trainer import Callbacks, Trainer
 
 CLI = "from spackle.cli import main\nmain()"
 
@@ -55,3 +60,29 @@ from spackle.training.trainer import Trainer
 step = Trainer.step
 Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
 """
+
+
+def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) -> tuple[Trainer, list[float]]:
+    """Train in this process; returns the trainer and the loss of each step."""
+    losses: list[float] = []
+    callbacks = Callbacks(
+        step=lambda step, numbers: losses.append(numbers["loss"]),
+        validated=lambda progress: None,
+        saved=lambda progress: None,
+        stop=lambda: False,
+    )
+    trainer = Trainer(recipe, method, network, torch.device("cpu"), folder, callbacks)
+    assert trainer.run() == "steps"
+    return trainer, losses
+
+
+def run_two(arguments: Sequence[str], code: str = "", entry: str = CLI) -> list[str]:
+    """A command in two processes that talk to each other; returns what each says."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    processes = [started(arguments, code, entry, RANK=str(rank), **shared) for rank in range(2)]
+    said = [process.communicate()[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said
+    return said

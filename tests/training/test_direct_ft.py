@@ -7,8 +7,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import socket
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from safetensors.torch import save_file
 from scenes import shifted
 from sharp_weights import MICRO
 from torch import Tensor
-from training_runs import started, state
+from training_runs import run_two, state, trained
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import (
@@ -48,7 +46,6 @@ from spackle.render.reference import ReferenceRenderer
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
 from spackle.training.method import Objective
 from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
-from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
 
@@ -205,7 +202,7 @@ def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, b
 
 
 def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: object) -> list[float]:
-    """Train in this process; returns the loss of each step."""
+    """The loss of each step on one photo."""
     recipe = Recipe(
         data=DataRecipe(validation_views=VIEWS),
         loss=LossRecipe(features="none"),
@@ -216,16 +213,7 @@ def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: ob
     owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
     photos = PseudoPhotos.of(recipe.data, place / "data", owner.sha256)
     method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), objective, 4, 0)
-    losses: list[float] = []
-    callbacks = Callbacks(
-        step=lambda step, numbers: losses.append(numbers["loss"]),
-        validated=lambda progress: None,
-        saved=lambda progress: None,
-        stop=lambda: False,
-    )
-    decoder = base.network.gaussian_decoder().let_learn()
-    assert Trainer(recipe, method, decoder, CPU, folder, callbacks).run() == "steps"
-    return losses
+    return trained(recipe, method, base.network.gaussian_decoder().let_learn(), folder)[1]
 
 
 def digest_of(path: Path) -> str:
@@ -276,22 +264,12 @@ def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Pa
     assert state(folder).method == "direct-ft"
 
 
-def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
-    return started(arguments(place, output, *more), f"{SMALL}\n{code}", **environment)
-
-
 @pytest.mark.slow
 def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
     """Two photos each: gradients are added up within a process, and then put together."""
     options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    processes = [child(place, tmp_path / "two", "", *options, RANK=str(rank), **shared) for rank in range(2)]
-    alone = train(place, tmp_path / "one", *options)
-    said = [process.communicate()[1] for process in processes]
-    assert (alone.code, *(process.returncode for process in processes)) == (0, 0, 0), said
+    run_two(arguments(place, tmp_path / "two", *options), SMALL)
+    assert train(place, tmp_path / "one", *options).code == 0
     one, two = (state(tmp_path / name).optimizer["state"] for name in ("one", "two"))
     assert one.keys() == two.keys()
     # Weights would not do: the optimiser's first step makes as much of a gradient's noise as of a gradient.

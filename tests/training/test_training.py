@@ -8,8 +8,6 @@ import math
 import resource
 import shutil
 import signal
-import socket
-import subprocess
 import sys
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from command import Run, names_in, run
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
+from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, run_two, started, state, trained
 
 from spackle.downloads import hold
 from spackle.gaussians import Gaussians
@@ -30,7 +28,7 @@ from spackle.training.method import Objective
 from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
 from spackle.training.residual_method import ResidualMethod, complete_samples
 from spackle.training.sample import Sample, load_sample, save_sample
-from spackle.training.trainer import Callbacks, Trainer
+from spackle.training.trainer import Trainer
 
 pytest.importorskip("yaml")
 
@@ -79,10 +77,6 @@ def train(place: Path, output: Path, *more: str) -> Run:
     return run(*arguments(place, output, *more))
 
 
-def child(place: Path, output: Path, code: str, *more: str, **environment: str) -> subprocess.Popen[str]:
-    return started(arguments(place, output, *more), code, **environment)
-
-
 # A run and what comes out -------------------------------------------------------------------------
 
 
@@ -119,7 +113,7 @@ def test_curves_and_pictures_are_in_the_logs(whole: tuple[Path, Run]) -> None:
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    process = child(place, tmp_path / "out", killed_at(4))
+    process = started(arguments(place, tmp_path / "out"), killed_at(4))
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 3
@@ -219,14 +213,9 @@ def test_two_runs_do_not_share_a_folder(place: Path, tmp_path: Path) -> None:
 
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     options = ["optim.steps=2", "optim.batch=4", "run.validate_every=2"]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    processes = [child(place, tmp_path / "two", "", *options, RANK=str(rank), **shared) for rank in range(2)]
+    said = run_two(arguments(place, tmp_path / "two", *options))
     alone = train(place, tmp_path / "one", *options)
-    said = [process.communicate()[1] for process in processes]
-    assert (alone.code, *(process.returncode for process in processes)) == (0, 0, 0), said
+    assert alone.code == 0
     assert_same_weights(tmp_path / "two", tmp_path / "one", 1e-5)
     one, two = (state(tmp_path / name).progress.history[0] for name in ("one", "two"))
     assert two == pytest.approx(one, rel=1e-5)
@@ -335,17 +324,9 @@ def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path)
         run=RunRecipe(log_every=1, validate_every=6, save_every=100),
     )
     objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
-    found: list[float] = []
-    callbacks = Callbacks(
-        step=lambda step, numbers: found.append(numbers["loss"]),
-        validated=lambda progress: None,
-        saved=lambda progress: None,
-        stop=lambda: False,
-    )
     torch.manual_seed(0)
     method = ResidualMethod(files, objective, recipe.optim.batch)
-    trainer = Trainer(recipe, method, ResidualNet(), objective.device, tmp_path, callbacks)
-    assert trainer.run() == "steps"
+    trainer, found = trained(recipe, method, ResidualNet(), tmp_path)
     assert len(found) == 12
     assert found[-1] < 0.5 * found[0]
     first, last = trainer.progress.history

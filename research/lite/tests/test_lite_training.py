@@ -9,7 +9,6 @@ import json
 import math
 import shutil
 import signal
-import socket
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from mixture import DepthBatch, Mixture
 from PIL import Image
 from recipe import LiteRecipe
 from train import main
-from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, started, state
+from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, run_two, started, state
 from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite.network import LiteNet, load_networks
@@ -214,15 +213,8 @@ def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple
 
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     options = ["optim.steps=2", "run.validate_every=2"]
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    words = arguments(place, tmp_path / "two", *options)
-    processes = [started(words, "", ENTRY, RANK=str(rank), **shared) for rank in range(2)]
-    alone = train(place, tmp_path / "one", *options)
-    said = [process.communicate()[1] for process in processes]
-    assert (alone.code, *(process.returncode for process in processes)) == (0, 0, 0), said
+    run_two(arguments(place, tmp_path / "two", *options), entry=ENTRY)
+    assert train(place, tmp_path / "one", *options).code == 0
     one, two = (state(tmp_path / name) for name in ("one", "two"))
     assert two.progress.history[0] == pytest.approx(one.progress.history[0], rel=1e-3)
     mine, yours = (
