@@ -158,8 +158,8 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells; nothing of use at the others.
 
-    The network looks only around the masked cells, see `spackle.residual.sparse`; and on a processor it computes
-    what only the others need nowhere, see `ResidualNet.deltas_at`.
+    The network looks only around the masked cells, see `spackle.residual.sparse`; on a processor it does not compute
+    what only the others need, see `ResidualNet.deltas_at`.
 
     Args:
         network: a `ResidualNet`.
@@ -170,8 +170,7 @@ def predict_deltas(
     device = cues.mask.device
     dtype = pick_dtype(precision, device)
     chosen = torch.ones_like(cues.mask) if dense else cues.mask
-    able = isinstance(network, ResidualNet) and device.type == "cpu" and not dense
-    few = cast(ResidualNet, network) if able else None
+    few = network if isinstance(network, ResidualNet) and device.type == "cpu" and not dense else None
     field = cues.alpha.new_zeros(*cues.mask.shape, DELTA_CHANNELS)
     for inner, outer in crops_around(chosen, STRIDE):
         there = outer.slices

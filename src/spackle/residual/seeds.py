@@ -149,8 +149,7 @@ def _place(start: int, stop: int, seen: Any, chosen: Any, radius: int, share: An
 
 def cell_centers(camera: Camera) -> Tensor:
     """[ceil(H/2), ceil(W/2), 2] in pixels."""
-    width, height = (size + size % CELL for size in (camera.width, camera.height))
-    return dataclasses.replace(camera, width=width, height=height).pixel_centers(stride=CELL)
+    return camera.even().pixel_centers(stride=CELL)
 
 
 @dataclasses.dataclass(frozen=True)

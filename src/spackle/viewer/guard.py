@@ -51,12 +51,10 @@ FORMATS = frozenset({"JPEG", "MPO", "PNG", "WEBP", "HEIF", "TIFF"})
 KINDS = ", ".join(suffix.removeprefix(".") for suffix in PHOTO_SUFFIXES)
 
 # The page has its scripts and styles from us alone, sends nothing elsewhere and stands in no other page's frame.
-CONTENT_POLICY = "; ".join(
-    [
-        *("default-src 'none'", "script-src 'self' 'wasm-unsafe-eval'", "style-src 'self'"),
-        *("connect-src 'self'", "img-src 'self' data: blob:", "media-src blob:", "worker-src 'self' blob:"),
-        *("base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'"),
-    ]
+CONTENT_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data: blob:; media-src blob:; worker-src 'self' blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 HEADERS = {
     "Cache-Control": "no-store",  # a photo is private; and the next viewer has other scenes under the same paths

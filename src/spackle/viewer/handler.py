@@ -1,27 +1,43 @@
-"""One connection to the viewer's server: GET and HEAD of its routes, a job's events, and POST /photos."""
+"""The viewer's socket and its connections: GET and HEAD of the routes, a job's events, and POST /photos."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
+import os
 import re
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler
-from typing import Any, Protocol, cast
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socketserver import TCPServer
+from typing import Any, cast
 
+from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES
-from spackle.viewer.guard import HEADERS, PIECE, Declared, Limits, RefusedError, declared, refusal
+from spackle.viewer.guard import (
+    HEADERS,
+    PIECE,
+    Declared,
+    Limits,
+    RefusedError,
+    declared,
+    is_loopback,
+    own_names,
+    refusal,
+)
 from spackle.viewer.page import PageScene
 from spackle.viewer.work import Channel, Worker
 
 JSON = "application/json; charset=utf-8"
 Body = tuple[str, bytes]  # content type, bytes
 EVENTS = re.compile(r"/jobs/([1-9][0-9]{0,8})/events")
+FULL = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 DRAINED = 1 << 26  # bytes of a refused upload that are read, so that the client gets to read why
 
 
@@ -100,19 +116,6 @@ class TimeoutReader(io.RawIOBase):
         return self._connection.recv_into(buffer)
 
 
-class Site(Protocol):
-    """What the handlers of a server share."""
-
-    routes: Routes
-    worker: Worker
-    limits: Limits
-    listeners: threading.BoundedSemaphore
-    names: frozenset[str]
-    local: bool
-    log: Callable[[str], None]
-    take: Callable[[io.BufferedIOBase, Declared], int]  # receives a photo in the claimed place, and starts its job
-
-
 class Handler(BaseHTTPRequestHandler):
     """Speaks HTTP/1.1; every refusal is a status and `{"error": "one line"}`."""
 
@@ -120,8 +123,8 @@ class Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     @property
-    def site(self) -> Site:
-        return cast("Site", self.server)
+    def site(self) -> Listener:
+        return cast("Listener", self.server)
 
     def setup(self) -> None:
         super().setup()
@@ -246,3 +249,98 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         self.site.log(f"{self.address_string()} {format % args!a}")
+
+
+class Listener(ThreadingHTTPServer):
+    """Threads for connections, and what they share; a connection too many is told so and closed.
+
+    Raises:
+        InputError: nothing can listen at that host and port.
+    """
+
+    daemon_threads = True
+    request_queue_size = 128
+    allow_reuse_address = os.name == "posix"  # elsewhere that would take a port away from who has it
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        pages: Mapping[str, Body],
+        limits: Limits,
+        log: Callable[[str], None],
+        take: Callable[[io.BufferedIOBase, Declared], int],
+    ) -> None:
+        self.routes, self.worker = Routes(pages, limits), Worker(log, limits.kept_jobs)
+        self.limits, self.log, self.take = limits, log, take
+        self.listeners = threading.BoundedSemaphore(limits.listeners)
+        self._places = threading.BoundedSemaphore(limits.connections)
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self.address_family, place = _address(host, port)
+        try:
+            super().__init__(place, Handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            line = f"--port {port}: cannot listen at {host}: {reason}: give another, or none"
+            if getattr(error, "errno", None) == errno.EADDRNOTAVAIL:
+                line = f"--host {host}: is no address of this machine: leave it out, or give 0.0.0.0 for all of them"
+            raise InputError(line) from error
+        numeric = str(self.server_address[0])
+        self.local, self.names = is_loopback(numeric), own_names(host, numeric)
+
+    def server_bind(self) -> None:
+        """Without the look-up of our own name, which may take seconds."""
+        TCPServer.server_bind(self)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if not self._places.acquire(blocking=False):
+            request.setblocking(False)
+            with contextlib.suppress(OSError):
+                request.send(FULL)
+            self.shutdown_request(request)
+            return
+        with self._lock:
+            self._open.add(request)
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._forget(request)
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._forget(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that goes away ends its own connection, and nothing else."""
+        error = sys.exc_info()[1]
+        self.log(f"{client_address[0]} connection ended: {type(error).__name__}: {error}")
+
+    def server_close(self) -> None:
+        """Also of the connections that are still open."""
+        super().server_close()
+        with self._lock:
+            left = list(self._open)
+        for connection in left:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def _forget(self, request: socket.socket) -> None:
+        with self._lock:
+            self._open.discard(request)
+        self._places.release()
+
+
+def _address(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any that is free)")
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        line = f"--host {host}: no address of this machine: {reason}: leave it out, or give 0.0.0.0"
+        raise InputError(line) from error
+    return found[0][0], found[0][4]

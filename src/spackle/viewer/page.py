@@ -29,12 +29,7 @@ BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1
 SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
 BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
 
-FILES = {
-    "index.html": "text/html",
-    "viewer.js": "text/javascript",
-    "viewer.css": "text/css",
-    "licenses.txt": "text/plain",
-}
+FILES = {"index.html": "html", "viewer.js": "javascript", "viewer.css": "css", "licenses.txt": "plain"}
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
 
@@ -146,7 +141,7 @@ def _rotations(quats: Tensor) -> NDArray[np.uint8]:
 def page_files() -> dict[str, tuple[str, bytes]]:
     """What a server hands out: URL path to content type and bytes; "/" is the page."""
     paths = {name: "/" if name == "index.html" else f"/{name}" for name in FILES}
-    return {paths[name]: (f"{kind}; charset=utf-8", _read(name)) for name, kind in FILES.items()}
+    return {paths[name]: (f"text/{kind}; charset=utf-8", _read(name)) for name, kind in FILES.items()}
 
 
 def single_html(scene: PageScene) -> bytes:
@@ -163,28 +158,21 @@ def single_html(scene: PageScene) -> bytes:
 
 def _policy(css: str, js: str) -> str:
     """Only these scripts and styles run, and nobody is asked for anything."""
-    parts = {
-        "default-src": "'none'",
-        "script-src": f"{_digest(js)} 'wasm-unsafe-eval'",
-        "style-src": _digest(css),
-        "worker-src": "blob:",
-        "img-src": "data: blob:",
-        "media-src": "blob:",
-        "form-action": "'none'",
-        "base-uri": "'none'",
-    }
-    policy = "; ".join(f"{name} {value}" for name, value in parts.items())
+    policy = (
+        f"default-src 'none'; script-src {_digest(js)} 'wasm-unsafe-eval'; style-src {_digest(css)}; worker-src blob:; "
+        "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
+    )
     return f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-
-
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _gzipped(data: bytes) -> bytes:
     """The same bytes at any time: there is no clock in them."""
     packer = zlib.compressobj(6, wbits=31)
     return packer.compress(data) + packer.flush()
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _read(name: str) -> bytes:
