@@ -5,6 +5,7 @@ Optional: pip install 'spackle-nvs[hf]'.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import logging
@@ -14,7 +15,6 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -238,7 +238,7 @@ def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
             module.register_forward_hook(lambda _module, _args, output: output.float())
 
 
-@contextmanager
+@contextlib.contextmanager
 def _one_line(who: str, what: str, advice: str) -> Iterator[None]:
     """Turn whatever transformers and torch raise over a stranger's files into one line.
 
@@ -257,7 +257,7 @@ def _one_line(who: str, what: str, advice: str) -> Iterator[None]:
         raise InputError(f"{who} {what} ({reason}): {advice}") from error
 
 
-@contextmanager
+@contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Keep the packages from printing warnings, logs and progress bars; what matters is raised."""
     from huggingface_hub import utils
@@ -305,8 +305,15 @@ def _find(model: str, files: list[str]) -> Path:
         if not folder.is_dir():
             raise InputError(f"hf:{model}: no such folder: check the name")
     elif _HUB_NAME.fullmatch(model):
-        cached = _from_cache(model, files)
-        folder = cached if cached is not None and not _lacks(cached, files) else _from_hub(model, files)
+        try:
+            from huggingface_hub import snapshot_download
+        except ImportError as error:
+            raise InputError(NOT_INSTALLED) from error
+        folder = None
+        with contextlib.suppress(OSError), quiet():  # what huggingface_hub says of what is not in the cache is one
+            folder = Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
+        if folder is None or _lacks(folder, files):
+            folder = _from_hub(model, files)
     else:
         raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
     if problem := _lacks(folder, files):
@@ -330,19 +337,6 @@ def _lacks(folder: Path, files: list[str]) -> str:
     elif WEIGHTS[0] in files and not (folder / WEIGHTS[0]).is_file():
         return f"has no {WEIGHTS[0]}, the only kind of weights that runs no code when it is read: give another model"
     return ""
-
-
-def _from_cache(model: str, files: list[str]) -> Path | None:
-    """The model's folder in the cache, whatever of it is there; None where nothing is."""
-    try:
-        from huggingface_hub import snapshot_download
-    except ImportError as error:
-        raise InputError(NOT_INSTALLED) from error
-    try:
-        with quiet():
-            return Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
-    except OSError:  # what huggingface_hub says of it is one
-        return None
 
 
 def _from_hub(model: str, files: list[str]) -> Path:

@@ -82,9 +82,10 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
     colors = srgb_to_linear(rgb)
-    gaussians = Gaussians.cat(
-        [_front(colors, inverse_depth, slope, camera), _backing(colors, inverse_depth, slope, camera)]
-    )
+    uv, flat = camera.pixel_centers().reshape(-1, 2), inverse_depth.reshape(-1)
+    opacities = torch.full((len(uv),), OPACITY)
+    front = surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
+    gaussians = Gaussians.cat([front, _backing(colors, inverse_depth, slope, camera)])
     notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
     if sky.share:
         notes["sky"] = round(sky.share, 4)
@@ -113,14 +114,6 @@ def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor
     sampled = sample(smooth, known, edges, camera.height, camera.width)
     settled, found = settle(sampled, rgb.contiguous().numpy())
     return torch.from_numpy(settled), torch.from_numpy(found)
-
-
-def _front(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
-    """One small Gaussian for each pixel."""
-    uv = camera.pixel_centers().reshape(-1, 2)
-    opacities = torch.full((len(uv),), OPACITY)
-    flat = inverse_depth.reshape(-1)
-    return surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
 
 
 def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:

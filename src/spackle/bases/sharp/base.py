@@ -64,14 +64,12 @@ class SharpBase:
         Args:
             path: Apple's .pt file, a safetensors file with the same names, or the decoder that
                 `spackle train --method direct-ft` wrote, which names the checkpoint for the rest.
-            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively. In either,
-                the last bits of the Gaussians depend on the number of threads, because sums run in another order;
-                bf16's last bits are coarser.
+            precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively.
             low_memory: take less memory and a little more time to predict: one window at a time.
             windows: of the 35 of a photo, how many go through the transformer at once; None: 5 on a processor, all on
-                a GPU. Only the last bits depend on it.
+                a GPU. The last bits depend on it.
             compiled: let `torch.compile` translate the network with the first photo, which takes minutes, and replay
-                it as one CUDA graph on a GPU. Where that cannot be done, a warning says why, and it runs as it is.
+                it as one CUDA graph on a GPU. Where that fails, a warning says why, and the network runs as it is.
             device: cpu or a CUDA device; where None, CUDA if it is there.
 
         Raises:

@@ -29,15 +29,7 @@ class VisionTransformer(nn.Module):
         self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
 
     def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
-        """Feature maps of windows.
-
-        Args:
-            windows: [B, 3, S, S] in -1..1.
-            taps: indices of blocks whose output is wanted too.
-
-        Returns:
-            The normalised features [B, C, G, G], and those of the taps, not normalised.
-        """
+        """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw ones after the blocks `taps`."""
         tokens = self.patch_embed(windows)
         tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
         tapped = []
@@ -150,13 +142,7 @@ class SlidingPyramid(nn.Module):
         self.fuse_lowres = nn.Conv2d(2 * dims[3], dims[3], 1)
 
     def forward(self, image: Tensor, batch: int, progress: Progress | None = None) -> list[Tensor]:
-        """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1.
-
-        Args:
-            image: the picture.
-            batch: how many windows go through the transformer at once.
-            progress: called after each batch.
-        """
+        """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1, `batch` windows at a time."""
         half, quarter = (interpolate(image, scale_factor=f, mode="bilinear") for f in (0.5, 0.25))
         windows = torch.cat([cut(image, self.window, FULL_WINDOWS), cut(half, self.window, HALF_WINDOWS), quarter])
         maps, latents = self._encode(windows, batch, progress)

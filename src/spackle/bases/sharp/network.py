@@ -50,13 +50,10 @@ class SharpNetwork(nn.Module):
     def forward(
         self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
     ) -> SharpOutput:
-        """Predict from a picture [1, 3, side, side] of sRGB in 0..1, float32.
+        """Predict from the photo, stretched to [1, 3, side, side] sRGB in 0..1, float32.
 
-        Args:
-            image: the photo, stretched to the square.
-            disparity_factor: focal length over width, both in the photo's pixels; a tensor without an axis counts, too.
-            batch: windows that go through the transformer at once; more are no faster on a processor.
-            progress: called as the transformer advances, with windows done and all of them.
+        `disparity_factor` is the focal length over the width in the photo's pixels. So many windows as `batch` says go
+        through the transformer at once; `progress` gets the windows done and the number of all.
         """
         seen = self.see(image, disparity_factor, batch, progress)
         deltas: Tensor = self.gaussian_decoder()(seen.picture, seen.maps)
