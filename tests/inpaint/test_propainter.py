@@ -6,11 +6,10 @@ The networks are the published ones in full size, on the smallest pictures that 
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from command import Run, run
+from dataset_builds import content, refused
 from deform_conv import DeformConv2d
 from photos import metres, picture, write_depth
 from PIL import Image
@@ -102,18 +102,6 @@ def slow(conv: nn.Conv2d, image: Tensor, offset: Tensor, mask: Tensor) -> Tensor
             total += weight * float(mask[b, n, i, j]) * at(b, channel, y, x)
         out[b, o, i, j] = total
     return out
-
-
-def test_the_convolution_is_torchvisions_where_that_can_be_imported() -> None:
-    try:
-        from torchvision.ops import deform_conv2d
-    except Exception as error:  # beside a torch without CUDA it is a RuntimeError
-        pytest.skip(f"torchvision: {error}")
-    conv = DeformConv2d(8, 12, 3, 1, 1, groups=2)
-    image, offset = torch.randn(2, 8, 9, 10), torch.randn(2, 4 * 2 * 9, 9, 10)
-    mask = torch.rand(2, 4 * 9, 9, 10)
-    theirs = deform_conv2d(image, offset, conv.weight, conv.bias, padding=1, mask=mask)
-    torch.testing.assert_close(conv(image, offset, mask), theirs)
 
 
 # Parts that need no package -----------------------------------------------------------------------
@@ -211,12 +199,10 @@ def seen() -> ViewStack:
     return dataclasses.replace(stack, mask=mask)
 
 
-@pytest.fixture(scope="module")
-def targets(inpainter: PropainterInpainter, seen: ViewStack) -> Tensor:
-    return inpainter.complete(seen)
-
-
-def test_holes_get_colours_and_all_else_stays(targets: Tensor, seen: ViewStack) -> None:
+def test_holes_get_colours_the_same_each_time_and_all_else_stays(
+    inpainter: PropainterInpainter, weights: Path, seen: ViewStack
+) -> None:
+    targets = inpainter.complete(seen)
     assert targets.shape == seen.rgb.shape
     assert targets.dtype == torch.float32
     assert torch.equal(targets[~seen.mask], seen.rgb[~seen.mask])
@@ -224,12 +210,8 @@ def test_holes_get_colours_and_all_else_stays(targets: Tensor, seen: ViewStack) 
     inside = targets[seen.mask]
     assert bool(((inside >= 0) & (inside <= 1)).all())
     assert float((inside - seen.rgb[seen.mask]).abs().mean()) > 0.05
-
-
-def test_the_same_views_give_the_same_bits(weights: Path, targets: Tensor, seen: ViewStack) -> None:
     again = get_inpainter("propainter", InpainterOptions(weights, device="cpu"))
     assert torch.equal(again.complete(seen), targets)
-    assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", again.version)
 
 
 def test_one_view_and_views_without_a_hole(inpainter: PropainterInpainter, seen: ViewStack) -> None:
@@ -343,46 +325,38 @@ def test_weights_are_widened_and_constants_stay(tmp_path: Path) -> None:
     assert not network.linear.weight.requires_grad
 
 
-def broken_files() -> dict[str, tuple[Callable[[Path], object], str]]:
-    """Names, how to write them, and what is said of them."""
-    good = {"linear.weight": torch.ones(2, 3), "linear.bias": torch.zeros(2)}
+GOOD = {"linear.weight": torch.ones(2, 3), "linear.bias": torch.zeros(2)}
+BROKEN: list[tuple[str, object, str]] = [  # names, bytes or what is saved, and what is said of them
+    ("missing.pth", None, "no such weight file"),
+    ("empty.pth", b"", "the file is empty"),
+    ("garbled.pth", b"\x80\x02no" * 50, "cannot be read as weights"),
+    ("text.pth", b"<html>" * 9, "cannot be read as weights"),
+    ("cut.pth", ..., "cannot be read as weights"),
+    ("cut.safetensors", b"\x40\0\0\0\0\0\0\0{" + b" " * 9, "cannot be read as weights"),
+    ("code.pth", {"linear.weight": print}, "cannot be read as weights"),
+    ("alone.pth", torch.ones(3), "cannot be read as weights"),
+    ("others.pth", {"a": torch.ones(3)}, "2 of 2 tensors are missing"),
+    ("shape.pth", GOOD | {"linear.bias": torch.ones(3)}, "such as linear.bias"),
+    ("whole.pth", GOOD | {"linear.bias": torch.ones(2).int()}, "1 of 2 tensors"),
+    ("nan.pth", GOOD | {"linear.bias": torch.tensor([0, torch.nan])}, "not finite"),
+    ("sparse.pth", GOOD | {"linear.weight": GOOD["linear.weight"].to_sparse()}, "1 of"),
+    ("small-0000-0badf00d.pth", GOOD, "SHA-1 is not the one in its name"),
+]
 
-    def cut(path: Path) -> None:
-        torch.save(good, path)
+
+@pytest.mark.parametrize(("name", "held", "said"), BROKEN, ids=[name for name, *_ in BROKEN])
+def test_broken_weights_are_a_line(tmp_path: Path, name: str, held: object, said: str) -> None:
+    path = tmp_path / name
+    if isinstance(held, bytes):
+        path.write_bytes(held)
+    elif held is ...:  # a good file, cut off
+        torch.save(GOOD, path)
         path.write_bytes(path.read_bytes()[:-200])
-
-    return {
-        "missing.pth": (lambda path: None, "no such weight file"),
-        "folder.pth": (Path.mkdir, "not a plain file"),
-        "empty.pth": (Path.touch, "the file is empty"),
-        "garbled.pth": (lambda path: path.write_bytes(b"\x80\x02no" * 50), "cannot be read as weights"),
-        "text.pth": (lambda path: path.write_text("<html>" * 9), "cannot be read as weights"),
-        "cut.pth": (cut, "cannot be read as weights"),
-        "cut.safetensors": (
-            lambda path: path.write_bytes(b"\x40\0\0\0\0\0\0\0{" + b" " * 9),
-            "cannot be read as weights",
-        ),
-        "code.pth": (lambda path: torch.save({"linear.weight": print}, path), "cannot be read as weights"),
-        "alone.pth": (lambda path: torch.save(torch.ones(3), path), "cannot be read as weights"),
-        "others.pth": (lambda path: torch.save({"a": torch.ones(3)}, path), "2 of 2 tensors are missing"),
-        "shape.pth": (lambda path: torch.save(good | {"linear.bias": torch.ones(3)}, path), "such as linear.bias"),
-        "whole.pth": (lambda path: torch.save(good | {"linear.bias": torch.ones(2).int()}, path), "1 of 2 tensors"),
-        "nan.pth": (lambda path: torch.save(good | {"linear.bias": torch.tensor([0, torch.nan])}, path), "not finite"),
-        "sparse.pth": (
-            lambda path: torch.save(good | {"linear.weight": good["linear.weight"].to_sparse()}, path),
-            "1 of",
-        ),
-        "small-0000-0badf00d.pth": (lambda path: torch.save(good, path), "SHA-1 is not the one in its name"),
-    }
-
-
-@pytest.mark.parametrize("name", broken_files())
-def test_broken_weights_are_a_line(tmp_path: Path, name: str) -> None:
-    write, said = broken_files()[name]
-    write(tmp_path / name)
+    elif held is not None:
+        torch.save(held, path)
     with pytest.raises(InputError, match=said) as caught:
-        give_weights(Small(), "small", tmp_path / name)
-    assert str(caught.value).startswith(f"{tmp_path / name}: ")
+        give_weights(Small(), "small", path)
+    assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
 
@@ -401,102 +375,60 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build(place: Path, output: Path, *more: object) -> Run:
-    return run(
-        "dataset", "build", "--photos", place / "photos", "--depth", place / "depth", "-o", output, *SHORT, *more
-    )
+    photos = ["--photos", place / "photos", "--depth", place / "depth"]
+    return run("dataset", "build", *photos, "-o", output, *SHORT, *more)
 
 
-@pytest.fixture(scope="module")
-def built(place: Path, weights: Path) -> tuple[Path, Run]:
-    output = place / "built"
-    return output, build(place, output, "--inpainter", "propainter", "--inpainter-weights", weights)
-
-
-def test_a_dataset_is_built_and_says_by_what(built: tuple[Path, Run]) -> None:
-    output, done = built
+def test_a_dataset_is_built_by_any_number_of_workers_and_says_by_what(
+    place: Path, weights: Path, tmp_path: Path
+) -> None:
+    options = ["--inpainter", "propainter", "--inpainter-weights", weights]
+    done = build(place, tmp_path / "one", *options)
     assert done.code == 0, done.err
     assert [line for line in done.lines if "S-Lab" in line and "non-commercial" in line] == [done.lines[0]]
-    assert run("dataset", "verify", output).code == 0
-    manifest = load_manifest(output)
+    assert build(place, tmp_path / "two", *options, "--workers", 2).code == 0
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+    manifest = load_manifest(tmp_path / "one")
     assert [entry.photo for _, entry in manifest.samples] == ["a.png", "b.png"]
     used = manifest.config["inpainter"]
     assert used["name"] == "propainter"
-    assert used["version"].endswith("long side 640")
+    assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", used["version"])
     assert used["weights"].keys() == set(NETWORKS)
     assert all(re.fullmatch("[0-9a-f]{64}", sha256) for sha256 in used["weights"].values())
-    json.dumps(dict(manifest.config))
-
-
-def test_two_workers_make_the_same_bytes(built: tuple[Path, Run], place: Path, weights: Path, tmp_path: Path) -> None:
-    options = ["--inpainter", "propainter", "--inpainter-weights", weights, "--workers", 2]
-    done = build(place, tmp_path / "out", *options)
-    assert done.code == 0, done.err
-    assert {file.name: file.read_bytes() for file in built[0].iterdir()} == {
-        file.name: file.read_bytes() for file in (tmp_path / "out").iterdir()
-    }
-
-
-def test_other_weights_are_another_dataset(built: tuple[Path, Run], place: Path, weights: Path, tmp_path: Path) -> None:
+    # Other weights are another dataset.
     other = shutil.copytree(weights, tmp_path / "other")
-    save_file(
-        {k: v + 1 for k, v in random_networks()["raft_things"].state_dict().items()}, other / "raft_things.safetensors"
-    )
-    done = build(place, built[0], "--inpainter", "propainter", "--inpainter-weights", other, "--inpainter-side", 320)
+    flow = {key: value + 1 for key, value in random_networks()["raft_things"].state_dict().items()}
+    save_file(flow, other / "raft_things.safetensors")
+    done = build(place, tmp_path / "one", *options[:3], other, "--inpainter-side", 320)
     assert done.code == 2
-    assert "inpainter.weights.raft_things: " in done.lines[-1]
+    for words in ("inpainter.weights.raft_things: ", "long side 640", "long side 320"):
+        assert words in done.lines[-1]
     assert "inpainter.weights.propainter: " not in done.lines[-1]
-    assert "long side 640" in done.lines[-1]
-    assert "long side 320" in done.lines[-1]
-
-
-def test_options_that_cannot_be_are_a_line_and_leave_nothing(place: Path, tmp_path: Path) -> None:
-    for options, said in (
-        (["--inpainter", "geometry", "--inpainter-weights", tmp_path], "the geometry inpainter has no network"),
-        (["--inpainter", "opencv", "--inpainter-side", 320], "the opencv inpainter has no network"),
-        (
-            ["--inpainter", "propainter", "--inpainter-side", 64],
-            "--inpainter-side must be between 128 and 1536, got 64",
-        ),
-    ):
-        done = build(place, tmp_path / "out", *options)
-        assert (done.code, len(done.lines)) == (2, 1)
-        assert said in done.err
-    assert not (tmp_path / "out").exists()
 
 
 def test_weights_that_cannot_be_are_a_line_and_leave_nothing(package: None, place: Path, tmp_path: Path) -> None:
-    done = build(place, tmp_path / "out", "--inpainter", "propainter")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "give --inpainter-weights FOLDER" in done.err
-    (tmp_path / "weights").mkdir()
+    refused(build(place, tmp_path / "out", "--inpainter", "propainter"), "give --inpainter-weights FOLDER")
     for name in NETWORKS:
-        (tmp_path / "weights" / f"{name}.pth").write_bytes(b"PK\x03\x04 cut off")
-    done = build(place, tmp_path / "out", "--inpainter", "propainter", "--inpainter-weights", tmp_path / "weights")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "raft_things.pth: cannot be read as weights" in done.err
+        (tmp_path / f"{name}.pth").write_bytes(b"PK\x03\x04 cut off")
+    done = build(place, tmp_path / "out", "--inpainter", "propainter", "--inpainter-weights", tmp_path)
+    refused(done, "raft_things.pth: cannot be read as weights")
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("found", ["nothing", "a torchvision of another torch"])
 def test_without_its_packages_propainter_is_a_line(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: str
 ) -> None:
     for name in [name for name in sys.modules if name.startswith(OURS)]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "pytorchcv", None)
-    done = build(place, tmp_path / "out", "--inpainter", "propainter")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "pip install 'spackle-nvs[propainter]'" in done.err
-
-
-def test_a_torchvision_of_another_torch_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pytorchcv")
-    for name in [name for name in sys.modules if name.startswith(OURS)]:
-        monkeypatch.delitem(sys.modules, name)
-    (tmp_path / "torchvision").mkdir()
-    problem = "operator torchvision::nms does not exist"  # what torchvision says
-    (tmp_path / "torchvision" / "__init__.py").write_text(f"raise RuntimeError({problem!r})\n")
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    done = build(place, tmp_path / "out", "--inpainter", "propainter")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert f"torchvision cannot be imported ({problem})" in done.err
-    assert torch.__version__ in done.err
+    said = ["pip install 'spackle-nvs[propainter]'"]
+    if found == "nothing":
+        monkeypatch.setitem(sys.modules, "pytorchcv", None)
+    else:
+        pytest.importorskip("pytorchcv")
+        problem = "operator torchvision::nms does not exist"  # what torchvision says
+        (tmp_path / "torchvision").mkdir()
+        (tmp_path / "torchvision" / "__init__.py").write_text(f"raise RuntimeError({problem!r})\n")
+        monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+        said = [f"torchvision cannot be imported ({problem})", torch.__version__]
+    refused(build(place, tmp_path / "out", "--inpainter", "propainter"), *said)
