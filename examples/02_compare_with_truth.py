@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 import spackle
-from spackle.app.demo import load_motorcycle
 from spackle.bases.lift import lift
+from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.formats import save_gray_png, save_png
 
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 import spackle
-from spackle.app.demo import load_motorcycle
 from spackle.bases.lift import lift
 from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.formats import save_png
 from spackle.render import TILE
 
