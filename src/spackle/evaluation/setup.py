@@ -93,22 +93,17 @@ class EvaluateOptions:
         self.opened.check()
         if self.residual == "none":
             raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
-        self._check_direct_ft()
-        self._check_disparities()
-        if self.limit is not None and not 1 <= self.limit <= MAX_LIMIT:
-            raise InputError(f"--limit must be between 1 and {MAX_LIMIT}, got {self.limit}")
-
-    def _check_direct_ft(self) -> None:
         if "direct-ft" in self.methods:
             if self.base.name != "sharp":
                 raise InputError("--methods direct-ft: is a SHARP that was trained further: add --base sharp")
             if self.direct_ft is None:
-                raise InputError(
-                    "--methods direct-ft: no weights: give --direct-ft FILE, which `spackle train --method direct-ft` "
-                    "made"
-                )
+                made = "which `spackle train --method direct-ft` made"
+                raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
         elif self.direct_ft is not None:
             raise InputError(f"--direct-ft {self.direct_ft}: no method takes it: add direct-ft to --methods")
+        self._check_disparities()
+        if self.limit is not None and not 1 <= self.limit <= MAX_LIMIT:
+            raise InputError(f"--limit must be between 1 and {MAX_LIMIT}, got {self.limit}")
 
     def _check_disparities(self) -> None:
         if not 1 <= len(self.disparities) <= MAX_DISPARITIES:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from spackle.errors import check_name
 from spackle.evaluation.case import EvalDataset
-from spackle.evaluation.datasets.reconstructions import Eth3d, Llff, Tanks
+from spackle.evaluation.datasets.posed_photos import Eth3d, Llff, Tanks, WildRgbd
 from spackle.evaluation.datasets.stereo import Booster, Middlebury
-from spackle.evaluation.datasets.wildrgbd import WildRgbd
 
 __all__ = ["DATASETS", "get_dataset"]
 

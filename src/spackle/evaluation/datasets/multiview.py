@@ -7,12 +7,14 @@ import hashlib
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.errors import InputError
@@ -68,8 +70,26 @@ def make_cases(
         bounds: nearest and farthest depth by photo, where known.
         metric: the poses' lengths are metres.
     """
+
+    def beside(other: Posed, to_world: Tensor) -> SecondView:
+        relative = other.camera.world_to_camera @ to_world
+        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
+        return SecondView(other.name, other.photo, camera)
+
+    def make_case(index: int, seconds: Sequence[int]) -> Case:
+        view, to_world = views[index], torch.linalg.inv(views[index].camera.world_to_camera)
+        return Case(
+            view.name,
+            view.photo,
+            dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32),
+            points=partial(model.points, model.views[index]) if model and len(model.views[index].ids) else None,
+            bounds=(bounds or {}).get(view.photo),
+            seconds=tuple(beside(views[other], to_world) for other in seconds),
+            metric=metric,
+        )
+
     chosen = near_views(views, range(len(views)) if wanted is None else wanted)
-    return [_make_case(views, index, others, model, bounds or {}, metric) for index, others in chosen.items()]
+    return [make_case(index, others) for index, others in chosen.items()]
 
 
 def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple[int, ...]]:
@@ -109,36 +129,6 @@ def _has_middle_of(view: Posed, other: Posed) -> bool:
     uv, z = view.camera.project(camera.unproject(middle, torch.tensor(other.depth, dtype=torch.float64)))
     size = torch.tensor([view.camera.width, view.camera.height])
     return bool((z > 0) & (uv >= 0).all() & (uv <= size).all())
-
-
-def _make_case(
-    views: Sequence[Posed],
-    index: int,
-    seconds: Sequence[int],
-    model: Model | None,
-    bounds: Mapping[Path, tuple[float, float]],
-    metric: bool,
-) -> Case:
-    view = views[index]
-    to_world = torch.linalg.inv(view.camera.world_to_camera)
-
-    def beside(other: Posed) -> SecondView:
-        relative = other.camera.world_to_camera @ to_world
-        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
-        return SecondView(other.name, other.photo, camera)
-
-    points = None
-    if model is not None and len(model.views[index].ids):
-        points = lambda: model.points(model.views[index])  # noqa: E731
-    return Case(
-        view.name,
-        view.photo,
-        dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32),
-        points=points,
-        bounds=bounds.get(view.photo),
-        seconds=tuple(beside(views[other]) for other in seconds),
-        metric=metric,
-    )
 
 
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
