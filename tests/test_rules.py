@@ -64,18 +64,18 @@ def test_the_base_comes_first_and_unchanged_in_what_is_merged(name: str, network
 
 @settings(deadline=None, max_examples=15)
 @given(st.sampled_from(sorted(SCENES)), st.floats(-0.6, 0.6), st.floats(-0.3, 0.3), st.booleans())
-def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down: float, shielded: bool) -> None:
+def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down: float, guarded: bool) -> None:
     subject = completer(name)
     camera = subject.photo_camera.looking(torch.tensor([right, down, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
     mask = Cues.of(CPU.render(subject.base, camera)).mask
-    aux = subject.complete_view(camera, [subject.photo_guard()] if shielded else [])
+    aux = subject.complete_view(camera, [subject.photo_guard()] if guarded else [])
     uv, z = camera.project(aux.means)
     column, row = (uv / 2).floor().long().unbind(-1)
     torch.testing.assert_close(uv, cell_centers(camera)[row, column], rtol=0, atol=0.02)
     assert bool((z > 0).all())
     assert bool(mask[row, column].all())
     assert int(torch.bincount(row * mask.shape[1] + column, minlength=1).max()) <= PASSES
-    assert len(aux) >= int(mask.sum()) if not shielded else len(aux) <= PASSES * int(mask.sum())
+    assert len(aux) >= int(mask.sum()) if not guarded else len(aux) <= PASSES * int(mask.sum())
 
 
 def test_even_a_wild_network_adds_no_more_gaussians_than_masked_cells_in_a_pass() -> None:
@@ -142,7 +142,7 @@ def test_even_an_untaught_network_leaves_the_photo_alone() -> None:
 
 @pytest.mark.parametrize("right", [-1.5, -1.0, 0.5, 1.5])
 @pytest.mark.parametrize("name", ["box", "odd"])
-def test_a_completed_view_behind_the_photos_shield_shows_the_photo_as_the_base_does(name: str, right: float) -> None:
+def test_a_completed_view_behind_the_photos_guard_shows_the_photo_as_the_base_does(name: str, right: float) -> None:
     """As far as disparity 0.6 and a little, but looking elsewhere than a trajectory does."""
     subject = completer(name)
     aux = subject.complete_view(shifted(subject.photo_camera, right), [subject.photo_guard()])

@@ -111,10 +111,6 @@ def counts(description: Any) -> dict[str, int]:
     return {layer["name"]: layer["count"] for layer in description["layers"]}
 
 
-def stages(told: list[Any]) -> list[str]:
-    return list(dict.fromkeys(event["stage"] for event in told if "stage" in event))
-
-
 # Scenes
 
 
@@ -164,47 +160,37 @@ def test_a_strangers_scene_is_all_base_behind_a_usual_lens(tmp_path: Path, visit
 # Photos
 
 
-def test_a_photo_is_completed_as_predict_completes_it(tmp_path: Path, visit: Callable[..., Run]) -> None:
-    photo, depth = write_pair(tmp_path)
-    assert run("predict", "-i", photo, "--depth", depth, "-o", tmp_path / "out", "--no-render").code == 0
-    report = report_of(tmp_path / "out" / "photo")
-    told: list[Any] = []
-    seen: dict[str, Any] = {}
-
-    def browse(url: str) -> None:
-        assert get(url, "/scene.json")["scene"] in (None, "/scenes/1.json")
-        told.extend(hear(url, "/jobs/1"))
-        seen.update(get(url, told[-1]["ready"]))
-
-    result = visit(browse, photo, "--depth", depth)
-    assert result.code == 130, result.err
-    assert set(stages(told)) <= {"prepare", "base", "complete", "page"}
-    assert counts(seen) == {"base": report["base"]["gaussians"], "aux": report["aux"]["gaussians"]}
-    assert seen["name"] == "photo.png"
-    assert any("focal length" in event.get("line", "") for event in told)
-    assert any("Gaussians from rgbd" in line for line in result.lines)
-
-
-def test_another_photo_is_completed_without_what_was_said_of_the_first(
+def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_was_said_of_the_first(
     tmp_path: Path, visit: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     photo, depth = write_pair(tmp_path / "first")
-    told: list[Any] = []
-    seen: list[Any] = []
+    given = ("--depth", depth, "--fov", "50")
+    assert run("predict", "-i", photo, *given, "-o", tmp_path / "out", "--no-render").code == 0
+    report = report_of(tmp_path / "out" / "photo")
+    told: list[list[Any]] = []
+    seen: list[dict[str, Any]] = []
 
     def browse(url: str) -> None:
-        hear(url, "/jobs/1")
-        told.extend(hear(url, post(url, "/photos?name=my%20other.jpg", apple_jpeg(codes()))["job"]))
+        assert get(url, "/scene.json")["scene"] in (None, "/scenes/1.json")
+        told.append(hear(url, "/jobs/1"))
+        seen.append(get(url, told[0][-1]["ready"]))
+        told.append(hear(url, post(url, "/photos?name=my%20other.jpg", apple_jpeg(codes()))["job"]))
         seen.append(get(url, get(url, "/scene.json")["scene"]))
 
-    result = visit(browse, photo, "--depth", depth, "--fov", "50")
-    assert "ready" in told[-1], told
-    assert seen[0]["name"] == "my other.jpg"
-    assert any(line.startswith("my other.jpg: base rgbd (the depth in the photo)") for line in result.lines)
-    assert any("--fov" in line for line in result.lines if line.startswith("photo.png: "))
-    assert not any("--fov" in line for line in result.lines if line.startswith("my other.jpg: "))
+    result = visit(browse, photo, *given)
+    assert result.code == 130, result.err
+    assert {event["stage"] for event in told[0] if "stage" in event} <= {"prepare", "base", "complete", "page"}
+    assert counts(seen[0]) == {"base": report["base"]["gaussians"], "aux": report["aux"]["gaussians"]}
+    assert any("focal length" in event.get("line", "") for event in told[0])
+    assert "ready" in told[1][-1], told
+    assert [description["name"] for description in seen] == ["photo.png", "my other.jpg"]
+    first, other = ([line for line in result.lines if line.startswith(f"{each['name']}: ")] for each in seen)
+    assert any("Gaussians from rgbd" in line for line in first)
+    assert any("--fov" in line for line in first)
+    assert other[0].startswith("my other.jpg: base rgbd (the depth in the photo)")
+    assert not any("--fov" in line for line in other)
     assert not any("upload." in line for line in result.lines)
     assert not list(tmp_path.glob("spackle-view-*"))
 
