@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,13 +40,7 @@ def write_scene(
     Image.fromarray(left).save(folder / "left.png")
     Image.fromarray(right).save(folder / "right.png")
     write_pfm(folder / "disp.pfm", disparity)
-    names = {
-        "left": "left.png",
-        "right": "right.png",
-        "disparity": "disp.pfm",
-        "disparity_scale": 1.0,
-        "invalid": "inf",
-    }
+    names = {"left": "left.png", "right": "right.png", "disparity": "disp.pfm", "disparity_scale": 1, "invalid": "inf"}
     lens = {"focal_px": focal, "cx": cx, "cy": cy, "doffs_px": doffs, "baseline_m": BASELINE}
     (folder / "scene.json").write_text(json.dumps(names | lens))
 
@@ -84,6 +79,20 @@ def write_motorcycle(folder: Path, shrink: int = 4) -> None:
     values = np.where(np.isfinite(values), values, np.inf).astype(np.float32)
     lens = [value / shrink for value in (994.978, 311.193, 254.877, 31.086)]
     write_scene(folder, small(left), small(right), values, *lens)
+
+
+def run_config(title: str, near: bool, methods: Sequence[str]) -> dict[str, Any]:
+    """A configuration as an evaluation stores it."""
+    return {
+        "title": title,
+        "terms": f"cite {title}",
+        "protocol": "near-view" if near else "large-view",
+        "methods": list(methods),
+        "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
+        "disparities": None if near else [0.3, 0.4, 0.5],
+        "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
+        "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
+    }
 
 
 def fake_pyiqa(

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from command import Run, names_in, run
-from evaluation_data import fake_pyiqa, write_boxes, write_motorcycle
+from evaluation_data import fake_pyiqa, run_config, write_boxes, write_motorcycle
 from PIL import Image
 from scenes import box_before_wall, shifted
 from torch import Tensor
@@ -165,15 +165,7 @@ def results(title: str, protocol: str, methods: list[str], figures: Figures) -> 
     rows = tuple(Row(s, v, m, figures[m]) for s in settings for m in methods for v in ("left", "right"))
     facts = {"base_gaussians": 1000}
     records = (ImageResult("a", facts, rows), ImageResult("b", facts, rows), ImageResult("c", problem="c: broken"))
-    config = {
-        "title": title,
-        "protocol": protocol,
-        "methods": methods,
-        "base": {"title": "rgbd", "says": "the dataset's own depth"},
-        "disparities": [0.3, 0.4, 0.5],
-        "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
-        "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
-    }
+    config = run_config(title, near=protocol == "near-view", methods=methods)
     return Results(config, records)
 
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import pytest
 from command import run
-from evaluation_data import write_boxes
+from evaluation_data import run_config, write_boxes
 from PIL import Image
 
 from spackle.evaluation.plots import SCENES, STYLES, Series, draw, evenly, overhead_plot
@@ -101,16 +101,7 @@ def results(near: bool, count: int = 11, title: str = "Middlebury", name: str = 
         views = [(s, m, v) for s in settings for m in METHODS for v in ("left", "right")]
         rows = tuple(Row(s, v, m, figures(near, m, scene)) for s, m, v in views)
         records.append(ImageResult(name.format(scene), facts, rows))
-    config: dict[str, Any] = {
-        "title": title,
-        "terms": f"cite {title}",
-        "protocol": "near-view" if near else "large-view",
-        "methods": list(METHODS),
-        "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
-        "disparities": None if near else [0.3, 0.4, 0.5],
-        "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
-        "metrics": {"niqe": "not run: pyiqa is not installed"},
-    }
+    config = run_config(title, near, METHODS)
     return Results(config, (*records, ImageResult("gone", problem="gone.png: <b>damaged</b>", remarks=())))
 
 

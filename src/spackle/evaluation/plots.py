@@ -9,7 +9,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spackle.errors import InputError
@@ -172,7 +172,14 @@ def overhead_plot(run: Run) -> Plot | None:
     """Added Gaussians against the size of the hole: a dot for each image and view."""
     series, count = [], 0
     for method in (name for name in run.methods if name in ADDING):
-        dots = list(_overheads(run, method))
+        dots = [
+            (100 * before, 100 * share)
+            for record in run.measured
+            for row in record.rows
+            if row.method == method
+            and (before := row.figures.get("har_before")) is not None
+            and (share := row.figures.get("aux_share")) is not None
+        ]
         count += len(dots)
         kept = [dots[k] for k in evenly(len(dots), DOTS // len(ADDING))]
         series.append(Series(method_name(run, method), method, kept))
@@ -195,14 +202,6 @@ def overhead_plot(run: Run) -> Plot | None:
 
     svg = draw(series, "hole before, % of the pixels", "added Gaussians, % of the base's", finish)
     return Plot("Added Gaussians against hole size", series, svg, note)
-
-
-def _overheads(run: Run, method: str) -> Iterator[tuple[float, float]]:
-    for record in run.measured:
-        for row in record.rows:
-            before, share = row.figures.get("har_before"), row.figures.get("aux_share")
-            if row.method == method and before is not None and share is not None:
-                yield 100 * before, 100 * share
 
 
 def scenes_plot(run: Run, figure: str) -> Plot | None:
