@@ -112,8 +112,9 @@ def naive_blend(
                         full[py - top, px - left] = True
                         continue
                     weight = alpha * light
-                    for channel in range(3):
-                        pixel[channel] += weight * colors[i, channel]
+                    pixel[0] += weight * colors[i, 0]
+                    pixel[1] += weight * colors[i, 1]
+                    pixel[2] += weight * colors[i, 2]
                     pixel[3] += weight * splats[i, 2]
                     pixel[4] += weight
         for py in range(top, bottom):
