@@ -15,7 +15,7 @@ from rich.filesize import decimal
 from spackle.app.render import DEFAULT_SIZE
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats import atomic_path, check_writable
+from spackle.formats import check_writable, write_whole
 from spackle.formats.ply import read_header
 from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, at_origin
 from spackle.formats.spz import LARGEST, spz_grid
@@ -25,10 +25,10 @@ from spackle.viewer import PageScene, page_scene, single_html
 
 
 def _html(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(single_html(page_of(scene)))
+    write_whole(path, single_html(page_of(scene)))
 
 
-WRITERS: dict[str, Callable[[SceneFile, Path], object]] = {**SCENE_WRITERS, ".html": _html}
+WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {**SCENE_WRITERS, ".html": _html}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -54,8 +54,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
     for output, writer in zip(outputs, writers, strict=True):
         start = time.perf_counter()
         try:
-            with atomic_path(output) as temporary:
-                writer(loaded, temporary)
+            writer(loaded, output)
         except InputError as error:
             raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
         _say(reporter, loaded, output, size, time.perf_counter() - start)
@@ -68,7 +67,7 @@ def _harmonics(scene: Path) -> int:
     return sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields)
 
 
-def writer_of(output: Path) -> Callable[[SceneFile, Path], object]:
+def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:
     """What writes a file of this name.
 
     Raises:

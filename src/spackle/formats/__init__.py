@@ -1,6 +1,6 @@
 """Files in and out: scenes, videos, pictures and cameras, each written whole or not at all."""
 
-from spackle.formats.atomic import atomic_path, check_writable
+from spackle.formats.atomic import atomic_path, check_writable, write_whole
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
 from spackle.formats.png import save_gray_png, save_png
@@ -20,4 +20,5 @@ __all__ = [
     "save_ply",
     "save_png",
     "save_video",
+    "write_whole",
 ]

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from spackle.camera import Camera
+from spackle.formats.atomic import write_whole
 from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
@@ -56,15 +57,15 @@ def _write_ply(scene: SceneFile, path: Path) -> None:
 
 
 def _write_compressed_ply(scene: SceneFile, path: Path) -> None:
-    path.write_bytes(encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
+    write_whole(path, encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
 
 
-# A new format is one file and one line here. The first end that fits a name counts.
-SCENE_WRITERS: dict[str, Callable[[SceneFile, Path], object]] = {
+# Each writes a whole file or none. A new format is one file and one line here; the first end that fits a name counts.
+SCENE_WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
     ".compressed.ply": _write_compressed_ply,
     ".ply": _write_ply,
-    ".spz": lambda scene, path: path.write_bytes(encode_spz(scene.gaussians)),
-    ".splat": lambda scene, path: path.write_bytes(encode_splat(scene.gaussians)),
-    ".sog": lambda scene, path: path.write_bytes(encode_sog(scene.gaussians)),
-    ".glb": lambda scene, path: path.write_bytes(encode_glb(scene.gaussians, scene.camera, scene.base_count)),
+    ".spz": lambda scene, path: write_whole(path, encode_spz(scene.gaussians)),
+    ".splat": lambda scene, path: write_whole(path, encode_splat(scene.gaussians)),
+    ".sog": lambda scene, path: write_whole(path, encode_sog(scene.gaussians)),
+    ".glb": lambda scene, path: write_whole(path, encode_glb(scene.gaussians, scene.camera, scene.base_count)),
 }
