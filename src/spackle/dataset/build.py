@@ -12,7 +12,7 @@ from spackle.dataset.maker import PARTS, Made, Maker, Seconds, at_work, key_of, 
 from spackle.dataset.options import MAX_PHOTOS, DatasetOptions, configuration
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.ray import at_work_on_ray, cluster
-from spackle.dataset.shards import NAME, Manifest, ShardEntry, differences, load_manifest, shard_name, write_shard
+from spackle.dataset.shards import NAME, Manifest, differences, load_manifest, shard_name, write_shard
 from spackle.errors import InputError
 from spackle.output_folder import alone_in, make_folder, remove_half_written, results_folder
 from spackle.progress import Reporter
@@ -29,7 +29,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         source: a folder of photos, or COCO annotations.
         output: a folder for manifest and shards.
         options: everything else.
-        reporter: says what is passed over, and at the end how long each stage took.
+        reporter: logs what is passed over, and at the end how long each stage took.
 
     Returns:
         "complete", or "stopped" where Ctrl-C came.
@@ -85,7 +85,7 @@ class _Build:
     ) -> None:
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, size = manifest.config, options.shard_size
-        self.shards = {int(shard.file[6:-4]): shard for shard in manifest.shards if self._is_there(shard)}
+        self.shards = {int(shard.file[6:-4]): shard for shard in manifest.shards if shard.lies_in(output)}
         self.problems: dict[int, str] = {}  # of photos that give no sample
         self.seconds: Seconds = dict.fromkeys(STAGES, 0.0)
         self.jobs = [
@@ -122,13 +122,8 @@ class _Build:
             return "stopped"
         return self._finish(made, total["wall"])
 
-    def _is_there(self, shard: ShardEntry) -> bool:
-        """Whether a shard still lies where it was written; what is in it is for `verify`."""
-        path = self.output / shard.file
-        return path.is_file() and path.stat().st_size == shard.size
-
     def _note(self, result: Made) -> int:
-        """Note what became of a photo; 1 where it gave a sample, else 0."""
+        """1 where a photo gave a sample, else 0."""
         self.waiting[result.index // self.options.shard_size].discard(result.index)
         for stage, time in result.seconds.items():
             self.seconds[stage] += time

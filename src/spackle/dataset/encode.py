@@ -101,11 +101,7 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
 
 
 def decode_gaussians(data: bytes) -> Gaussians:
-    """What `encode_gaussians` wrote, as float32.
-
-    Raises:
-        ValueError: something else.
-    """
+    """What `encode_gaussians` wrote, as float32; ValueError where it is something else."""
     try:
         arrays = load(data)
         low, high = arrays["scale_logs"].tolist()

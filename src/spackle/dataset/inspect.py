@@ -46,11 +46,7 @@ def show_info(location: str, console: Console) -> None:
 
 
 def verify_dataset(location: str, reporter: Reporter) -> int:
-    """Read every byte; returns how many things are wrong, after a line for each.
-
-    Raises:
-        InputError: no manifest, or a damaged one.
-    """
+    """Read every byte; returns how many things are wrong, after a line for each. InputError without a manifest."""
     manifest = load_manifest(location)
     count = 0
     with reporter.stage("verify", {}) as step:
@@ -65,13 +61,6 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
 
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
     """Write a sheet (base, mask and target of some views of some photos) and a video of one path, base beside target.
-
-    Args:
-        location: folder or address.
-        output: a folder.
-        photos: how many, spread over the dataset.
-        views: of each, spread over its path.
-        reporter: logs where they lie.
 
     Raises:
         InputError: no finished dataset, a damaged one, or a folder that cannot be written to.

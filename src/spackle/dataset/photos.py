@@ -91,18 +91,11 @@ def _named_by_coco(source: Path, folder: Path | None) -> Found:
 
 
 def choose(found: Found, count: int | None, seed: int, warn: Log, progress: Step) -> list[PhotoFile]:
-    """The photos of a dataset, in the order of their names: all, or a random subset.
+    """The photos of a dataset, in the order of their names: all, or a random subset of `count`.
 
     The subset depends on the names, the contents and the seed, not on the order in which a file system lists them.
-    What cannot be read, is too small, or repeats another photo byte for byte is passed over, and in a
-    subset the next one takes its place.
-
-    Args:
-        found: see `find_photos`.
-        count: how many; all where None.
-        seed: of the subset.
-        warn: told of each photo that is passed over, and why.
-        progress: called with (photos chosen, of how many).
+    What cannot be read, is too small, or repeats another photo byte for byte is passed over, which `warn` is told, and
+    in a subset the next one takes its place.
 
     Raises:
         InputError: fewer good photos than `count`, or none.

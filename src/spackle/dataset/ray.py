@@ -161,7 +161,7 @@ def at_work_on_ray(
     """As `at_work`, on the cluster that `ray` is connected to; `log` is told of workers that died.
 
     Raises:
-        InputError: a base, node, folder or disk that cannot be used, or a photo at which workers die.
+        InputError: likewise; a node that is not like the others, or a photo at which workers die.
     """
     pool = WorkerPool(ray, options, output, jobs, log)
     try:

@@ -37,10 +37,7 @@ END = bytes(2 * BLOCK)  # of an archive
 
 
 def pack(members: Iterable[tuple[str, bytes]]) -> bytes:
-    """Named files as a stretch of a tar archive, without its end: stretches may follow one another.
-
-    No time, owner or machine is in it.
-    """
+    """Named files as a stretch of a tar archive, without its end, and without time, owner or machine."""
     parts: list[bytes] = []
     for name, data in members:
         header = tarfile.TarInfo(name)  # mtime 0, uid 0, gid 0, mode 644
@@ -155,11 +152,7 @@ class PhotoGroup:
         return tuple(float(view["hole"]) for view in self.facts["views"])
 
     def view(self, index: int, *, with_base: bool = False) -> DatasetView:
-        """Decode one view.
-
-        Raises:
-            InputError: a file that is missing or damaged.
-        """
+        """Decode one view; InputError where a file of it is missing or damaged."""
         try:
             facts = self.facts["views"][index]
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))

@@ -9,13 +9,14 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from spackle.dataset.sample import END, PhotoGroup
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import atomic_path
+from spackle.progress import Step
 
 NAME = "manifest.json"
 FORMAT = 1  # of shards and manifest; a reader of another one refuses
@@ -23,11 +24,7 @@ PIECE = 1 << 20  # bytes read at once
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a file of a dataset for reading; it can be sought in.
-
-    Args:
-        location: a folder, or an address that fsspec understands, such as s3://bucket/dataset.
-        name: of the file in it.
+    """Open a file in a folder, or at an address that fsspec understands (s3://bucket/dataset); it can be sought in.
 
     Raises:
         InputError: it is not there or cannot be read, or fsspec is missing.
@@ -75,6 +72,11 @@ class ShardEntry:
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
 
+    def lies_in(self, folder: Path) -> bool:
+        """Whether a file of its size is there; what is in it is for `problems`."""
+        path = folder / self.file
+        return path.is_file() and path.stat().st_size == self.size
+
 
 Place = tuple[ShardEntry, SampleEntry]
 
@@ -117,11 +119,7 @@ class Manifest:
 
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
-    """Read the manifest of a dataset in a folder or at an address.
-
-    Raises:
-        InputError: it is missing, damaged, or of another format.
-    """
+    """Read the manifest of a dataset; InputError where it is missing, damaged, or of another format."""
     where = f"{str(location).rstrip('/')}/{NAME}"
     with open_in(location, NAME) as file:
         text = file.read()
@@ -173,12 +171,7 @@ def shard_name(number: int) -> str:
 
 
 def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
-    """Put samples one after the other into a tar file, whole or not at all.
-
-    Args:
-        parts: key and file of each sample, see `pack_sample`.
-        target: the shard.
-        passed_over: photos that are not in it, for its entry.
+    """Put samples, by key and file, one after the other into a tar file, whole or not at all; its entry.
 
     Raises:
         InputError: a part that is damaged, or a disk that is full.
@@ -199,16 +192,11 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
             offset += len(data)
         file.write(END)
         whole.update(END)
-    size = offset + len(END)
-    return ShardEntry(target.name, size, whole.hexdigest(), tuple(samples), tuple(passed_over))
+    return ShardEntry(target.name, offset + len(END), whole.hexdigest(), tuple(samples), tuple(passed_over))
 
 
 def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
-    """One photo's files out of an open shard, held to their digest.
-
-    Raises:
-        InputError: they are damaged or cut off.
-    """
+    """One photo's files out of an open shard; InputError where they are not what their digest says."""
     try:
         file.seek(sample.offset)
         data = file.read(sample.size)
@@ -221,16 +209,8 @@ def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
     return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")
 
 
-def problems(
-    location: str | os.PathLike[str], manifest: Manifest, progress: Callable[[int, int], None]
-) -> Iterator[str]:
-    """Read every byte of a dataset and say in a line each what is wrong.
-
-    Args:
-        location: folder or address.
-        manifest: of the dataset.
-        progress: called with (bytes read, of how many).
-    """
+def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Step) -> Iterator[str]:
+    """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
     total, done = sum(shard.size for shard in manifest.shards), 0
     if not manifest.complete:
         yield "the dataset is not finished: the command that builds it goes on"

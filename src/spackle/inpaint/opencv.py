@@ -17,15 +17,7 @@ class OpenCV:
     """The package, found once."""
 
     def __init__(self, wanted_by: str, instead: str = "") -> None:
-        """Find it.
-
-        Args:
-            wanted_by: for the message, what needs it.
-            instead: for the message, what to do without it.
-
-        Raises:
-            InputError: it is not installed.
-        """
+        """Find it; InputError where it is not installed, which says what needs it and what to do without it."""
         try:
             import cv2
         except ImportError as error:

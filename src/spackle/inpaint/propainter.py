@@ -151,10 +151,7 @@ def _network(name: str, file: Path) -> nn.Module:
 
 
 def weight_files(folder: Path | None) -> dict[str, Path]:
-    """The file of each of `NETWORKS`: NAME.pth, NAME-….pth as it is published, or .safetensors.
-
-    Args:
-        folder: where they lie, unpacked.
+    """The file of each of `NETWORKS` in a folder: NAME.pth, NAME-….pth as it is published, or .safetensors.
 
     Raises:
         InputError: there is no such folder, or not one file of each.
