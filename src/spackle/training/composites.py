@@ -20,14 +20,7 @@ Photos = Callable[[np.random.Generator], Tensor]  # a random photo, [H, W, 3] sR
 
 
 def composite(rng: np.random.Generator, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A picture [H, W, 3] sRGB, and its inverse depth [H, W] in 1/m, known exactly.
-
-    Args:
-        rng: all choices come from here.
-        photos: gives the pictures that are put together.
-        height: in pixels.
-        width: likewise.
-    """
+    """A picture [H, W, 3] sRGB of several photos, and its inverse depth [H, W] in 1/m, known exactly."""
     rgb = random_crop(rng, photos(rng), height, width)
     inverse_depth = _background(rng, height, width)
     for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):

@@ -55,19 +55,14 @@ def train_recipe(
     checkpoint: Path | None = None,
     overwrite: bool = False,
 ) -> str:
-    """Train as a recipe says, or go on with a run.
+    """Train the residual, or SHARP's own decoder, as a recipe says; returns as `train` does.
 
     Args:
         path: the recipe, a file or a packaged one's name.
         overrides: `key=value` on top of it.
-        output: a folder for all results.
-        reporter: the first process speaks through it.
-        method: what learns: the residual, or SHARP's own decoder.
+        output, reporter, overwrite: as for `train`.
+        method: what learns.
         checkpoint: weights of SHARP, where it is SHARP that learns.
-        overwrite: start anew where `output` holds a run; the samples in it stay.
-
-    Returns:
-        Why the run ended, as `Trainer.run` has it.
 
     Raises:
         InputError: a recipe, file or folder that cannot be used, a loss that is no number.
@@ -88,7 +83,9 @@ def train(
     Args:
         recipe: what to do.
         make_plan: refuses at once what cannot be used, and does no long work yet.
-        output, reporter, overwrite: as for `train_recipe`.
+        output: a folder for all results.
+        reporter: the first process speaks through it.
+        overwrite: start anew where `output` holds a run; the samples in it stay.
 
     Returns:
         Why the run ended: "steps", "patience" or "stopped", as `Trainer.run` has it.
