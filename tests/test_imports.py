@@ -41,9 +41,6 @@ ALLOWED: dict[str, set[str]] = {
     "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app"},
 }
 
-# Names that two classes still have. The list may only become shorter.
-SHARED_NAMES = {"Source", "View"}
-
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.
 WITH_THE_CORE_ALONE = """
 import importlib, importlib.abc, importlib.metadata as metadata, pkgutil, re, sys
@@ -140,7 +137,7 @@ def test_no_two_classes_have_one_name() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
                 homes.setdefault(node.name, []).append(name_of(path))
-    shared = {name: files for name, files in homes.items() if len(files) > 1 and name not in SHARED_NAMES}
+    shared = {name: files for name, files in homes.items() if len(files) > 1}
     assert not shared
 
 

@@ -65,16 +65,13 @@ def test_pixel_centres_lie_at_half_integers() -> None:
 
 
 @PROPERTY
-@given(cameras(), st.tuples(st.floats(-300, 800), st.floats(-300, 800)), st.floats(0.01, 1000))
-def test_pixels_come_back_from_the_world(camera: Camera, pixel: tuple[float, float], depth: float) -> None:
+@given(cameras(), COORDINATES, st.tuples(st.floats(-300, 800), st.floats(-300, 800)), st.floats(0.01, 1000))
+def test_points_and_pixels_come_back_even_from_behind(
+    camera: Camera, point: tuple[float, ...], pixel: tuple[float, float], depth: float
+) -> None:
     uv, z = camera.project(camera.unproject(torch.tensor(pixel).double(), torch.tensor(depth).double()))
     assert float(z) == pytest.approx(depth, rel=1e-6, abs=1e-9)
     assert uv.tolist() == pytest.approx(pixel, rel=1e-6, abs=1e-5)
-
-
-@PROPERTY
-@given(cameras(), COORDINATES)
-def test_points_come_back_from_the_picture_even_from_behind(camera: Camera, point: tuple[float, ...]) -> None:
     world = torch.tensor(point, dtype=torch.float64)
     uv, z = camera.project(world)
     assume(abs(float(z)) > 1e-3)
