@@ -16,7 +16,7 @@ Text = Callable[[float], str]
 
 SIDE = "right"  # the end of the swipe where the second camera of Middlebury's and Booster's pairs stands
 VIEW = (
-    f"One view of each image: the {SIDE} end of a swipe at that disparity (spackle.trajectory.extremes), where the "
+    f"One view of each image: the {SIDE} end of a swipe at that disparity (spackle.camera_path.extremes), where the "
     "second camera of a stereo pair would stand; the paper does not say which view it timed"
 )
 PAPER = PAPER_ROW.format("SHARP")

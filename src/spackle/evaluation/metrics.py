@@ -75,7 +75,7 @@ METRICS: dict[str, Figure] = {
     "distance": Figure(
         "distance ↓",
         "masked perceptual distance in the hole: SqueezeNet 1.0 at conv1, fire4, fire8 and fire9, unit feature "
-        "vectors, 0 to 8 (spackle.training.distance.hole_distance); not LPIPS",
+        "vectors, 0 to 8 (spackle.training.losses.hole_distance); not LPIPS",
         lower=True,
         truth=True,
     ),
