@@ -120,13 +120,16 @@ def _motions(inverse_depth: Tensor, camera: Camera) -> Tensor:
     return torch.stack([fx * torch.stack(across, -1), fy * torch.stack(down, -1)], dim=-2)
 
 
+def _thinned(chosen: Tensor, fewest: int) -> Tensor:
+    """Every fourth of the chosen pixels [H, W] each way, where those are enough; else all."""
+    thin = torch.zeros_like(chosen)
+    thin[::THINNING, ::THINNING] = chosen[::THINNING, ::THINNING]
+    return thin if int(thin.sum()) >= fewest else chosen
+
+
 def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
     """The six numbers of the motion that most of the picture follows; what moves by itself is outvoted."""
-    chosen = torch.zeros_like(trusted)
-    chosen[::THINNING, ::THINNING] = True
-    chosen &= trusted
-    if int(chosen.sum()) < 6:
-        chosen = trusted
+    chosen = _thinned(trusted, 6)
     rows, wanted = basis[chosen].double(), flow[chosen].double()
     size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # so that one small ridge suits all columns
     rows = rows / size
@@ -337,11 +340,7 @@ def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAl
         found: where the frame's pixels were in that one.
     """
     was = sample(earlier[..., None], pixel_grid(earlier) + found.flow)[..., 0]
-    chosen = found.sure & (inverse_depth > 0) & (was > 0)
-    thin = torch.zeros_like(chosen)
-    thin[::THINNING, ::THINNING] = True
-    if int((chosen & thin).sum()) >= FEWEST:
-        chosen = chosen & thin
+    chosen = _thinned(found.sure & (inverse_depth > 0) & (was > 0), FEWEST)
     now, then = inverse_depth[chosen].double(), was[chosen].double()
     if len(now) < FEWEST:
         return DepthAlignment()
