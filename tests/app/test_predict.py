@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -125,17 +124,16 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path, plain: tuple[Path, 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path)
-    predicted(photo, depth, tmp_path, "--residual", "none")
-    bare = read_ply(tmp_path / "photo" / "scene.ply").count
-    predicted(photo, depth, tmp_path)
-    assert read_ply(tmp_path / "photo" / "scene.ply").count > bare
-    assert names_in(tmp_path / "photo") == FILES
-
-
-def test_no_render_writes_no_video(tmp_path: Path) -> None:
-    predicted(*write_pair(tmp_path), tmp_path, "--no-render")
+    predicted(photo, depth, tmp_path, "--residual", "none", "--no-render")
     assert names_in(tmp_path / "photo") == FILES - {"video.mp4"}
-    assert "video" not in report_of(tmp_path / "photo")["seconds"]
+    report, bare = report_of(tmp_path / "photo"), read_ply(tmp_path / "photo" / "scene.ply")
+    assert (report["aux"], report["residual"]) == ({"gaussians": 0, "share": 0.0}, {"weights": "none"})
+    assert ("video" in report["seconds"], report["video"]) == (False, None)
+    assert bare == read_ply(tmp_path / "photo" / "base.ply")
+    assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
+    predicted(photo, depth, tmp_path)
+    assert read_ply(tmp_path / "photo" / "scene.ply").count > bare.count
+    assert names_in(tmp_path / "photo") == FILES
 
 
 @pytest.mark.parametrize("kind", ["swipe", "shake", "rotate", "rotate_forward"])
@@ -177,18 +175,12 @@ def test_cameras_completes_exactly_the_given_views(tmp_path: Path) -> None:
         assert stored["_mask"].mean() / 255 == pytest.approx(report["hole_area_ratio"][index]["before"])
 
 
-def test_cameras_of_several_sizes_make_pictures(tmp_path: Path) -> None:
-    photo, depth = write_pair(tmp_path)
-    views = camera_file(tmp_path / "views.json", rights=[0.2, 0.4], sizes=[(64, 48), (33, 21)])
-    predicted(photo, depth, tmp_path / "out", "--cameras", views, "--no-render")
-    assert pixels(tmp_path / "out" / "photo" / "views" / "0001.png").shape == (21, 33, 3)
-
-
 def test_view_mode_completes_each_view_on_its_own(tmp_path: Path) -> None:
     photo, depth = write_pair(tmp_path)
-    views = camera_file(tmp_path / "views.json", rights=[0.1, 0.4])
-    predicted(photo, depth, tmp_path / "out", "--cameras", views, "--mode", "view")
+    views = camera_file(tmp_path / "views.json", rights=[0.1, 0.4, 0.2], sizes=[(64, 48), (64, 48), (33, 21)])
+    predicted(photo, depth, tmp_path / "out", "--cameras", views, "--mode", "view", "--no-render")
     folder = tmp_path / "out" / "photo"
+    assert pixels(folder / "views" / "0002.png").shape == (21, 33, 3)
     report = report_of(folder)
     assert (report["mode"], report["scene_ply_view"]) == ("view", "1")
     assert all(view["after"] == 0 for view in report["hole_area_ratio"])
@@ -199,16 +191,6 @@ def test_view_mode_completes_each_view_on_its_own(tmp_path: Path) -> None:
     mask = pixels(folder / "views" / "0001_mask.png") > 0
     cells = mask.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).any(axis=(1, 3)).sum()
     assert 0 < report["aux"]["gaussians"] <= 2 * cells
-
-
-def test_residual_none_is_the_base_alone(tmp_path: Path) -> None:
-    predicted(*write_pair(tmp_path), tmp_path, "--residual", "none")
-    folder = tmp_path / "photo"
-    report = report_of(folder)
-    assert report["aux"] == {"gaussians": 0, "share": 0.0}
-    assert report["residual"] == {"weights": "none"}
-    assert read_ply(folder / "scene.ply") == read_ply(folder / "base.ply")
-    assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
 
 
 def test_the_seeds_alone_can_be_had_and_fill_the_holes_where_no_weights_came_with_the_package(
@@ -465,49 +447,29 @@ BAD_PHOTOS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", BAD_PHOTOS)
-def test_bad_photos(tmp_path: Path, kind: str) -> None:
-    photo = tmp_path / "bad.png"
-    BAD_PHOTOS[kind](photo)
-    expect_refusal(tmp_path, "-i", photo, "--depth", write_depth(tmp_path / "d.npy"), named=photo)
+def test_files_that_are_no_photo_and_no_depth_map(tmp_path: Path, kind: str) -> None:
+    bad = tmp_path / "bad.png"
+    BAD_PHOTOS[kind](bad)
+    expect_refusal(tmp_path, "-i", bad, "--depth", write_depth(tmp_path / "d.npy"), named=bad)
+    expect_refusal(tmp_path, "-i", write_photo(tmp_path / "a.png"), "--depth", bad, named=bad)
 
 
-BAD_DEPTHS: dict[str, Any] = {
-    "another shape": metres(48, 64),
-    "all infinite": np.full((HEIGHT, WIDTH), np.inf, np.float32),
-    "text": np.full((HEIGHT, WIDTH), "far"),
-    "beyond float32": np.full((HEIGHT, WIDTH), 1e300),
-}
-
-
-@pytest.mark.parametrize("kind", BAD_DEPTHS)
-def test_bad_depth_values(tmp_path: Path, kind: str) -> None:
-    depth = tmp_path / "bad.npy"
-    np.save(depth, BAD_DEPTHS[kind])
-    expect_refusal(tmp_path, "-i", write_photo(tmp_path / "a.png"), "--depth", depth, named=depth)
-
-
-@pytest.mark.parametrize("kind", ["missing", "truncated", "an empty folder", "a pipe"])
-def test_bad_depth_files(tmp_path: Path, kind: str) -> None:
-    depth = tmp_path / "bad.png"
-    BAD_PHOTOS[kind](depth)
-    expect_refusal(tmp_path, "-i", write_photo(tmp_path / "a.png"), "--depth", depth, named=depth)
-
-
-def test_a_photo_as_depth(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[0], named=pair[0])
-
-
-def test_a_disparity_without_its_calibration(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+def test_depth_maps_that_do_not_go_with_the_photo(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    far, bad = np.full((HEIGHT, WIDTH), "far"), tmp_path / "bad.npy"
+    for depth in (metres(48, 64), np.full((HEIGHT, WIDTH), np.inf), far, np.full((HEIGHT, WIDTH), 1e300)):
+        np.save(bad, depth)
+        expect_refusal(tmp_path, "-i", pair[0], "--depth", bad, named=bad)
+    long = tmp_path / ("x" * 300)  # a name that no file system takes
+    expect_refusal(tmp_path, "-i", long, "--depth", pair[1], named=long)
+    for file in (pair[0], long):
+        expect_refusal(tmp_path, "-i", pair[0], "--depth", file, named=file)
     disparity = pair[1].rename(tmp_path / "disp0.npy")
     expect_refusal(tmp_path, "-i", pair[0], "--depth", disparity, named=disparity)
     (tmp_path / "calib.txt").write_text("cam0=[1 2]\n")
     expect_refusal(tmp_path, "-i", pair[0], "--depth", disparity, named=tmp_path / "calib.txt")
-
-
-def test_names_that_no_file_system_takes(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    long = tmp_path / ("x" * 300)
-    expect_refusal(tmp_path, "-i", long, "--depth", pair[1], named=long)
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", long, named=long)
+    expect_refusal(tmp_path, "-i", pair[0], "--base", "rgbd", named="--depth")
+    (tmp_path / "depths").mkdir()
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", tmp_path / "depths", named=pair[0])
 
 
 BAD_OPTIONS = {
@@ -534,12 +496,6 @@ def test_bad_options(tmp_path: Path, pair: tuple[Path, Path], option: str) -> No
         expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], option, *value.split(), named=named)
 
 
-def test_no_depth(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    expect_refusal(tmp_path, "-i", pair[0], "--base", "rgbd", named="--depth")
-    (tmp_path / "depths").mkdir()
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", tmp_path / "depths", named=pair[0])
-
-
 def test_damaged_residual_weights(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     weights = tmp_path / "bad.safetensors"
     save_file({"stem.weight": torch.zeros(3)}, weights)
@@ -548,27 +504,17 @@ def test_damaged_residual_weights(tmp_path: Path, pair: tuple[Path, Path]) -> No
         expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--residual", weights, named=weights)
 
 
-@pytest.mark.parametrize("text", ["", "null", "[" * 100_000, "\x89PNG", '{"frames": []}'])
-def test_bad_cameras(tmp_path: Path, pair: tuple[Path, Path], text: str) -> None:
-    views = tmp_path / "bad.json"
-    views.write_text(text, encoding="latin-1")
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", views, named=views)
-
-
-def test_cameras_that_see_too_much(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    views = camera_file(tmp_path / "views.json", rights=[0.2], focal=1e-20)
-    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new", "--cameras", views)
-    assert result.code == 2
-    assert str(views) in result.lines[-1]
-    assert not (tmp_path / "new").exists()
-
-
-def test_cameras_that_make_no_video(tmp_path: Path, pair: tuple[Path, Path], scene: Path) -> None:
-    views = camera_file(tmp_path / "views.json", rights=[0.2, 0.4], sizes=[(64, 48), (32, 24)])
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", views, named="--no-render")
+def test_bad_cameras(tmp_path: Path, pair: tuple[Path, Path], scene: Path) -> None:
+    given, views = ("-i", pair[0], "--depth", pair[1], "--cameras"), tmp_path / "views.json"
+    for text in ("", "null", "[" * 100_000, "\x89PNG", '{"frames": []}'):
+        views.write_text(text, encoding="latin-1")
+        expect_refusal(tmp_path, *given, views, named=views)
+    result = run("predict", *given, camera_file(views, rights=[0.2], focal=1e-20), "-o", tmp_path / "new")
+    assert (result.code, str(views) in result.lines[-1], (tmp_path / "new").exists()) == (2, True, False)
+    camera_file(views, rights=[0.2, 0.4], sizes=[(64, 48), (32, 24)])
+    expect_refusal(tmp_path, *given, views, named="--no-render")
     refuses(run("render", "-i", scene, "-o", tmp_path / "a.mp4", "--cameras", views), views)
-    huge = camera_file(tmp_path / "huge.json", rights=[0.2], sizes=[(8194, 48)])
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--cameras", huge, named=huge)
+    expect_refusal(tmp_path, *given, camera_file(views, rights=[0.2], sizes=[(8194, 48)]), named=views)
     assert not (tmp_path / "a.mp4").exists()
 
 

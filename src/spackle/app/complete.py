@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spackle.app.video import FrameMaker, PathOptions, video_problem
+from spackle.app.video import FrameMaker, PathOptions
 from spackle.bases.open import BaseSettings, Choice, all_finite, open_base
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
@@ -82,17 +82,9 @@ class PhotoCompleter:
         path.check()
         self.settings, self.residual, self.path, self.mode = base, residual, path, mode
         self.network = residual.load()
-        self.given_views = path.load_cameras()
+        self.given_views, self.keyframes = path.load()
         self.base = open_base(base)
-        self.keyframes = path.load_keyframes()
         self.renderer = get_renderer(base.device)
-
-    def check_video(self) -> None:
-        """InputError where the given views make no video."""
-        if self.given_views and (problem := video_problem(self.given_views)):
-            raise InputError(
-                f"{self.path.cameras}: {problem}, so they make no video: add --no-render for pictures only"
-            )
 
     def complete(self, photo: Photo, reporter: Reporter, seconds: dict[str, float]) -> CompletedPhoto:
         """A photo, given at its full size, to its completed scene.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,10 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
     """
     pair = load_motorcycle()
     with results_folder(output, FILES):
-        return _run(pair, output, reporter)
+        return _demo_of(pair, output, reporter)
 
 
-def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
+def _demo_of(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
     start = time.perf_counter()
     renderer = get_renderer()
     seconds: dict[str, float] = {}
@@ -52,7 +53,11 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
     reporter.say(
         f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
     )
-    scene, cameras = _complete_path(prediction, renderer, reporter, seconds)
+    base, camera = prediction.gaussians, prediction.camera
+    cameras = scene_path(base, camera, "rotate_forward", DISPARITY)
+    sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
+    with reporter.stage("complete", seconds) as step:
+        scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step)
     with reporter.stage("write", seconds):
         save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
         scene.save(output / "scene.ply", disparity=DISPARITY)
@@ -60,7 +65,7 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
         total = len(cameras)
         views = ((step(i + 1, total), scene.render(camera, renderer).rgb)[1] for i, camera in enumerate(cameras))
         save_video(views, output / "video.mp4")
-    holes = _compare_extremes(scene, pair, renderer, output / "comparison.png")
+    holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
     with reporter.stage("truth", seconds):
         scores = _compare_truth(prediction, pair, renderer, output)
     report: dict[str, Any] = {
@@ -83,25 +88,11 @@ def _run(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
     return report
 
 
-def _complete_path(
-    prediction: BasePrediction, renderer: Renderer, reporter: Reporter, seconds: dict[str, float]
-) -> tuple[Scene, list[Camera]]:
-    """A scene for the video's path and both extremes."""
-    cameras = scene_path(prediction.gaussians, prediction.camera, "rotate_forward", DISPARITY)
-    with reporter.stage("complete", seconds) as step:
-        wanted = [*cameras, *_sides(prediction)]
-        scene = complete(prediction, wanted, renderer=renderer, progress=step)
-    return scene, cameras
-
-
-def _sides(prediction: BasePrediction) -> tuple[Camera, Camera]:
-    return extremes(prediction.camera.even(), DISPARITY, DepthRange.of(prediction.gaussians))
-
-
 @torch.no_grad()
-def _compare_extremes(scene: Scene, pair: StereoPair, renderer: Renderer, path: Path) -> dict[str, float]:
-    """comparison.png, and the mean HAR of the two extremes before and after."""
-    sides = extremes(scene.camera.even(), DISPARITY, DepthRange.of(scene.base))
+def _compare_sides(
+    scene: Scene, sides: Sequence[Camera], pair: StereoPair, renderer: Renderer, path: Path
+) -> dict[str, float]:
+    """comparison.png, and the mean HAR of the path's two extremes before and after."""
     before = [renderer.render(scene.base, camera) for camera in sides]
     after = [scene.render(camera, renderer) for camera in sides]
     rows = [

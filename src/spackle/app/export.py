@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ from spackle.formats import check_writable, write_whole
 from spackle.formats.ply import read_header
 from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, at_origin
 from spackle.formats.spz import LARGEST, spz_grid
-from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.image import focal_length
 from spackle.progress import Reporter
 from spackle.viewer import PageScene, page_scene, single_html
 
@@ -102,7 +101,7 @@ def page_of(scene: SceneFile, focal_px: float | None = None, fov: float | None =
     Raises:
         InputError: a scene that cannot be seen from its camera.
     """
-    path, gaussians, camera = scene.path, scene.gaussians, _lens(scene.camera, focal_px, fov)
+    path, gaussians, camera = scene.path, scene.gaussians, _lens(scene, focal_px, fov)
     if not at_origin(camera):
         gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin
         camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
@@ -122,24 +121,12 @@ def name_of(path: Path) -> str:
     return path.parent.name if path.name in ("scene.ply", "base.ply") and path.parent.name else path.stem
 
 
-def _lens(stored: Camera | None, focal_px: float | None, fov: float | None) -> Camera:
+def _lens(scene: SceneFile, focal_px: float | None, fov: float | None) -> Camera:
     """The stored camera; a lens that a person gives beats it, and without either it is as `spackle render` has it."""
-    width, height = (stored.width, stored.height) if stored else DEFAULT_SIZE
-    focal = _given_focal(focal_px, fov, width)
-    if focal is None and stored is not None:
+    stored = scene.camera
+    if stored is not None and focal_px is None and fov is None:
         return stored
-    camera = Camera.from_focal(focal or film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)
+    width, height = (stored.width, stored.height) if stored else DEFAULT_SIZE
+    focal, _ = focal_length(scene.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=fov)
+    camera = Camera.from_focal(focal, width, height)
     return camera if stored is None else dataclasses.replace(camera, world_to_camera=stored.world_to_camera)
-
-
-def _given_focal(focal_px: float | None, fov: float | None, width: int) -> float | None:
-    """In pixels, as a person gave it; InputError where it makes no sense."""
-    if focal_px is not None and fov is not None:
-        raise InputError("--focal-px and --fov are given together: give one of them")
-    if focal_px is not None and not (math.isfinite(focal_px) and focal_px > 0):
-        raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
-    if fov is None:
-        return focal_px
-    if not 0 < fov < 180:
-        raise InputError(f"--fov must lie between 0 and 180 degrees, got {fov:g}")
-    return width / 2 / math.tan(math.radians(fov) / 2)

@@ -19,7 +19,7 @@ from spackle.app.complete import (
     save_views_video,
 )
 from spackle.app.report import base_before, is_done, make_report, summary
-from spackle.app.video import PathOptions
+from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase, find_depth
@@ -152,8 +152,9 @@ def open_completer(options: PredictOptions) -> PhotoCompleter:
     for option, value in {"--format": video.format, "--fps": video.fps, "--loop": video.loop}.items():
         if value is not None and not options.render:
             raise InputError(f"{option} {value}: is for the video, and --no-render writes none: leave one of them out")
-    if options.render:
-        completer.check_video()
+    views = completer.given_views if options.render else None
+    if views and (problem := video_problem(views)):
+        raise InputError(f"{options.path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     return completer
 
 

@@ -53,7 +53,7 @@ def render_scene(
     renderer = get_renderer(device)
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
-        views, keyframes = path.load_cameras(), path.load_keyframes()
+        views, keyframes = path.load()
         gaussians = load_ply(scene)
         cameras = views or _fly(scene, gaussians, path, keyframes, focal_px, reporter)
         # A path has the video's size already.

@@ -115,13 +115,10 @@ class PathOptions:
             raise InputError(f"--size: the views of --cameras {self.cameras} have a size of their own: leave it out")
         self.video.check()
 
-    def load_cameras(self) -> list[Camera] | None:
-        """The views of --cameras; InputError for a file that cannot be used."""
-        return None if self.cameras is None else load_cameras(self.cameras)
-
-    def load_keyframes(self) -> KeyframePath | None:
-        """The keyframes of --path; InputError for a file that cannot be used."""
-        return None if self.path is None else load_path(self.path)
+    def load(self) -> tuple[list[Camera] | None, KeyframePath | None]:
+        """The views of --cameras and the keyframes of --path; InputError for a file that cannot be used."""
+        views = None if self.cameras is None else load_cameras(self.cameras)
+        return views, None if self.path is None else load_path(self.path)
 
     def fly(self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None) -> list[Camera]:
         """The cameras of a video: through keyframes or along the trajectory, at the photo's size made even.

@@ -46,25 +46,23 @@ def get_weights(
     """
     known = known_weights(name)
     path = _place(known, output)
-    if os.path.isfile(path) and not force:
+    record: DownloadRecord | None
+    new = force or not os.path.isfile(path)
+    if new:
+        with results_folder(path.parent, [path.name]):
+            record = _download(known, known.url if url is None else url, path, reporter)
+        hint = "" if output is None else "; --checkpoint names it to predict"
+        reporter.say(f"{_summary(known, record)} -> {path}{hint}")
+    else:
         record = _say_present(known, path, reporter)
-        _result(known, path, record, reporter, new=False)
-        return path
-    with results_folder(path.parent, [path.name]):
-        record = _download(known, known.url if url is None else url, path, reporter)
-    hint = "" if output is None else "; --checkpoint names it to predict"
-    reporter.say(f"{_summary(known, record)} -> {path}{hint}")
-    _result(known, path, record, reporter, new=True)
+    sha256 = None if record is None else record.sha256  # no digest where there is no record of the download
+    size = os.path.getsize(path)
+    reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
     return path
 
 
 def make_weights(output: Path, size: str, reporter: Reporter) -> None:
-    """Write weights that anyone can make (see `deterministic_weights`): .pt as Apple's, or .safetensors.
-
-    Args:
-        output: the file.
-        size: "full" or "tiny".
-        reporter: says what has been written.
+    """Write weights that anyone can make (see `deterministic_weights`): "full" or "tiny", .pt or .safetensors.
 
     Raises:
         InputError: another suffix, or a file that cannot be written.
@@ -86,17 +84,15 @@ def make_weights(output: Path, size: str, reporter: Reporter) -> None:
 
 def list_weights(reporter: Reporter, console: Console) -> None:
     """A table of the known weights; of those that are here the size alone is checked, which takes no time."""
-    if reporter.as_json:
-        for known in WEIGHTS.values():
-            file = weights_folder() / known.file
-            reporter.result({"name": known.name, "state": _state(file), "file": file, "licence": known.licence})
-        return
-    table = Table(box=None, pad_edge=False)
+    folder, table = weights_folder(), Table(box=None, pad_edge=False)
     for header in ("name", "state", "file", "licence"):
         table.add_column(header, overflow="fold")
-    folder = weights_folder()
     for known in WEIGHTS.values():
-        table.add_row(known.name, _state(folder / known.file), known.file, known.licence)
+        file, state = folder / known.file, _state(folder / known.file)
+        reporter.result({"name": known.name, "state": state, "file": file, "licence": known.licence})
+        table.add_row(known.name, state, known.file, known.licence)
+    if reporter.as_json:
+        return
     console.print(table)
     console.print(f"in {folder} (SPACKLE_WEIGHTS names another)", markup=False, soft_wrap=True)
 
@@ -106,13 +102,6 @@ def _place(known: KnownWeights, output: Path | None) -> Path:
         return weights_folder() / known.file
     named = output.suffix.lower() == Path(known.file).suffix and not os.path.isdir(output)
     return output if named else output / known.file
-
-
-def _result(known: KnownWeights, path: Path, record: DownloadRecord | None, reporter: Reporter, *, new: bool) -> None:
-    """For scripts; no digest where there is no record of the download."""
-    sha256 = None if record is None else record.sha256
-    size = os.path.getsize(path)
-    reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
 
 
 def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> DownloadRecord | None:

@@ -164,7 +164,11 @@ class BaseSettings:
             return {file.name: file for p in patterns for file in sorted(self.folder.glob(p)) if file.is_file()}
         found: dict[str, Path | None] = {}
         if self.named in ("sharp", AUTO):
-            found["checkpoint"] = _sharp_here() if self.named == AUTO else self.checkpoint or installed("sharp")
+            try:
+                found["checkpoint"] = self.checkpoint or installed("sharp")
+            except InputError:  # a machine without a place for any
+                if self.named != AUTO:
+                    raise
         if self.named in ("lite", AUTO):
             shipped = lite.SHIPPED if lite.SHIPPED.is_file() else None
             found["lite weights"] = (self.checkpoint if self.named == "lite" else None) or shipped
@@ -238,11 +242,6 @@ class _Candidate:
     shared: bool = True  # by all photos: what fails for one for good fails for all
     short: bool = False  # of memory, the last time
 
-    def give_up(self, short: bool) -> None:
-        """Keep other photos from failing in the same way; this frees what has been loaded, too."""
-        if self.shared:
-            self.find, self.lack, self.short = _nothing, f"{self.what} cannot be used", short
-
 
 def open_base(settings: BaseSettings, log: Log = LOG.warning) -> OpenedBase:
     """A base by its settings; nothing is loaded before a photo needs it.
@@ -260,14 +259,14 @@ def open_base(settings: BaseSettings, log: Log = LOG.warning) -> OpenedBase:
     named = settings.named
 
     def network(name: str) -> Find:
-        return _once(functools.partial(_load, name, settings, files, prints))
+        load = functools.cache(functools.partial(_load, name, settings, files, prints))
+        return lambda photo, depth: load()
 
     if named == AUTO:
+        sharp = network("sharp") if "checkpoint" in files else _nothing
         candidates = [
             _Candidate("rgbd", "the depth in the photo", _by_own_depth, "no depth in the photo", shared=False),
-            _Candidate(
-                "sharp", "SHARP", network("sharp") if "checkpoint" in files else _nothing, "no SHARP weights here"
-            ),
+            _Candidate("sharp", "SHARP", sharp, "no SHARP weights here"),
             _Candidate("lite", "lite", network("lite")),
         ]
         return OpenedBase(candidates, log, prints, by_name=False)
@@ -311,7 +310,7 @@ class OpenedBase:
 
     def load(self, photo: Photo, depth: Path | DepthMap | None = None, log: Log | None = None) -> PhotoBase:
         """The first half of `predict`: the base is loaded, and the photo's depth is read where that takes any."""
-        found = PhotoBase(photo, depth, self._candidates, log or self._log, self)
+        found = PhotoBase(photo, depth, self._candidates, log or self._log, None if self._by_name else self._told)
         found.load()
         return found
 
@@ -324,12 +323,6 @@ class OpenedBase:
         """The base of a choice for all further photos, as the frames of a clip need it: nothing to fall back to."""
         return OpenedBase([c for c in self._candidates if c.name == choice.base], self._log, self.fingerprints)
 
-    def news(self, line: str) -> str:
-        """The line; nothing where a base is named, or where the same was said of an earlier photo."""
-        new = not self._by_name and line not in self._told
-        self._told.add(line)
-        return line if new else ""
-
 
 class PhotoBase:
     """The bases that one photo may get; the first of them that has what it takes and does not fail."""
@@ -340,9 +333,9 @@ class PhotoBase:
         depth: Path | DepthMap | None,
         candidates: Sequence[_Candidate],
         log: Log,
-        opened: OpenedBase,
+        told: set[str] | None,  # the news so far; None where there are none
     ) -> None:
-        self._photo, self._depth, self._left, self._log, self._opened = photo, depth, list(candidates), log, opened
+        self._photo, self._depth, self._left, self._log, self._told = photo, depth, list(candidates), log, told
         self._alone = len(candidates) == 1
         self._lacks: list[str] = []
         self._passed: list[str] = []
@@ -367,14 +360,22 @@ class PhotoBase:
         while True:
             base = self.load()
             try:
-                prediction = _finite_prediction(base, self._photo, progress)
+                prediction = base.predict(self._photo, progress)
+                if not all_finite(prediction.gaussians):
+                    raise InputError(
+                        f"{self._photo.path}: the base's Gaussians leave the range of float32: "
+                        "check depth and focal length"
+                    )
             except InputError as error:
                 # What is wrong with one photo need not be so with another.
                 self._fall_back(error, for_good=isinstance(error, MemoryShort))
                 continue
             why = ", ".join(self._lacks) or self._left[0].what
             choice = Choice(base.name, why, tuple(self._passed), not self._short)
-            return prediction, dataclasses.replace(choice, news=self._opened.news(choice.line))
+            if self._told is None or choice.line in self._told:
+                return prediction, choice
+            self._told.add(choice.line)
+            return prediction, dataclasses.replace(choice, news=choice.line)
 
     def _fall_back(self, error: InputError, *, for_good: bool) -> None:
         """Go on with the next candidate, for other photos too where it is for good; raise the error at the last."""
@@ -384,8 +385,8 @@ class PhotoBase:
         if isinstance(error, BaseError) or len(self._left) == 1:
             raise error
         short = isinstance(error, MemoryShort)
-        if for_good:
-            candidate.give_up(short)
+        if for_good and candidate.shared:  # no other photo fails in the same way; this frees what was loaded, too
+            candidate.find, candidate.lack, candidate.short = _nothing, f"{candidate.what} cannot be used", short
         self._log(f"{self._photo.path.name}: going on without {candidate.what}: {error}")
         self._passed.append(f"{candidate.what}: {error}")
         self._next(f"{candidate.what} cannot be used", short)
@@ -431,13 +432,13 @@ def _by_own_depth(photo: Photo, depth: Path | DepthMap | None) -> Base | None:
 
 def _depth_map(photo: Photo, source: Path | DepthMap, calib: Path | None) -> DepthMap:
     """A photo's depth map, as far as the lens decides it by the lens that counts: a person's word beats the map's."""
-    path = None if isinstance(source, DepthMap) else find_depth(source, photo.path)
-    depth = source if isinstance(source, DepthMap) else load_depth(find_depth(source, photo.path), calib=calib)
+    path = source if isinstance(source, DepthMap) else find_depth(source, photo.path)
+    depth = path if isinstance(path, DepthMap) else load_depth(path, calib=calib)
     depth.check_shape(photo.height, photo.width, photo.path)
     if depth.K is None or not given_focal(photo):
         return depth
     focal = photo.focal_px * (depth.depth.shape[1] / photo.width)
-    if path is not None:
+    if not isinstance(path, DepthMap):
         return load_depth(path, calib=calib, focal_px=focal)
     if depth.quantity == "depth" or depth.note:  # metres that depend on no lens
         return dataclasses.replace(depth, K=None)
@@ -499,30 +500,8 @@ def _load(name: str, settings: BaseSettings, files: Mapping[str, Path], prints: 
     return base
 
 
-def _sharp_here() -> Path | None:
-    """SHARP's downloaded weights; None also on a machine without a place for any."""
-    try:
-        return installed("sharp")
-    except InputError:
-        return None
-
-
-def _once(load: Callable[[], Base]) -> Find:
-    """The same base for each photo."""
-    loaded = functools.cache(load)
-    return lambda photo, depth: loaded()
-
-
 def _nothing(photo: Photo, depth: Path | DepthMap | None) -> None:
     return None
-
-
-def _finite_prediction(base: Base, photo: Photo, progress: Progress | None) -> BasePrediction:
-    """What a base makes of a photo; InputError also where its numbers are too large."""
-    prediction = base.predict(photo, progress)
-    if not all_finite(prediction.gaussians):
-        raise InputError(f"{photo.path}: the base's Gaussians leave the range of float32: check depth and focal length")
-    return prediction
 
 
 def all_finite(gaussians: Gaussians) -> bool:
