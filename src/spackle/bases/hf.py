@@ -309,11 +309,10 @@ def _find(model: str, files: list[str]) -> Path:
             from huggingface_hub import snapshot_download
         except ImportError as error:
             raise InputError(NOT_INSTALLED) from error
-        folder = None
+        cached = None
         with contextlib.suppress(OSError), quiet():  # what huggingface_hub says of what is not in the cache is one
-            folder = Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
-        if folder is None or _lacks(folder, files):
-            folder = _from_hub(model, files)
+            cached = Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
+        folder = cached if cached is not None and not _lacks(cached, files) else _from_hub(model, files)
     else:
         raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
     if problem := _lacks(folder, files):
