@@ -94,8 +94,8 @@ def slow(conv: nn.Conv2d, image: Tensor, offset: Tensor, mask: Tensor) -> Tensor
     for b, o, i, j in np.ndindex(*out.shape):
         total = 0.0 if conv.bias is None else float(conv.bias[o])
         for c, tap in np.ndindex(per_group, taps):
-            channel, n = o // out_per_group * per_group + c, tap
-            n += (o // out_per_group * per_group + c) // per_offset * taps
+            channel = o // out_per_group * per_group + c
+            n = tap + channel // per_offset * taps
             y = i * stride[0] - padding[0] + tap // columns * dilation[0] + float(offset[b, 2 * n, i, j])
             x = j * stride[1] - padding[1] + tap % columns * dilation[1] + float(offset[b, 2 * n + 1, i, j])
             weight = float(conv.weight[o, c, tap // columns, tap % columns])
@@ -328,6 +328,7 @@ def test_weights_are_widened_and_constants_stay(tmp_path: Path) -> None:
 GOOD = {"linear.weight": torch.ones(2, 3), "linear.bias": torch.zeros(2)}
 BROKEN: list[tuple[str, object, str]] = [  # names, bytes or what is saved, and what is said of them
     ("missing.pth", None, "no such weight file"),
+    ("folder.pth", Path.mkdir, "not a plain file"),
     ("empty.pth", b"", "the file is empty"),
     ("garbled.pth", b"\x80\x02no" * 50, "cannot be read as weights"),
     ("text.pth", b"<html>" * 9, "cannot be read as weights"),
@@ -352,6 +353,8 @@ def test_broken_weights_are_a_line(tmp_path: Path, name: str, held: object, said
     elif held is ...:  # a good file, cut off
         torch.save(GOOD, path)
         path.write_bytes(path.read_bytes()[:-200])
+    elif held is Path.mkdir:
+        path.mkdir()
     elif held is not None:
         torch.save(held, path)
     with pytest.raises(InputError, match=said) as caught:
