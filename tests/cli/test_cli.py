@@ -55,14 +55,12 @@ def test_a_terminal_gets_bars_and_a_file_does_not() -> None:
         assert ("complete" in text, "3/7" in text) == (terminal, terminal)
 
 
-@pytest.mark.parametrize(
-    "options", [("--trajectory", "spiral"), ("--mode", "x"), ("--frames", "many"), ("--nonsense",)]
-)
-def test_usage_errors(tmp_path: Path, pair: tuple[Path, Path], options: tuple[str, ...]) -> None:
-    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out", *options)
-    assert result.code == 2
-    assert options[0] in result.err
-    assert not (tmp_path / "out").exists()
+def test_usage_errors(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    for options in (("--trajectory", "spiral"), ("--mode", "x"), ("--frames", "many"), ("--nonsense",)):
+        result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "out", *options)
+        assert result.code == 2
+        assert options[0] in result.err
+        assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", [("predict", "-o", "out"), ("dataset", "build", "--photos", "x", "-o", "out")])
@@ -75,7 +73,7 @@ def test_a_path_of_another_name_is_told_those_there_are(command: tuple[str, ...]
 
 def test_python_m_spackle_is_the_command() -> None:
     done = subprocess.run([sys.executable, "-m", "spackle", "--version"], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("spackle ")
+    assert done.stdout == f"spackle {spackle.__version__}\n"
 
 
 def test_the_installed_command_is_this_one() -> None:
@@ -172,16 +170,8 @@ def test_each_command_has_a_help_of_its_own(command: str) -> None:
     result = run(command, "--help")
     assert result.code == 0
     assert f"spackle {command}" in result.out.splitlines()[0]
-
-
-def test_the_examples_name_options_that_there_are() -> None:
-    for command, option in (("predict", "--input"), ("export", "--output")):
-        assert option in run(command, "--help").out
-    assert "SCENE_OR_PHOTO" in run("view", "--help").out
-
-
-def test_the_version_is_the_packages() -> None:
-    assert run("--version").out == f"spackle {spackle.__version__}\n"
+    named = {"predict": "--input", "export": "--output", "view": "SCENE_OR_PHOTO"}  # in the examples of the first help
+    assert named.get(command, "") in result.out
 
 
 def test_shells_are_told_how_to_complete(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,14 +207,6 @@ def test_each_result_is_a_line_of_json_and_nothing_else_is_on_the_standard_outpu
     assert [Path(line["file"]).stat().st_size for line in files] == [line["bytes"] for line in files]
     assert [line["gaussians"] for line in files] == [report["merged"]] * 2
     assert json.loads(run("weights", "list", "--json").out)["name"] == "sharp"
-
-
-def test_without_json_the_standard_output_stays_empty(tmp_path: Path) -> None:
-    picture, depth = small_pair(tmp_path)
-    result = run(
-        "predict", "-i", picture, "--depth", depth, "-o", tmp_path / "out", "--no-render", "--residual", "none"
-    )
-    assert (result.code, result.out) == (0, "")
 
 
 def test_an_error_is_a_line_of_json_too(tmp_path: Path) -> None:
