@@ -1,0 +1,53 @@
+"""What the docs name exists: functions and files of ARCHITECTURE.md, and every link inside the repository."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("research/**/*.md"), *ROOT.glob("src/**/*.md")]
+)
+
+
+def names_in(path: Path) -> set[str]:
+    """What a module defines at its top."""
+    names = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", node)]
+        names |= {str(getattr(target, "name", getattr(target, "id", ""))) for target in targets}
+    return names
+
+
+def test_the_architecture_names_what_there_is() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    found = re.findall(r"`([\w/]+\.(?:py|yaml))(?::(\w+))?`", text)
+    assert len(found) > 30
+    for file, name in found:
+        path = ROOT / file if file.startswith(("tests/", "research/")) else ROOT / "src" / "spackle" / file
+        assert path.is_file(), file
+        assert not name or name in names_in(path), f"{file}:{name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for link in re.findall(r'(?:\]\(|src=")([^)"\s]+)', text):
+        target, _, section = link.partition("#")
+        if "://" in link:
+            continue
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), link
+        if section and path.suffix == ".md":
+            titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert section in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, link
+
+
+def test_user_docs_stay_short() -> None:
+    """At most 9,000 words: what was tried and measured belongs to docs/lab."""
+    pages = [ROOT / "README.md", *ROOT.glob("docs/*.md")]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= 9_000
