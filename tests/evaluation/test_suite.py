@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.util
 import json
 from collections.abc import Iterator
@@ -20,24 +19,23 @@ from sharp_weights import MICRO, gaussians_of, micro_network
 from spackle.bases.sharp import SharpBase
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
-from spackle.evaluation import suite_stages as stages
+from spackle.evaluation import suite_sections as stages
 from spackle.evaluation.efficiency import complete_in_laps
 from spackle.evaluation.naive_renderer import naive_render
 from spackle.evaluation.results import KINDS, begin
-from spackle.evaluation.suite import TITLES, limit_ms, suite_tables
-from spackle.evaluation.suite_scenes import holed_scene, photo_scene
-from spackle.evaluation.timing import TOTAL, Section, Timing, count_flops, measure
+from spackle.evaluation.suite import TITLES, plain_row, suite_tables
+from spackle.evaluation.suite_sections import Row, count_flops, holed_scene, photo_scene
+from spackle.evaluation.timing import TOTAL, measure
+from spackle.image import Photo
 from spackle.render import CpuRenderer
 from spackle.residual import Completer, ResidualNet, hole_area_ratio
 
 SIDE = 64
-LIMITS = Section(
-    (
-        Timing("matrix product, fp32", (0.5, 1.0), "GFLOP/s"),
-        Timing("matrix product, bf16", (4.0,), "GFLOP/s"),
-        Timing("copy of memory", (2.0,), "GB/s"),
-    )
-)
+PEAKS = {stages.PRODUCT.format("fp32"): 1e6, stages.PRODUCT.format("bf16"): 4e6, stages.COPY: 2e6}
+
+
+def rows_of(section: stages.Section) -> dict[str, Row]:
+    return {row.name: row for row in section[0]}
 
 
 # --- timing and limits
@@ -72,19 +70,14 @@ def test_torch_counts_operations() -> None:
     assert count_flops(lambda: torch.nn.functional.scaled_dot_product_attention(q, q, q)) == 2 * (2 * 2 * 8 * 8 * 4)
 
 
-def test_the_larger_of_two_limits_counts_and_peaks_are_the_best_runs() -> None:
-    assert limit_ms(Timing("call", (6.0,), flops=3e6), LIMITS) == pytest.approx(3.0)
-    assert limit_ms(Timing("call", (6.0,), flops=4e6, dtype="bf16"), LIMITS) == pytest.approx(1.0)
-    row = Timing("call", (6.0, 8.0, 10.0), flops=1e6, bytes=4e6)
-    assert limit_ms(row, LIMITS) == pytest.approx(2.0)
-    assert limit_ms(row, None) is None
-    assert limit_ms(Timing("call", (6.0,)), LIMITS) is None
-    *_, table, missing = suite_tables({"limits": LIMITS, "renderer": Section((row,))}, {"video": "no photo"})
+def test_limits_are_rates_and_stand_beside_the_rows_that_they_hold_for() -> None:
+    rows = stages.limits_section(2, share=1 / 128)[0]
+    assert [row.unit for row in rows] == ["GFLOP/s", "GFLOP/s", "GB/s"]
+    assert all(len(row.values) == stages.LIMIT_RUNS and min(row.values) > 0 for row in rows)
+    row = plain_row(Row("call", np.array([6.0, 8.0, 10.0]), limit_ms=2.0))
+    table, missing = suite_tables({"renderer": {"rows": [row], "facts": {}}}, {"video": "no photo"})
     assert table.lines[0].cells == ("call", "8.00 ms", "7.00 – 9.00", "3", "2.00 ms", "4.0×")
     assert missing.lines[0].cells == ("video", TITLES["video"], "not run: no photo")
-    found = stages.limits_section(2, share=1 / 128)
-    assert [row.unit for row in found.rows] == ["GFLOP/s", "GFLOP/s", "GB/s"]
-    assert all(len(row.values) == stages.LIMIT_RUNS and min(row.values) > 0 for row in found.rows)
 
 
 # --- sections
@@ -98,19 +91,21 @@ def test_the_naive_renderer_draws_what_ours_draws() -> None:
 
 
 def test_the_renderers_section_has_all_stages_and_a_band_on_top(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = stages.renderer_section(2, SIDE)
+    section = stages.renderer_section(2, SIDE, PEAKS)
+    found, facts = rows_of(section), section[1]
     names = [*stages.RENDER_STAGES, *(f"naive: {stage}" for stage in stages.RENDER_STAGES), stages.CALL]
-    assert all(len(found.row(name).values) == 2 and min(found.row(name).values) > 0 for name in names)
-    naive, call = (found.row(name).values for name in ("naive: whole call", stages.CALL))
-    assert found.row(stages.NAIVE_RATIO).values == tuple(a / b for a, b in zip(naive, call, strict=True))
+    assert all(len(found[name].values) == 2 and min(found[name].values) > 0 for name in names)
+    assert found[stages.NAIVE_RATIO].values == pytest.approx(
+        found["naive: whole call"].values / found[stages.CALL].values
+    )
     count = SIDE * SIDE // 2
-    assert found.facts["gaussians"] == count
-    assert found.row(stages.CALL).bytes == count * 56 + SIDE * SIDE * 20
-    assert found.facts["redraw_gaussians"] == pytest.approx(0.05 * count, rel=0.4)
-    assert 0 < found.facts["redraw_tiles"] < (SIDE // 16) ** 2
+    assert facts["gaussians"] == count
+    assert found[stages.CALL].limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
+    assert facts["redraw_gaussians"] == pytest.approx(0.05 * count, rel=0.4)
+    assert 0 < facts["redraw_tiles"] < (SIDE // 16) ** 2
     monkeypatch.setattr(stages, "naive_render", lambda scene, camera: torch.zeros(SIDE, SIDE, 3))
     with pytest.raises(RuntimeError, match="disagree"):
-        stages.renderer_section(1, SIDE)
+        stages.renderer_section(1, SIDE, PEAKS)
 
 
 def test_the_disparity_is_found_at_which_a_share_is_holes() -> None:
@@ -127,48 +122,43 @@ def test_what_completion_adds_is_the_sum_of_its_stages() -> None:
     torch.manual_seed(0)
     network = ResidualNet().eval().requires_grad_(False)
     base, camera = holed_scene(96)
-    found = stages.completion_section(2, base, camera, CpuRenderer(), network)
-    added, place, redraw, render = (
-        np.array(found.row(name).values) for name in (stages.ADDED, stages.PLACE, stages.REDRAW, stages.RENDER)
-    )
-    assert added == pytest.approx(place + redraw)
-    assert found.row(stages.IN_RENDERS).values == pytest.approx(tuple(added / render))
-    assert found.facts["holes"] == pytest.approx(0.05, rel=0.05)
-    assert found.facts["added"] > 0
-    assert found.row(stages.NETWORK).flops > 1e8
+    section = stages.completion_section(2, base, camera, CpuRenderer(), network)
+    found, facts = rows_of(section), section[1]
+    added = found[stages.ADDED].values
+    assert added == pytest.approx(found[stages.PLACE].values + found[stages.REDRAW].values)
+    assert found[stages.IN_RENDERS].values == pytest.approx(added / found[stages.RENDER].values)
+    assert facts["holes"] == pytest.approx(0.05, rel=0.05)
     view = stages.find_view(base, camera, CpuRenderer())[1]
     completer = Completer(base, camera, CpuRenderer(), network)
-    assert same_bits(complete_in_laps(completer, view, lambda name: None), completer.complete_view(view))
-    seeds_alone = stages.completion_section(1, base, camera, CpuRenderer(), None)
-    assert stages.NETWORK not in [row.name for row in seeds_alone.rows]
-    again = Section.of(json.loads(json.dumps(dataclasses.asdict(found))))
-    assert (again.rows, again.facts) == (found.rows, found.facts)
+    whole = completer.complete_view(view)
+    assert same_bits(complete_in_laps(completer, view, lambda name: None), whole)
+    assert facts["added"] == len(whole) > 0
 
 
 def test_a_video_in_one_scene_and_frame_by_frame() -> None:
-    found = stages.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
-    names = (stages.LIFT, stages.ENCODE, stages.EACH, stages.SHIELDS, stages.SCENE, stages.SCRATCH)
-    lift, encode, each, shields, one_scene, scratch = (found.row(name).values[0] for name in names)
-    assert scratch == pytest.approx(lift + encode + each + shields)
-    assert found.row(stages.SCENE_RATIO).values[0] == pytest.approx(scratch / one_scene)
-    kept = lift + encode + each + shields / 4
-    assert found.row(stages.KEPT_RATIO).values[0] == pytest.approx(kept / one_scene)
-    assert found.facts["added"] > 0
+    section = stages.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
+    found = {name: float(row.values[0]) for name, row in rows_of(section).items()}
+    same = found[stages.LIFT] + found[stages.ENCODE] + found[stages.EACH]
+    assert found[stages.SCRATCH] == pytest.approx(same + found[stages.SHIELDS])
+    assert found[stages.SCENE_RATIO] == pytest.approx(found[stages.SCRATCH] / found[stages.SCENE])
+    assert found[stages.KEPT_RATIO] == pytest.approx((same + found[stages.SHIELDS] / 4) / found[stages.SCENE])
+    assert section[1]["added"] > 0
 
 
 def test_sharp_in_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    photo = stages.sharp_photo(MICRO.side)
-    found = stages.sharp_section(1, SharpBase(micro_network(), weights="micro"), photo)
-    assert found.facts["gaussians"] == gaussians_of(MICRO)
-    assert found.row(stages.FORWARD).flops > 1e9
-    assert found.row(stages.WHOLE).values[0] >= found.row(stages.FORWARD).values[0]
+    photo = Photo(torch.rand(MICRO.side, MICRO.side, 3), 1.2 * MICRO.side, "", Path("photo.png"))
+    section = stages.sharp_section(1, SharpBase(micro_network(), weights="micro"), photo, PEAKS)
+    found, facts = rows_of(section), section[1]
+    assert facts["gaussians"] == gaussians_of(MICRO)
+    assert (found[stages.FORWARD].limit_ms or 0) > 1e3  # 1e9 operations at 1e6 a millisecond
+    assert found[stages.WHOLE].values[0] >= found[stages.FORWARD].values[0]
 
     def no_compiler(*arguments: object) -> Any:
         raise RuntimeError("no compiler\nanywhere")
 
     monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
-    found = stages.sharp_section(1, SharpBase(micro_network(), compiled=True, windows=9), photo)
-    assert (found.facts["windows"], found.facts["compile_problem"]) == (9, "no compiler anywhere")
+    _, facts = stages.sharp_section(1, SharpBase(micro_network(), compiled=True, windows=9), photo, PEAKS)
+    assert (facts["windows"], facts["compile_problem"]) == (9, "no compiler anywhere")
 
 
 # --- the command

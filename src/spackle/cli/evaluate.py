@@ -174,12 +174,13 @@ def bench(
     disparities = parse_disparities(_with_words(context, disparity))
     bases = _settings(base, checkpoint, precision, low_memory, device)
     if dataset is None or root is None:
+        sharp = dataclasses.replace(bases, windows=windows, compiled=compiled)
         asked = SuiteOptions(
             only=split_words(only or ""),
             runs=runs,
+            device=device,
+            sharp=sharp if {"--base", "--checkpoint"} & given else None,
             base_runs=base_runs,
-            base=dataclasses.replace(bases, windows=windows, compiled=compiled),
-            sharp=bool({"--base", "--checkpoint"} & given),
             residual=residual_file(residual),
             side=side,
         )

@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
 from spackle.bases.open import BaseError
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, load_case
-from spackle.evaluation.efficiency import Efficiency, ImageCost, count_parameters, time_base, time_view
+from spackle.evaluation.efficiency import Efficiency, Record, count_parameters, time_base, time_view
 from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write_text
@@ -24,9 +24,8 @@ from spackle.evaluation.table import to_latex, to_markdown
 from spackle.machine import hardware, versions
 from spackle.output_folder import alone_in, results_folder
 from spackle.progress import Reporter
+from spackle.residual import Completer
 from spackle.signals import asked_to_stop
-
-T = TypeVar("T")
 
 RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
 SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
@@ -37,93 +36,77 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     """Time a dataset, or go on with that; "complete", or "stopped" where Ctrl-C came.
 
     Writes bench.json, bench.md, bench.tex and images/ into `output`. The folder belongs to one machine: times of two do
-    not go together.
-
-    Args:
-        options: of an evaluation without metrics, whose views are timed.
-        runs: how often everything behind the base is timed.
-        base_runs: how often the base is timed; None: once for SHARP, which takes long, else `runs` times.
-        output: a folder.
-        reporter: tells which images fail, and with -v each image's figures.
+    not go together. Everything behind the base is timed `runs` times, the base `base_runs` times (None: once for SHARP,
+    which takes long, else `runs` times).
 
     Raises:
         InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
             memory for the base.
     """
     check_runs(runs, base_runs)
-    tools = open_evaluation(options)
-    cases, kind = tools.cases, options.base.kind
+    tools, kind = open_evaluation(options), options.base.kind
     device = options.device if kind.network else torch.device("cpu")
     config = {"kind": "bench", **{name: tools.config[name] for name in SHARED}}
     config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if kind.slow else runs)}
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
-    images: list[ImageCost] = []
+    images: list[Record] = []
     warm = False  # whether this process has predicted something
     with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output, "benchmark"):
         begin(output, config)
         with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
-            for index, case in enumerate(cases):
+            for index, case in enumerate(tools.cases):
                 if stop():
                     reporter.say("stopped; the same command goes on from here")
                     return "stopped"
-                path = output / IMAGES / f"{stem_of(index, case.name)}.json"
-                inputs = inputs_digest(case)
-                image = load_part(path, inputs, ImageCost.of)
+                path, inputs = output / IMAGES / f"{stem_of(index, case.name)}.json", inputs_digest(case)
+                image = load_part(path, inputs)
                 if image is None:
-                    image = _measure(case, tools, config, device, warm, reporter)
-                    if image.problem is None:
+                    try:
+                        image = time_image(case, tools, config, warm)
+                    except BaseError:  # no other image would fare better; too little memory is one, too
+                        raise
+                    except InputError as error:  # the next run tries it again
+                        problem = problem_of(case, error, options.root)
+                        reporter.say(f"passed over: {problem}")
+                        image = {"name": case.name, "facts": {}, "problem": problem, "views": []}
+                    else:
                         warm = True
-                        write_part(path, inputs, image.plain())
+                        save_part(path, inputs, image)
+                        _log_views(image, reporter)
                 images.append(image)
-                step(index + 1, len(cases))
-        _finish(Efficiency(config, tuple(images)), options, output, reporter)
+                step(index + 1, len(tools.cases))
+        _finish(Efficiency(config, images), options, output, reporter)
     return "complete"
 
 
-def _measure(
-    case: Case, tools: Evaluation, config: Mapping[str, Any], device: torch.device, warm: bool, reporter: Reporter
-) -> ImageCost:
-    """One image; a problem of its own is its record, which the next run tries again."""
-    try:
-        image = time_image(case, tools, config, device, warm)
-    except BaseError:  # no other image would fare better; too little memory is one, too
-        raise
-    except InputError as error:
-        problem = problem_of(case, error, tools.options.root)
-        reporter.say(f"passed over: {problem}")
-        return ImageCost(case.name, problem=problem)
-    for view in image.views:
-        found = view.figures()
-        times = f"{found['base_ms']:,.0f} ms, with Spackle {found['spackle_ms']:,.0f}"
-        reporter.detail(f"  {case.name}, {view.setting}: {times}, {view.added:,} Gaussians added")
-    return image
-
-
-def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], device: torch.device, warm: bool) -> ImageCost:
-    """All settings of an image; `device` is the base's; `warm`: something was predicted before in this process.
+def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], warm: bool) -> Record:
+    """All settings of an image, see `Efficiency`; `warm`: something was predicted before in this process.
 
     Raises:
         InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
         BaseError: no image can be worked on.
     """
-    load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+    load, device = load_average(), torch.device(config["base"]["device"])
     loaded = load_case(dataclasses.replace(case, seconds=()))
     opened = tools.open(loaded).load(loaded.full)  # a network is loaded before the clock starts
-    base = time_base(lambda: opened.predict()[0], config["base_runs"], device, warm)
+    found, seconds, warm = time_base(lambda: opened.predict()[0], config["base_runs"], device, warm)
     try:
-        views = large_views(base.prediction, tools.options.disparities)
+        views = large_views(found, tools.options.disparities)
     except ValueError as error:
         raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
-    more: dict[str, Any] = {"device": device, "precision": tools.options.base.precision}
-    costs = [
-        time_view(base, view.setting, view.camera, tools.renderer, tools.network, config["runs"], **more)
-        for view in views
-        if view.name == SIDE
-    ]
-    size = {"width": loaded.photo.width, "height": loaded.photo.height}
-    facts = {**size, "load": load, "warm": base.warm, "notes": base.prediction.notes}
-    return ImageCost(case.name, facts, tuple(costs))
+    precision = tools.options.base.precision
+    completer = Completer(found.gaussians, found.camera, tools.renderer, tools.network, precision=precision)
+    wanted = [view for view in views if view.name == SIDE]
+    costs = [time_view(seconds, completer, view.setting, view.camera, config["runs"], device) for view in wanted]
+    facts = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load, "warm": warm}
+    return {"name": case.name, "facts": {**facts, "notes": found.notes}, "problem": None, "views": costs}
+
+
+def _log_views(image: Record, reporter: Reporter) -> None:
+    for view in image["views"]:
+        times = "{base_ms:,.0f} ms, with Spackle {spackle_ms:,.0f}, {added:,} Gaussians added".format(**view["figures"])
+        reporter.detail(f"  {image['name']}, {view['setting']}: {times}")
 
 
 def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter: Reporter) -> None:
@@ -134,25 +117,29 @@ def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter:
     tables = efficiency_tables(found, parameters)
     write_text(to_markdown(tables), output / MARKDOWN)
     write_text(to_latex(tables), output / LATEX)
-    counted = {**dataclasses.asdict(parameters), "share": parameters.share}
-    write_json({"parameters": counted, **found.plain()}, output / RESULTS)
+    write_json({"parameters": parameters, **found.plain()}, output / RESULTS)
     overheads = ", ".join(f"{s}: {100 * found.spread(s, 'overhead').median:.2f} %" for s in found.settings)
     reporter.say(f"{found.config['title']}: {measured} of {total} images, overhead {overheads} -> {output}")
     reporter.result({"folder": output, "images": total, "measured": measured})
 
 
-def load_part(path: Path, inputs: object, decode: Callable[[Any], T]) -> T | None:
+def save_part(path: Path, inputs: object, found: Record) -> None:
+    """Write what was measured, and of which inputs."""
+    write_json({"inputs": inputs, "found": found}, path)
+
+
+def load_part(path: Path, inputs: object) -> Record | None:
     """What an earlier run measured; None where it is not there, or of other inputs than these (None: of any)."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return decode(content["found"]) if inputs in (None, content["inputs"]) else None
+        return dict(content["found"]) if inputs in (None, content["inputs"]) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def write_part(path: Path, inputs: object, found: Mapping[str, Any]) -> None:
-    """Write what `load_part` reads."""
-    write_json({"inputs": inputs, "found": found}, path)
+def load_average() -> float | None:
+    """Of the machine over the last minute, where it tells."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
 
 
 def check_runs(runs: int, base_runs: int | None) -> None:

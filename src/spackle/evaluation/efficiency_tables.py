@@ -1,13 +1,12 @@
-"""The paper's two tables of efficiency, its numbers beside those measured, and two tables of our own."""
+"""The paper's two tables of efficiency, its numbers beside those measured, and a table of stages."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from spackle.evaluation import paper
-from spackle.evaluation import paper_efficiency as published
-from spackle.evaluation.efficiency import BASE_PATH, EXTRA, STAGES, Efficiency, Parameters
+from spackle.evaluation.efficiency import BASE_PATH, EXTRA, STAGES, Efficiency
 from spackle.evaluation.table import EMPTY, Line, Table
 from spackle.evaluation.tables import PAPER_ROW, count_text
 
@@ -22,39 +21,44 @@ VIEW = (
 PAPER = PAPER_ROW.format("SHARP")
 EXPANDED: Cells = ("Dataset", "Setting", "From", "Added GS", "Added GS (%)", "Merged GS", "base time (ms)")
 EXPANDED += ("Spackle time (ms)", "Time overhead", "base FPS", "Spackle FPS", "n")
+ODD_MARK = "†"
+ODD_NOTE = (
+    f"{ODD_MARK} Printed as published, though the row contradicts itself: 0.671 FPS is 1,490 ms and not 6,410.3, and "
+    "neither gives −3.3 %. The paper's caption speaks of measurement outliers."
+)
 
 
-def efficiency_tables(found: Efficiency, parameters: Parameters) -> list[Table]:
+def efficiency_tables(found: Efficiency, parameters: Mapping[str, float]) -> list[Table]:
     """All of them; at least one image of `found` was measured."""
-    return [_overhead_table(found), _expanded_table(found), _stages_table(found), _parameters_table(parameters)]
+    return [_overhead_table(found), _expanded_table(found, parameters), _stages_table(found)]
 
 
 def _overhead_table(found: Efficiency) -> Table:
     """Added Gaussians and median times (tab:efficiency_gaussian_overhead)."""
-    title, settings = str(found.config["title"]), found.settings
-    lines = []
-    for name in _titles(found):
+    title, base, settings = str(found.config["title"]), str(found.config["base"]["title"]), found.settings
+
+    def counts(name: str) -> list[Cells]:
         rows = []
         if name == title:
             means = [(found.spread(s, "added").mean, 100 * found.spread(s, "share").mean) for s in settings]
-            rows.append((_base(found), *(cell for pair in means for cell in _added(*pair))))
-        if name in paper.GAUSSIANS:
-            theirs = [paper.at(paper.GAUSSIANS[name], float(setting))[:2] for setting in settings]
-            rows.append((PAPER, *(cell for pair in theirs for cell in _added(*pair))))
-        lines += _group(name, rows)
-    averages = list(zip(published.AVERAGE_ADDED, published.AVERAGE_SHARE_PERCENT, strict=True))
-    indices = [published.setting_index(float(setting)) for setting in settings]
-    average = [cell for i in indices for cell in _added(*((None, None) if i is None else averages[i]))]
-    lines.append(Line(("Average", PAPER, *average), rule=True))
+            rows.append((base, *(cell for pair in means for cell in _added(*pair))))
+        return [*rows, published(paper.GAUSSIANS[name])] if name in paper.GAUSSIANS else rows
+
+    def published(numbers: tuple[float, ...]) -> Cells:
+        return (PAPER, *(cell for s in settings for cell in _added(*paper.at(numbers, float(s))[:2])))
+
+    lines = _grouped(found, counts)
+    lines.append(Line(("Average", *published(paper.AVERAGE)), rule=True))
     lines.append(Line(("Runtime efficiency", *[EMPTY] * (1 + 2 * len(settings))), rule=True))
-    for name, figure, our_text, their_text, values in (
-        ("Median time of the base (ms)", "base_ms", _ms, _ms, published.MEDIAN_BASE_MS),
-        ("Median time with Spackle (ms)", "spackle_ms", _ms, _ms, published.MEDIAN_SPACKLE_MS),
-        ("Median time overhead", "overhead", _share, _percent, published.MEDIAN_OVERHEAD_PERCENT),
+    for name, figure, our_text, their_text, medians in (
+        ("Median time of the base (ms)", "base_ms", _ms, _ms, paper.MEDIAN_BASE_MS),
+        ("Median time with Spackle (ms)", "spackle_ms", _ms, _ms, paper.MEDIAN_SPACKLE_MS),
+        ("Median time overhead", "overhead", _share, _percent, paper.MEDIAN_OVERHEAD),
     ):
         ours = [cell for s in settings for cell in (our_text(found.spread(s, figure).median), EMPTY)]
-        papers = [cell for i in indices for cell in (EMPTY if i is None else their_text(values[i]), EMPTY)]
-        lines += [Line((name, _base(found), *ours)), Line((EMPTY, PAPER, *papers))]
+        values = [paper.at(medians, float(s))[0] for s in settings]
+        theirs = [cell for value in values for cell in (EMPTY if value is None else their_text(value), EMPTY)]
+        lines += [Line((name, base, *ours)), Line((EMPTY, PAPER, *theirs))]
     return Table(
         "tab:efficiency_gaussian_overhead",
         "Efficiency and Gaussian overhead. Counts are means over images. Times are medians: ours over the images of "
@@ -67,16 +71,19 @@ def _overhead_table(found: Efficiency) -> Table:
     )
 
 
-def _expanded_table(found: Efficiency) -> Table:
+def _expanded_table(found: Efficiency, parameters: Mapping[str, float]) -> Table:
     """Counts, times and rates of each setting (tab:expanded_efficiency_gaussian_overhead)."""
-    lines: list[Line] = []
-    for title in _titles(found):
-        rows: list[Cells] = []
+
+    def rows(title: str) -> list[Cells]:
+        found_rows = []
         for setting in found.settings:
-            rows += [_our_row(found, setting)] if title == found.config["title"] else []
-            rows += _paper_row(title, setting)
-        lines += _group(title, rows)
-    marked = any(published.ODD_MARK in cell for line in lines for cell in line.cells)
+            found_rows += [_our_row(found, setting)] if title == found.config["title"] else []
+            known = title in paper.TIMES and float(setting) in paper.DISPARITIES
+            found_rows += [_paper_row(title, setting)] if known else []
+        return found_rows
+
+    lines = _grouped(found, rows)
+    marked = any(ODD_MARK in cell for line in lines for cell in line.cells)
     return Table(
         "tab:expanded_efficiency_gaussian_overhead",
         "Expanded efficiency and Gaussian overhead. Ours: counts are means and the rest are medians over images; FPS "
@@ -85,7 +92,7 @@ def _expanded_table(found: Efficiency) -> Table:
         (("", len(EXPANDED)),),
         tuple(lines),
         words=3,
-        notes=(*_notes(found), *([f"{published.ODD_NOTE}."] if marked else [])),
+        notes=(*_notes(found), _parameters_note(parameters), *([ODD_NOTE] if marked else [])),
     )
 
 
@@ -94,21 +101,17 @@ def _our_row(found: Efficiency, setting: str) -> Cells:
     wanted, count = paper.IMAGES.get(str(found.config["title"])), len(found.measured)
     texts = {"base_ms": _ms, "spackle_ms": _ms, "overhead": _share, "base_fps": _rate, "spackle_fps": _rate}
     medians = (text(found.spread(setting, figure).median) for figure, text in texts.items())
-    counts = (*_added(added, 100 * share), count_text(merged))
-    return (_setting(setting), _base(found), *counts, *medians, str(count) if wanted is None else f"{count}/{wanted}")
+    counts = (str(found.config["base"]["title"]), *_added(added, 100 * share), count_text(merged))
+    return (_setting(setting), *counts, *medians, str(count) if wanted is None else f"{count}/{wanted}")
 
 
-def _paper_row(title: str, setting: str) -> list[Cells]:
-    """The paper's row of a dataset; none where it has none."""
-    row = published.time_at(title, float(setting))
-    if row is None:
-        return []
+def _paper_row(title: str, setting: str) -> Cells:
     added, share, merged = paper.at(paper.GAUSSIANS[title], float(setting))
-    mark = published.ODD_MARK if (title, float(setting)) == published.ODD else ""
-    times = (_ms(row.base_ms) + mark, _ms(row.spackle_ms), _percent(row.overhead_percent) + mark)
-    rates = (_rate(row.base_fps) + mark, _rate(row.spackle_fps))
-    counts = (*_added(added, share), count_text(merged))
-    return [(_setting(setting), PAPER, *counts, *times, *rates, str(paper.IMAGES[title]))]
+    values = [value or 0.0 for value in paper.at(paper.TIMES[title], float(setting))]
+    times = [text(value) for text, value in zip((_ms, _ms, _percent, _rate, _rate), values, strict=True)]
+    if (title, float(setting)) == paper.ODD_TIME:
+        times = [text + ODD_MARK * (k in (0, 2, 3)) for k, text in enumerate(times)]
+    return (_setting(setting), PAPER, *_added(added, share), count_text(merged), *times, str(paper.IMAGES[title]))
 
 
 def _stages_table(found: Efficiency) -> Table:
@@ -138,41 +141,32 @@ def _stages_table(found: Efficiency) -> Table:
     )
 
 
-def _parameters_table(parameters: Parameters) -> Table:
-    """How large the networks are."""
-    rows = (
-        ("SHARP", parameters.base / 1e6, published.PARAMETERS_M),
-        ("SHARP and Spackle", (parameters.base + parameters.residual) / 1e6, published.MERGED_PARAMETERS_M),
-        ("Spackle alone", parameters.residual / 1e6, published.ADDED_PARAMETERS_M),
-        ("Spackle, % of SHARP", 100 * parameters.share, published.ADDED_PARAMETERS_PERCENT),
-    )
-    return Table(
-        "tab:efficiency_parameters",
-        "Parameters in millions, counted in the networks: SHARP's as its checkpoint has them, of which inference uses "
-        f"{parameters.base_used / 1e6:.2f}. The same whatever base was timed.",
-        ("Network", "counted", "paper"),
-        (("", 3),),
-        tuple(Line((name, f"{ours:.2f}", f"{theirs:.2f}")) for name, ours, theirs in rows),
+def _parameters_note(counted: Mapping[str, float]) -> str:
+    """How large the networks are, and how large the paper says they are."""
+    base, added = counted["base"] / 1e6, counted["residual"] / 1e6
+    return (
+        f"Parameters in millions, counted in the networks: SHARP {base:.2f}, of which inference uses "
+        f"{counted['base_used'] / 1e6:.2f}; with Spackle {base + added:.2f}; Spackle alone {added:.2f} "
+        f"({100 * counted['share']:.2f} %). The paper: {paper.PARAMETERS_M}, {paper.MERGED_PARAMETERS_M}, "
+        f"{paper.ADDED_PARAMETERS_M} ({paper.ADDED_PARAMETERS_PERCENT} %)."
     )
 
 
-def _titles(found: Efficiency) -> list[str]:
-    return list(dict.fromkeys([*paper.DATASETS, str(found.config["title"])]))
-
-
-def _group(title: str, rows: Sequence[Cells]) -> list[Line]:
-    """Rows under one title, with a rule above the first."""
-    return [Line((title if not number else EMPTY, *row), rule=not number) for number, row in enumerate(rows)]
-
-
-def _base(found: Efficiency) -> str:
-    return str(found.config["base"]["title"])
+def _grouped(found: Efficiency, rows: Callable[[str], Sequence[Cells]]) -> list[Line]:
+    """The rows of each dataset under its title, with a rule above the first."""
+    titles = dict.fromkeys([*paper.DATASETS, str(found.config["title"])])
+    return [
+        Line((EMPTY if number else title, *row), rule=not number)
+        for title in titles
+        for number, row in enumerate(rows(title))
+    ]
 
 
 def _setting(setting: str, pattern: str = "{}") -> str:
     """ "S1" for 0.3, or by the pattern "S1: disparity 0.3"; other disparities than the paper's have no such name."""
-    index = published.setting_index(float(setting))
-    return f"disparity {setting}" if index is None else pattern.format(f"S{index + 1}", setting)
+    if float(setting) not in paper.DISPARITIES:
+        return f"disparity {setting}"
+    return pattern.format(f"S{paper.DISPARITIES.index(float(setting)) + 1}", setting)
 
 
 def _added(added: float | None, percent: float | None) -> Cells:
@@ -183,7 +177,7 @@ def _setup(found: Efficiency) -> str:
     """The view, the base, the weights and the machine, for every caption."""
     base, residual = found.config["base"], found.config["residual"]
     hardware, versions = found.config["hardware"], found.config["versions"]
-    precision = found.measured[0].facts["notes"].get("precision")
+    precision = found.measured[0]["facts"]["notes"].get("precision")
     network = f"network in {precision} on {base['device']}" if precision else "no network"
     weights = "seeds, no weights"
     if residual["sha256"]:
@@ -201,16 +195,15 @@ def _notes(found: Efficiency) -> tuple[str, ...]:
         f"Each stage: median of {runs} runs after one that is not counted; the base: {base_runs} per image. Files are "
         "read before the clock starts, and nothing is written. A time of several stages is the sum of their medians."
     ]
-    cold = [image.name for image in found.measured if not image.facts["warm"]]
-    if cold:
+    facts = {image["name"]: image["facts"] for image in found.measured}
+    if cold := [name for name, known in facts.items() if not known["warm"]]:
         notes.append(f"The base of {', '.join(cold)} was timed at its first prediction in a process: it was not warm.")
-    loads = [float(image.facts["load"]) for image in found.measured if image.facts["load"] is not None]
-    if loads:
+    if loads := [float(known["load"]) for known in facts.values() if known["load"] is not None]:
         notes.append(
             f"Load of the machine before each image (with this benchmark in it): median {statistics.median(loads):.1f},"
             f" {min(loads):.1f} to {max(loads):.1f}; above the number of cores, other processes made times longer."
         )
-    if failed := [image.name for image in found.images if image.problem is not None]:
+    if failed := [image["name"] for image in found.images if image["problem"] is not None]:
         notes.append(f"{len(failed)} of {len(found.images)} images gave no figures: {', '.join(failed[:5])}.")
     return tuple(notes)
 

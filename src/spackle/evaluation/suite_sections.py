@@ -1,28 +1,25 @@
-"""The sections of `spackle bench --suite`: the machine's limits, rendering, completion, video, SHARP."""
+"""The sections of `spackle bench --suite`: limits of the machine, rendering, completion, video, SHARP; their scenes."""
 
 from __future__ import annotations
 
-import functools
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_processor
-from spackle.bases.sharp.layers import FULL
 from spackle.camera import Camera
 from spackle.camera_path import MAX_DISPARITY, DepthRange, extremes, trajectory
-from spackle.device import pick_dtype
 from spackle.errors import InputError
 from spackle.evaluation.efficiency import EXTRA, complete_in_laps
 from spackle.evaluation.naive_renderer import naive_render
-from spackle.evaluation.suite_scenes import photo_scene
-from spackle.evaluation.timing import CPU, MS, TOTAL, Lap, Section, Task, Timing, count_flops, measure
+from spackle.evaluation.timing import CPU, MS, TOTAL, Lap, Task, Values, measure
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
@@ -30,10 +27,7 @@ from spackle.render import CpuRenderer, Renderer, touched_tiles
 from spackle.render.binning import list_tiles, sort_by_depth
 from spackle.render.pipeline import Canvas, blend, project, wanted_tiles
 from spackle.render.project import KernelCamera
-from spackle.render.protocol import Rendering
-from spackle.residual import Completer, Cues, ResidualNet, hole_area_ratio, make_seeds
-from spackle.residual.network import predict_deltas
-from spackle.residual.seeds import Rim
+from spackle.residual import Completer, ResidualNet, hole_area_ratio
 
 LIMIT_RUNS = 7  # at least: the best run counts
 MATRIX_SIDE, COPY_MB = 2048, 256
@@ -44,7 +38,7 @@ TWIN_ERROR = 1e-5  # between the two renderers, on average
 BAND, BAND_SETS = 0.05, 3  # what is redrawn: a band of the picture this wide, in so many sets
 GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
 HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of the completed view; of the search for it, and its relative tolerance
-RENDER, SHIELD, NETWORK, ADDED = "base render of the view", "photo's shield, once a photo", "network", "added time"
+RENDER, SHIELD, ADDED = "base render of the view", "photo's shield, once a photo", "added time"
 PLACE, REDRAW, IN_RENDERS = "mask, seeds, network, placing", "redraw", "added time over base render"
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
 LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
@@ -53,33 +47,52 @@ EACH, SHIELDS = "frames rendered and completed, each by itself", "the photo's sh
 SCENE_RATIO, KEPT_RATIO = "frame by frame over one scene", "the same, the photo's shield made once"
 FORWARD, UNPROJECT, SAVE, WHOLE = "forward", "unprojection", "save as PLY", "photo to scene"
 
+SIDE = 1536  # pixels along SHARP's picture
+CELL = 2
+# Boxes in front of the wall: left, top, right, bottom as shares of the picture, and their depth in metres.
+# They cover less than a tenth, so that paths look at the wall.
+BOXES = ((0.15, 0.20, 0.30, 0.40, 3.5), (0.60, 0.35, 0.80, 0.55, 3.0), (0.35, 0.70, 0.50, 0.80, 4.0))
+WALL_M = 6.0
+BEHIND = 1.02  # the second layer's depth over the first's
+SPREAD_PX = 1.3
+
+Peaks = Mapping[str, float]  # a row of the limits → its best run, operations or bytes a millisecond
+
+
+class Row(NamedTuple):
+    """One measured figure."""
+
+    name: str
+    values: Values
+    unit: str = "ms"
+    limit_ms: float | None = None  # the least time that it needs, at the measured limit that holds for it
+
+
+Section = tuple[list[Row], dict[str, Any]]  # figures; sizes and settings, ready for JSON
+
 
 def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
     """Products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written; best runs.
 
     `share` is of the full sizes.
     """
-    runs, side, rows = max(runs, LIMIT_RUNS), round(share * MATRIX_SIDE), []
+    side, source = round(share * MATRIX_SIDE), torch.zeros(round(share * COPY_MB * 2**20) // 4, device=device)
+    work: dict[str, tuple[Task, float, str]] = {}
     for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
         a, b = (torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype) for k in range(2))
-        times = _time_calls(runs, {"": functools.partial(torch.mm, a, b, out=torch.empty_like(a))}, device)[""]
-        rows.append(Timing(PRODUCT.format(name), tuple(2 * side**3 / (ms / MS) / 1e9 for ms in times), "GFLOP/s"))
-    source = torch.zeros(round(share * COPY_MB * 2**20) // 4, device=device)
-    times = _time_calls(runs, {"": functools.partial(torch.ones_like(source).copy_, source)}, device)[""]
-    rows.append(Timing(COPY, tuple(2 * source.nbytes / (ms / MS) / 1e9 for ms in times), "GB/s"))
-    return Section(tuple(rows), {"matrices": side, "copy_mb": share * COPY_MB})
+        out = torch.empty_like(a)
+        product: Task = lambda _, a=a, b=b, out=out: torch.mm(a, b, out=out)  # type: ignore[misc]  # noqa: E731
+        work[PRODUCT.format(name)] = (product, 2 * side**3, "GFLOP/s")
+    target = torch.ones_like(source)
+    work[COPY] = (lambda _: target.copy_(source), 2 * source.nbytes, "GB/s")
+    rows = []
+    for name, (task, amount, unit) in work.items():
+        times = measure(max(runs, LIMIT_RUNS), {name: task}, device)[name, TOTAL]
+        rows.append(Row(name, amount / (times / MS) / 1e9, unit))
+    return rows, {"matrices": side, "copy_mb": share * COPY_MB}
 
 
-def _time_calls(
-    runs: int, calls: Mapping[str, Callable[[], object]], device: torch.device = CPU
-) -> dict[str, tuple[float, ...]]:
-    """Milliseconds of calls that take turns."""
-    tasks: dict[str, Task] = {name: lambda _, call=call: call() for name, call in calls.items()}  # type: ignore[misc]
-    times = measure(runs, tasks, device)
-    return {name: times[name, TOTAL] for name in calls}
-
-
-def renderer_section(runs: int, side: int) -> Section:
+def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     """The CPU renderer on a scene of SHARP's size: stages, a whole call, the naive twin, a redraw.
 
     Raises:
@@ -95,14 +108,14 @@ def renderer_section(runs: int, side: int) -> Section:
         "naive": lambda lap: naive_render(scene, camera, lap),
     }
     times = measure(runs, tasks)
-    rows = [Timing(stage, times["ours", stage]) for stage in RENDER_STAGES]
-    least = float(len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES)  # read once, written once
-    rows.append(Timing(CALL, times["call", TOTAL], bytes=least))
-    rows += [Timing(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
-    rows.append(Timing("naive: whole call", times["naive", TOTAL]))
-    rows.append(Timing(NAIVE_RATIO, _ratios(times["naive", TOTAL], times["call", TOTAL]), "×"))
+    call, naive = times["call", TOTAL], times["naive", TOTAL]
+    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that are read once or written once
+    rows = [Row(stage, times["ours", stage]) for stage in RENDER_STAGES]
+    rows.append(Row(CALL, call, limit_ms=least / peaks[COPY]))
+    rows += [Row(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
+    rows += [Row("naive: whole call", naive), Row(NAIVE_RATIO, naive / call, "×")]
     redrawn, facts = _redraw(runs, scene, camera)
-    return Section((*rows, *redrawn), {"gaussians": len(scene), "width": side, "height": side, **facts})
+    return [*rows, *redrawn], {"gaussians": len(scene), "width": side, "height": side, **facts}
 
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
@@ -120,7 +133,7 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     lap("blend")
 
 
-def _redraw(runs: int, scene: Gaussians, camera: Camera) -> tuple[list[Timing], dict[str, int]]:
+def _redraw(runs: int, scene: Gaussians, camera: Camera) -> Section:
     """A band of the scene again on top: on the drawing that the renderer remembers, in its tiles anew, and all anew."""
     u = camera.project(scene.means)[0][:, 0] / camera.width
     edges = [0.5 - BAND / 2 + BAND * k / BAND_SETS for k in range(BAND_SETS + 1)]
@@ -128,26 +141,15 @@ def _redraw(runs: int, scene: Gaussians, camera: Camera) -> tuple[list[Timing], 
     tiles = torch.stack([touched_tiles(part, camera) for part in more]).any(0)
     keeper, sets = CpuRenderer(), [scene, *more]
     under = keeper.render(scene, camera)
-    calls: dict[str, Callable[[], Rendering]] = {
-        "remembered": lambda: keeper.render(sets, camera, tiles=tiles, onto=under),
-        "anew": lambda: CpuRenderer().render(sets, camera, tiles=tiles, onto=under),
-        "all": lambda: CpuRenderer().render(sets, camera),
+    tasks: dict[str, Task] = {
+        "redraw with a few sets more, remembered": lambda _: keeper.render(sets, camera, tiles=tiles, onto=under),
+        "redraw of the same tiles, anew": lambda _: CpuRenderer().render(sets, camera, tiles=tiles, onto=under),
+        "redraw of all tiles, anew": lambda _: CpuRenderer().render(sets, camera),
     }
-    if not torch.equal(calls["remembered"]().rgb, calls["anew"]().rgb):
-        raise RuntimeError("a remembered drawing and a new one differ")
-    times = _time_calls(runs, calls)
-    rows = [
-        Timing("redraw with a few sets more, remembered", times["remembered"]),
-        Timing("redraw of the same tiles, anew", times["anew"]),
-        Timing("redraw of all tiles, anew", times["all"]),
-        Timing("same tiles anew over remembered", _ratios(times["anew"], times["remembered"]), "×"),
-    ]
-    facts = {"redraw_sets": BAND_SETS, "redraw_gaussians": sum(map(len, more)), "redraw_tiles": int(tiles.sum())}
-    return rows, facts
-
-
-def _ratios(over: tuple[float, ...], under: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(a / b for a, b in zip(over, under, strict=True))
+    times = measure(runs, tasks)
+    rows = [Row(name, times[name, TOTAL]) for name in tasks]
+    rows.append(Row("same tiles anew over remembered", rows[1].values / rows[0].values, "×"))
+    return rows, {"redraw_sets": BAND_SETS, "redraw_gaussians": sum(map(len, more)), "redraw_tiles": int(tiles.sum())}
 
 
 def completion_section(
@@ -161,26 +163,13 @@ def completion_section(
     """One view, 5 % of which are holes, beside the base's render of it; without a network the seeds fill the holes."""
     disparity, camera = find_view(base, photo_camera, renderer)
     completer = Completer(base, photo_camera, renderer, network)
-    before = renderer.render(base, camera)
-    tasks: dict[str, Task] = {"view": lambda lap: complete_in_laps(completer, camera, lap)}
-    if network is not None:
-        cues = Cues.of(before)
-        seeds = make_seeds(cues, camera, photo_camera)
-        rim = Rim.of(cues, seeds, camera, photo_camera)
-        ask = functools.partial(predict_deltas, network, cues, seeds, rim)
-        tasks[NETWORK] = lambda _: ask()
-    times = measure(runs, tasks, device)
-    shield, place, redraw = (times["view", stage] for stage in EXTRA)
-    added = tuple(map(sum, zip(place, redraw, strict=True)))
-    rows = [Timing(RENDER, times["view", "view"]), Timing(SHIELD, shield), Timing(PLACE, place)]
-    if network is not None:
-        dtype = "bf16" if pick_dtype("auto", CPU) == torch.bfloat16 else "fp32"
-        rows.append(Timing(NETWORK, times[NETWORK, TOTAL], flops=count_flops(ask), dtype=dtype))
-    rows += [Timing(REDRAW, redraw), Timing(ADDED, added)]
-    rows.append(Timing(IN_RENDERS, _ratios(added, times["view", "view"]), "×"))
+    times = measure(runs, {"": lambda lap: complete_in_laps(completer, camera, lap)}, device)
+    render, shield, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
+    rows = [Row(RENDER, render), Row(SHIELD, shield), Row(PLACE, place), Row(REDRAW, redraw)]
+    rows += [Row(ADDED, place + redraw), Row(IN_RENDERS, (place + redraw) / render, "×")]
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
-    facts |= {"holes": hole_area_ratio(before.alpha), "added": len(completer.complete_view(camera))}
-    return Section(tuple(rows), facts)
+    holes = hole_area_ratio(renderer.render(base, camera).alpha)
+    return rows, {**facts, "holes": holes, "added": len(completer.complete_view(camera))}
 
 
 def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES) -> tuple[float, Camera]:
@@ -190,7 +179,6 @@ def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float 
         InputError: there is no such view.
     """
     even, depths = camera.even(), DepthRange.of(base)
-
     low, high = 0.0, MAX_DISPARITY
     for _ in range(HALVINGS):
         middle = (low + high) / 2
@@ -242,29 +230,18 @@ def video_section(
             lap(EACH)
 
     times = measure(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
-    scenes, lifts, codes = (np.array(times["scene", stage]) for stage in (TOTAL, LIFT, ENCODE))
-    each, shields = (np.array(times["scratch", stage]) for stage in (EACH, SHIELDS))
-    anew = lifts + each + shields + codes
+    whole, each, shields = times["scene", TOTAL], times["scratch", EACH], times["scratch", SHIELDS]
+    anew = times["scene", LIFT] + each + shields + times["scene", ENCODE]
     kept = anew - shields * (frames - 1) / frames
-    rows = [Timing(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
-    rows += [
-        Timing(SCENE, tuple(scenes)),
-        Timing(EACH, tuple(each)),
-        Timing(SHIELDS, tuple(shields)),
-        Timing(SCRATCH, tuple(anew)),
-    ]
-    rows += [Timing(SCENE_RATIO, tuple(anew / scenes), "×"), Timing(KEPT_RATIO, tuple(kept / scenes), "×")]
+    rows = [Row(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
+    rows += [Row(SCENE, whole), Row(EACH, each), Row(SHIELDS, shields), Row(SCRATCH, anew)]
+    rows += [Row(SCENE_RATIO, anew / whole, "×"), Row(KEPT_RATIO, kept / whole, "×")]
     facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
-    return Section(tuple(rows), {**facts, "width": path[0].width, "height": path[0].height})
+    return rows, {**facts, "width": path[0].width, "height": path[0].height}
 
 
-def sharp_photo(side: int = FULL.side) -> Photo:
-    """Any photo: SHARP's time does not depend on what it shows."""
-    return Photo(torch.rand(side, side, 3), 1.2 * side, "", Path("photo.png"))
-
-
-def sharp_section(runs: int, base: SharpBase, photo: Photo, device: torch.device = CPU) -> Section:
-    """A photo to a scene on disk by SHARP, stage by stage."""
+def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU) -> Section:
+    """A photo to a scene on disk by SHARP, stage by stage; its time does not depend on what the photo shows."""
     count = 0
 
     def whole(lap: Lap) -> None:
@@ -280,15 +257,65 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, device: torch.device
 
     # The run that is counted warms up; a compiled network hides its operations, and warms up within `measure`.
     flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
-    times = measure(runs, {"sharp": whole}, device, warm=flops > 0)
-    rows = [Timing(FORWARD, times["sharp", FORWARD], flops=flops, dtype=base.precision)]
-    rows += [Timing(name, times["sharp", name]) for name in (UNPROJECT, SAVE)]
-    rows.append(Timing(WHOLE, times["sharp", TOTAL]))
-    facts = {
-        "weights": base.weights,
-        "precision": base.precision,
-        "side": base.network.config.side,
-        "windows": base.windows,
-    }
-    facts |= {"compiled": base.compiled, "compile_problem": base.compile_problem or None}
-    return Section(tuple(rows), {**facts, "gaussians": count})
+    times = measure(runs, {"": whole}, device, warm=flops > 0)
+    least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
+    rows = [Row(FORWARD, times["", FORWARD], limit_ms=least)]
+    rows += [Row(UNPROJECT, times["", UNPROJECT]), Row(SAVE, times["", SAVE]), Row(WHOLE, times["", TOTAL])]
+    facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
+    facts |= {"windows": base.windows, "compiled": base.compiled, "compile_problem": base.compile_problem or None}
+    return rows, {**facts, "gaussians": count}
+
+
+def count_flops(call: Callable[[], Any]) -> float:
+    """Operations of the products, convolutions and attention in a call: two for each multiplication and addition."""
+
+    def attention(query: Any, key: Any, value: Any, *rest: Any, **more: Any) -> Any:
+        return sdpa_flop_count(query, key, value)  # type: ignore[no-untyped-call]
+
+    # PyTorch counts attention on GPUs alone.
+    mapping = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: attention}
+    with FlopCounterMode(display=False, custom_mapping=mapping) as counter:
+        call()
+    return float(counter.get_total_flops())
+
+
+def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
+    """Two layers of (side/2)² Gaussians, aligned with the pixels of a photo, over smooth but varied depths.
+
+    Opacities lie between 0.04 and 0.99, so that more Gaussians are drawn than a surface would need.
+    """
+    generator = torch.Generator().manual_seed(0)
+    camera, uv, xs, ys, grid = _pixels(side)
+    layers, n = [], grid * grid
+    for layer in range(2):
+        waves = 1.5 * torch.sin(9 * xs / grid) * torch.cos(7 * ys / grid)
+        z = 3 + 2 * layer + waves + 0.05 * torch.rand(grid, grid, generator=generator)
+        scales = (0.6 + 0.8 * torch.rand(n, 3, generator=generator)) * z.reshape(n, 1) / camera.focal[0]
+        quats, opacities = torch.randn(n, 4, generator=generator), 0.04 + 0.95 * torch.rand(n, generator=generator)
+        colors = torch.rand(n, 3, generator=generator)
+        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, opacities, colors))
+    return Gaussians.cat(layers), camera
+
+
+def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
+    """As many Gaussians, closed as the photo's camera sees them: boxes before a wall, which show holes from aside."""
+    camera, uv, xs, ys, grid = _pixels(side)
+    n, depth = grid * grid, torch.full((grid, grid), WALL_M)
+    for left, top, right, bottom, metres in BOXES:
+        depth[int(top * grid) : int(bottom * grid), int(left * grid) : int(right * grid)] = metres
+    hues = (0.4, 0.45, 0.55)
+    waves = [0.5 + hue * torch.sin(20 * k * xs / grid + 3 * depth + k * ys / 9) / 2 for k, hue in enumerate(hues, 1)]
+    quats, colors = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1), torch.stack(waves, dim=-1).reshape(n, 3)
+    layers = []
+    for z in (depth, BEHIND * depth):
+        scales = (SPREAD_PX * z.reshape(n, 1) / camera.focal[0]).expand(n, 3).contiguous()
+        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, torch.full((n,), 0.99), colors))
+    return Gaussians.cat(layers), camera
+
+
+def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
+    """The photo's camera; centres of its cells [g, g, 2]; their columns and rows [g, g]; how many there are a side."""
+    grid = side // CELL
+    ys, xs = torch.meshgrid(torch.arange(grid), torch.arange(grid), indexing="ij")
+    uv = (torch.stack([xs, ys], dim=-1) + 0.5) * (side / grid)
+    return Camera.from_focal(1.2 * side, side, side), uv, xs, ys, grid
