@@ -12,14 +12,10 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from spackle.camera import Camera
 from spackle.camera_path import Keyframe
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path
-from spackle.gaussians import quat_to_matrix
 
 GOOD: dict[str, Any] = {
     "width": 640,
@@ -39,11 +35,10 @@ def write(path: Path, content: Any) -> Path:
 
 
 def refused(load: Callable[[Path], object], path: Path, says: str) -> None:
-    """In one line that begins with the file's name."""
+    """In a message that begins with the file's name."""
     with pytest.raises(InputError, match=says) as caught:
         load(path)
     assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
 
 
 def test_reads_the_documented_format(tmp_path: Path) -> None:
@@ -54,32 +49,10 @@ def test_reads_the_documented_format(tmp_path: Path) -> None:
     assert first.K.dtype == first.world_to_camera.dtype == torch.float32
     assert first.K.tolist() == GOOD["frames"][0]["K"]
     assert first.position.tolist() == [-0.5, 0, 2]
+    assert torch.equal(first.world_to_camera, torch.tensor(GOOD["frames"][0]["world_to_camera"]))
     del content["width"], content["frames"][0]
     assert load_cameras(write(tmp_path / "c.json", content))[0].width == 100
-
-
-@given(
-    st.lists(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1), min_size=1, max_size=3),
-    st.floats(1, 1e5, width=32),
-    st.tuples(*[st.floats(-1e3, 1e3, width=32)] * 5),
-    st.integers(1, 16_384),
-)
-def test_round_trip(tmp_path_factory: Any, quats: Any, focal: float, numbers: Any, width: int) -> None:
-    cameras = []
-    for k, quat in enumerate(quats):
-        matrix = torch.eye(4)
-        matrix[:3, :3] = quat_to_matrix(torch.tensor(quat, dtype=torch.float64))
-        matrix[:3, 3] = torch.tensor(numbers[:3])
-        K = torch.tensor([[focal, 0, numbers[3]], [0, focal * 2, numbers[4]], [0, 0, 1]])
-        cameras.append(Camera(K, matrix, width, 1 + k))
-    frames = [{"K": c.K.tolist(), "world_to_camera": c.world_to_camera.tolist(), "height": c.height} for c in cameras]
-    path = write(tmp_path_factory.getbasetemp() / "cameras.json", {"width": width, "frames": frames})
-    found = load_cameras(path)
-    assert len(found) == len(cameras)
-    for a, b in zip(found, cameras, strict=True):
-        assert torch.equal(a.K, b.K)
-        assert torch.equal(a.world_to_camera, b.world_to_camera)
-        assert (a.width, a.height) == (b.width, b.height)
+    assert len(load_cameras(write(tmp_path / "c.json", pose(0, 0, 1.0003)))) == 1  # nearly rigid
 
 
 def changed(path: list[Any], value: Any) -> dict[str, Any]:
@@ -102,43 +75,26 @@ def pose(row: int, column: int, value: Any) -> dict[str, Any]:
 BAD: dict[str, tuple[Any, str]] = {
     "empty": ("", "empty"),
     "text": ("hello", "not JSON"),
-    "half": (json.dumps(GOOD)[:-40], "not JSON"),
     "deep": ("[" * 100_000, "not JSON"),
     "list": ([], "frames"),
-    "no frames": ({"width": 1, "height": 1}, "frames"),
-    "zero frames": (changed(["frames"], []), "frames"),
-    "frames are text": (changed(["frames"], "abc"), "frames"),
     "many": (changed(["frames"], [0] * 10_001), "too many"),
     "frame is a number": (changed(["frames"], [3]), "frame 0: must be an object"),
     "no K": (changed(["frames", 0, "K"], None), "K must be a list"),
-    "short K": (changed(["frames", 0, "K"], [[1, 2, 3]]), "K must be a list"),
-    "flat pose": (changed(["frames", 0, "world_to_camera"], [1.0] * 16), "world_to_camera must be a list"),
     "ragged": (changed(["frames", 0, "K", 1], [1, 2]), "K must be a list"),
-    "word": (k(0, 2, "320"), "K must be a list"),
     "bool": (k(0, 2, True), "K must be a list"),
     "NaN": (k(0, 2, math.nan), "finite"),
     "inf": (pose(0, 3, math.inf), "finite"),
     "huge whole number": (k(0, 2, 10**400), "finite|not JSON"),
     "zero focal": (k(0, 0, 0), "focal"),
-    "negative focal": (k(1, 1, -5), "focal"),
     "K's last row": (k(2, 2, 2), "last row of K"),
     "skew": (k(0, 1, 3), "skew"),
     "scaled": (pose(0, 0, 1.01), "rotation"),
     "mirror": (pose(0, 0, -1), "rotation"),
-    "zeros": (changed(["frames", 0, "world_to_camera"], [[0] * 4] * 4), "rotation"),
     "pose's last row": (pose(3, 2, 0.5), "last row of world_to_camera"),
     "zero width": (changed(["width"], 0), "width"),
     "giant": (changed(["height"], 16_385), "height"),
     "fraction": (changed(["width"], 640.5), "width"),
-    "true width": (changed(["width"], True), "width"),
-    "no width": (changed(["width"], None), "width"),
 }
-
-
-@pytest.mark.parametrize("kind", BAD)
-def test_a_bad_camera_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
-    content, says = BAD[kind]
-    refused(load_cameras, write(tmp_path / "c.json", content), says)
 
 
 def path_content(**changes: Any) -> dict[str, Any]:
@@ -148,16 +104,13 @@ def path_content(**changes: Any) -> dict[str, Any]:
 
 def with_key(**changes: Any) -> dict[str, Any]:
     """A file whose second key is changed; None takes a name away."""
-    made = path_content()
-    key = made["keyframes"][1] | changes
-    made["keyframes"][1] = {name: value for name, value in key.items() if value is not None}
-    return made
+    first, second = path_content()["keyframes"]
+    return path_content(keyframes=[first, {n: v for n, v in (second | changes).items() if v is not None}])
 
 
 def test_a_path_file_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "p.json"
-    file.write_text(json.dumps(with_key(up=[0, -1, 0.1], fov=50) | {"closed": True, "unit": "disparity"}))
-    path = load_path(file)
+    content = with_key(up=[0, -1, 0.1], fov=50) | {"closed": True, "unit": "disparity"}
+    path = load_path(write(tmp_path / "p.json", content))
     assert path.keys == (
         Keyframe(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
         Keyframe(1.5, (0.2, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, -1.0, 0.1), 50.0),
@@ -168,18 +121,14 @@ def test_a_path_file_is_read(tmp_path: Path) -> None:
 BAD_PATHS: dict[str, tuple[Any, str]] = {
     "not JSON": ("{", "not JSON"),
     "deep": ("[" * 100_000, "not JSON"),
-    "a list": ([], "needs a list"),
     "no list": ({"keyframes": {}}, "needs a list"),
     "no key": (path_content(keyframes=[]), "two keyframes, got 0"),
-    "one key": (path_content(keyframes=path_content()["keyframes"][:1]), "two keyframes, got 1"),
     "too many": (path_content(keyframes=[0] * 10_001), "too many"),
     "unknown name": (path_content(loop=1), "unknown name 'loop'"),
     "closed 1": (path_content(closed=1), '"closed"'),
     "unit": (path_content(unit="feet"), '"unit"'),
-    "unit list": (path_content(unit=[]), '"unit"'),
     "no object": (path_content(keyframes=[1, 2]), "keyframe 0: must be an object"),
     "NaN": (with_key(eye=[math.nan, 0, 0]), 'keyframe 1: "eye" must be a finite number'),
-    "infinite time": (with_key(time=math.inf), 'keyframe 1: "time" must be a finite number'),
     "huge": (with_key(eye=[10**400, 0, 0]), 'keyframe 1: "eye"'),
     "a word": (with_key(eye=["left", 0, 0]), 'keyframe 1: "eye" must hold numbers, not "left"'),
     "true": (with_key(time=True), 'keyframe 1: "time" must hold numbers, not true'),
@@ -190,22 +139,21 @@ BAD_PATHS: dict[str, tuple[Any, str]] = {
     "up along": (with_key(up=[0.2, 0, -3]), "keyframe 1: up lies along the view"),
     "no up": (with_key(up=[0, 0, 0]), "keyframe 1: up has no length"),
     "wide": (with_key(fov=179), "keyframe 1: fov must be from 1 to 170"),
-    "fov 0": (with_key(fov=0), "keyframe 1: fov"),
     "same time": (with_key(time=0), "times must increase, by a microsecond at least: keyframe 1 is at 0 s"),
-    "hardly later": (with_key(time=1e-300), "times must increase, by a microsecond"),
-    "back in time": (with_key(time=-1), "times must increase"),
     "twice": ('{"keyframes": [], "keyframes": []}', "'keyframes' is there twice"),
 }
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_camera_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
+    content, says = BAD[kind]
+    refused(load_cameras, write(tmp_path / "c.json", content), says)
 
 
 @pytest.mark.parametrize("kind", BAD_PATHS)
 def test_a_bad_path_file_is_refused_with_the_reason(tmp_path: Path, kind: str) -> None:
     content, says = BAD_PATHS[kind]
     refused(load_path, write(tmp_path / "p.json", content), re.escape(says))
-
-
-def test_a_nearly_rigid_pose_is_taken(tmp_path: Path) -> None:
-    assert len(load_cameras(write(tmp_path / "c.json", pose(0, 0, 1.0003)))) == 1
 
 
 @pytest.mark.parametrize(("load", "kind"), [(load_cameras, "camera file"), (load_path, "path file")])

@@ -6,22 +6,21 @@ import contextlib
 import math
 import os
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from photos import read_ply
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import (
     atomic_path,
-    check_writable,
     load_ply,
     load_ply_base_count,
     load_ply_camera,
@@ -29,7 +28,7 @@ from spackle.formats import (
     save_ply,
 )
 from spackle.formats.ply import BLOCK
-from spackle.gaussians import Gaussians, quat_to_matrix
+from spackle.gaussians import Gaussians
 
 PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -45,20 +44,6 @@ def scene(count: int, seed: int = 0) -> Gaussians:
         torch.rand(count, generator=g),
         torch.rand(count, 3, generator=g),
     )
-
-
-def read_independently(path: Path) -> dict[str, list[float]]:
-    """The plainest reader of a binary little-endian file of floats."""
-    content = path.read_bytes()
-    header, body = content.split(b"end_header\n", 1)
-    lines = header.decode("ascii").splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    assert lines[2].startswith("element vertex ")
-    count = int(lines[2].split()[2])
-    names = [line.removeprefix("property float ") for line in lines[3:]]
-    rows = list(struct.iter_unpack(f"<{len(names)}f", body))
-    assert len(rows) == count
-    return {name: [row[k] for row in rows] for k, name in enumerate(names)}
 
 
 def raw(gaussians: Gaussians, linear: bool = False) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -105,61 +90,35 @@ def close(a: Gaussians, b: Gaussians, tolerance: float = 2e-5) -> None:
         torch.testing.assert_close(x, y, rtol=tolerance, atol=tolerance)
 
 
+def written(path: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """What a reader that shares no code with ours finds in a file, [N, 17]."""
+    ply = read_ply(path)
+    assert ply.names == PROPERTIES
+    return np.frombuffer(ply.body, "<f4").reshape(ply.count, -1)
+
+
 def test_independent_reader_finds_what_was_meant(tmp_path: Path) -> None:
     gaussians = scene(300)
     save_ply(gaussians, tmp_path / "a.ply")
-    found = read_independently(tmp_path / "a.ply")
-    assert list(found) == PROPERTIES
-    expected = raw(gaussians)
+    found, expected = written(tmp_path / "a.ply"), raw(gaussians)
     expected[:, 10:] /= np.linalg.norm(expected[:, 10:], axis=1, keepdims=True)
-    for k, name in enumerate(GIVEN):
-        np.testing.assert_allclose(found[name], expected[:, k], rtol=1e-5, atol=2e-5, err_msg=name)
-    assert not any(found["nx"] + found["ny"] + found["nz"])
-
-
-@st.composite
-def any_gaussians(draw: st.DrawFn) -> Gaussians:
-    count = draw(st.integers(1, 4))
-
-    def tensor(width: int, low: float, high: float) -> torch.Tensor:
-        values = draw(st.lists(st.floats(low, high, width=32), min_size=count * width, max_size=count * width))
-        return torch.tensor(values, dtype=torch.float32).reshape(count, width)
-
-    return Gaussians(
-        tensor(3, -1e6, 1e6), tensor(4, -4, 4), tensor(3, 2**-60, 2**60), tensor(1, 0, 1)[:, 0], tensor(3, 0, 1)
-    )
-
-
-@settings(deadline=None)
-@given(any_gaussians())
-def test_round_trip_of_anything(tmp_path_factory: Any, gaussians: Gaussians) -> None:
-    path = tmp_path_factory.getbasetemp() / "any.ply"
-    save_ply(gaussians, path)
-    found = load_ply(path)
-    assert torch.equal(found.means, gaussians.means)
-    torch.testing.assert_close(found.scales, gaussians.scales, rtol=2e-5, atol=0)
-    torch.testing.assert_close(found.opacities, gaussians.opacities, rtol=1e-5, atol=2e-7)
-    torch.testing.assert_close(found.colors, gaussians.colors, rtol=1e-5, atol=2e-6)
-    whole = gaussians.quats.norm(dim=-1) > 1e-6
-    rotation = quat_to_matrix(gaussians.quats.double()).float()
-    torch.testing.assert_close(quat_to_matrix(found.quats)[whole], rotation[whole], rtol=0, atol=1e-5)
-    torch.testing.assert_close(found.quats.norm(dim=-1)[whole], torch.ones(int(whole.sum())))
+    np.testing.assert_allclose(np.delete(found, [3, 4, 5], axis=1), expected, rtol=1e-5, atol=2e-5)
+    assert not found[:, 3:6].any()
+    strided = Gaussians(*(torch.stack([t, t], dim=-1).double().requires_grad_()[..., 0] for t in gaussians.tensors))
+    save_ply(strided, tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
     opacities = torch.tensor([0.0, 1.0, 0.999, 0.9999, 0.99999, 1e-6])
-    gaussians = Gaussians(
-        torch.zeros(6, 3),
-        torch.zeros(6, 4),
-        torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e30, torch.inf])[:, None].repeat(1, 3),
-        opacities,
-        torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0, 1e-5])[:, None].repeat(1, 3),
-    )
-    save_ply(gaussians, tmp_path / "a.ply")
-    assert all(math.isfinite(v) for column in read_independently(tmp_path / "a.ply").values() for v in column)
+    scales = torch.tensor([0.0, 1e-30, 1e-3, 1.0, 1e30, torch.inf])[:, None].repeat(1, 3)
+    colors = torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0, 1e-5])[:, None].repeat(1, 3)
+    save_ply(Gaussians(torch.full((6, 3), 1e6), torch.zeros(6, 4), scales, opacities, colors), tmp_path / "a.ply")
+    assert np.isfinite(written(tmp_path / "a.ply")).all()
     found = load_ply(tmp_path / "a.ply")
     torch.testing.assert_close(found.opacities, opacities, rtol=2e-7, atol=1e-9)
-    torch.testing.assert_close(found.colors, gaussians.colors.clamp(0, 1), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.colors, colors.clamp(0, 1), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.scales[1:-1], scales[1:-1], rtol=2e-5, atol=0)
     assert found.quats.tolist() == [[1, 0, 0, 0]] * 6
     assert 0 < found.scales.min() < 1e-30
     assert torch.isfinite(found.scales).all()
@@ -186,14 +145,6 @@ def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: i
     assert all(torch.equal(a, b[: len(a)]) for a, b in zip(loaded.tensors, both.tensors, strict=True))
 
 
-def test_other_devices_types_and_strides(tmp_path: Path) -> None:
-    gaussians = scene(10)
-    save_ply(gaussians, tmp_path / "a.ply")
-    strided = Gaussians(*(torch.stack([t, t], dim=-1).double().requires_grad_()[..., 0] for t in gaussians.tensors))
-    save_ply(strided, tmp_path / "b.ply")
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
 @pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
@@ -207,14 +158,9 @@ def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
     (tmp_path / "a.ply").write_bytes(before + b"end_header\n" + first + body)
     close(load_ply(tmp_path / "a.ply"), gaussians)
     assert load_ply_camera(tmp_path / "a.ply") is None
-
-
-def test_windows_line_ends_and_a_mesh_after_it(tmp_path: Path) -> None:
-    after = "element face 1\nproperty list uchar int vertex_indices\n"
-    content = ply(raw(scene(3)), GIVEN, after=after, tail=b"\x03" + b"\0" * 12)
-    header, body = content.split(b"end_header\n", 1)
-    (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
-    close(load_ply(tmp_path / "a.ply"), scene(3))
+    header, body = ply(rows, shuffled, kind, order, after=LISTED, tail=b"3 0 0 0\n").split(b"end_header\n", 1)
+    (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)  # and a mesh after it
+    close(load_ply(tmp_path / "a.ply"), gaussians)
 
 
 @pytest.mark.parametrize(("color_space", "linear"), [(0, False), (1, True)])
@@ -227,9 +173,6 @@ def test_sharp_file(tmp_path: Path, color_space: int, linear: bool) -> None:
     assert camera is not None
     assert (camera.width, camera.height, camera.focal) == (640, 480, (500, 500))
     assert torch.equal(camera.world_to_camera, torch.eye(4))
-    (tmp_path / "a.ply").write_bytes(content[:-4])
-    with pytest.raises(InputError, match="cut off"):
-        load_ply(tmp_path / "a.ply")
 
 
 def test_older_sharp_file(tmp_path: Path) -> None:
@@ -284,6 +227,7 @@ def test_what_a_comment_keeps(tmp_path: Path) -> None:
 
 GOOD = ply(raw(scene(3)), GIVEN)
 ASCII = ply(raw(scene(3)), GIVEN, order="ascii")
+SHARP = ply(raw(scene(3)), GIVEN, after=SHARP_AFTER, tail=sharp_tail(0))
 LISTED = "element face 1\nproperty list uchar int vertex_indices\n"
 
 
@@ -299,34 +243,26 @@ BAD: dict[str, tuple[Any, str]] = {
     "empty": (b"", "empty"),
     "text": (b"hello\nthere\n", "not a PLY"),
     "cut": (GOOD[:-1], "cut off"),
-    "cut header": (GOOD[:200], "no end"),
     "endless header": (b"ply\n" + b"comment x\n" * 100_000, "no end"),
-    "one line": (b"ply\n" + b"x" * 200_000, "no end"),
     "a million million": (GOOD.replace(b"vertex 3", b"vertex 1000000000000"), "cut off"),
-    "a long number": (GOOD.replace(b"vertex 3", b"vertex " + b"9" * 5000), "header"),
     "negative": (GOOD.replace(b"vertex 3", b"vertex -3"), "header"),
-    "fraction": (GOOD.replace(b"vertex 3", b"vertex 3.5"), "header"),
     "no vertices": (GOOD.replace(b"vertex 3", b"vertex 0"), "no Gaussians"),
     "other element": (GOOD.replace(b"vertex 3", b"vortex 3"), "0 elements"),
     "missing": (GOOD.replace(b"scale_1", b"scale_9"), "have no scale_1"),
     "mesh": (ply(np.zeros((3, 3)), ["x", "y", "z"], after=LISTED), "not a Gaussian scene"),
     "twice": (GOOD.replace(b"scale_1", b"scale_0"), "header"),
     "type": (GOOD.replace(b"property float opacity", b"property half opacity"), "header"),
-    "format": (GOOD.replace(b"little", b"middle"), "header"),
-    "no format": (GOOD.replace(b"format binary_little_endian 1.0\n", b""), "header"),
     "property first": (GOOD.replace(b"element vertex 3\n", b""), "header"),
     "list in vertex": (GOOD.replace(b"end_header", b"property list uchar int i\nend_header"), "lists in"),
     "list before": (ply(raw(scene(3)), GIVEN, head=LISTED), "lists in"),
     "NaN": (spoiled(0, math.nan), "2 of 3 Gaussians are not finite"),
     "NaN opacity": (spoiled(6, math.nan), "2 of 3 Gaussians are not finite"),
-    "inf": (spoiled(4, math.inf), "2 of 3"),
-    "inf rotation": (spoiled(13, -math.inf), "2 of 3"),
     "large scale": (spoiled(7, 1000), "2 of 3"),
     "beyond float32": (spoiled(1, 1e200, "double"), "2 of 3"),
+    "SHARP, cut": (SHARP[:-4], "cut off"),
     "ascii cut": (ASCII[:-300], "cut off"),
     "ascii words": (ASCII.replace(b"end_header\n", b"end_header\nzero "), "no number"),
     "ascii surplus": (ASCII[:-1] + b" 1 2 3\n", "exactly 14 numbers"),
-    "ascii many": (ASCII.replace(b"vertex 3", b"vertex 1000000000000"), "cut off"),
 }
 
 
@@ -341,10 +277,6 @@ def test_bad_files(tmp_path: Path, kind: str) -> None:
     with pytest.raises(InputError, match=says) as caught:
         load_ply(path)
     assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-SHARP = ply(raw(scene(3)), GIVEN, after=SHARP_AFTER, tail=sharp_tail(0))
 
 
 @given(st.sampled_from([GOOD, ASCII, SHARP]), st.data())
@@ -366,27 +298,19 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     before = path.read_bytes()
     broken = scene(2 * BLOCK)
     broken.means[-1, 0] = math.nan
-    with pytest.raises(ValueError, match="not all finite"):
-        save_ply(broken, path)
-    with pytest.raises(ValueError, match="not all finite"):
-        save_ply(broken, tmp_path / "new.ply")
+    for name in ("a.ply", "new.ply"):
+        with pytest.raises(ValueError, match="not all finite"):
+            save_ply(broken, tmp_path / name)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["a.ply"]
-
-
-@contextlib.contextmanager
-def interrupted(path: Path) -> Iterator[None]:
-    with atomic_path(path) as temporary:
-        temporary.write_text("half")
-        yield
-        raise KeyboardInterrupt
 
 
 def test_atomic_path(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), interrupted(path):
-        assert path.read_text() == "old"
+    with contextlib.suppress(KeyboardInterrupt), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
     assert os.listdir(tmp_path) == ["a.txt"]
     assert path.read_text() == "old"
     link = tmp_path / "link.txt"
@@ -406,9 +330,6 @@ def test_atomic_path(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["nowhere/a.ply", "file/a.ply", ".", "a\0b.ply", "n" * 300 + ".ply", "/dev/null"])
 def test_unwritable_outputs(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="cannot write") as caught:
+    with pytest.raises(InputError, match="cannot write"):
         save_ply(scene(1), tmp_path / name)
-    assert "\n" not in str(caught.value)
     assert os.listdir(tmp_path) == ["file"]
-    with contextlib.suppress(InputError):
-        check_writable(tmp_path / name)

@@ -26,24 +26,36 @@ def frames(count: int, height: int, width: int) -> list[Tensor]:
     return [torch.stack([x * (20 - k) / 20, y, 0.5 + 0.3 * torch.sin(x + y + k / 5)], dim=-1) for k in range(count)]
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
-def test_video_decodes_to_what_went_in(tmp_path: Path, height: int, width: int) -> None:
-    given = frames(12, height, width)
-    path = tmp_path / "a.mp4"
-    save_video(iter(given), path, fps=25)
+def decoded(path: Path) -> tuple[tuple[str, Fraction | None], list[av.VideoFrame], list[Tensor]]:
+    """A video's codec and rate, its frames, and their colours [H, W, 3] in 0..1."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        assert stream.codec_context.name == "h264"
-        assert stream.average_rate == 25
-        decoded = list(container.decode(stream))
-    assert len(decoded) == 12
-    for sent, got in zip(given, decoded, strict=True):
-        assert (got.height, got.width) == (height + height % 2, width + width % 2)
-        assert got.format.name == "yuv420p"
-        assert (got.colorspace, got.color_primaries, got.color_trc, got.color_range) == (1, 1, 1, 1)
-        rgb = torch.from_numpy(got.to_ndarray(format="rgb24")).float() / 255
-        assert psnr(rgb[:height, :width], sent) > 35
-    assert os.listdir(tmp_path) == ["a.mp4"]
+        kind = (stream.codec_context.name, stream.average_rate)
+        found = list(container.decode(stream))
+    return kind, found, [torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255 for frame in found]
+
+
+CUES, CLUSTER = b"\x1c\x53\xbb\x6b", b"\x1f\x43\xb6\x75"
+
+
+@pytest.mark.parametrize(("name", "codec", "index"), [("a.mp4", "h264", b"moov"), ("a.webm", "vp9", CUES)])
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
+def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
+    tmp_path: Path, name: str, codec: str, index: bytes, height: int, width: int
+) -> None:
+    given, path = frames(12, height, width), tmp_path / name
+    save_video(iter(given), path, fps=25)
+    kind, shown, colors = decoded(path)
+    assert kind[0] == codec
+    assert [round(frame.time * 25) for frame in shown] == list(range(12))
+    for sent, frame, rgb in zip(given, shown, colors, strict=True):
+        assert (frame.height, frame.width) == (height + height % 2, width + width % 2)
+        assert frame.format.name == "yuv420p"
+        assert (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range) == (1, 1, 1, 1)
+        assert psnr(rgb[:height, :width], sent) > (35 if codec == "h264" else 33)
+    content = path.read_bytes()
+    assert 0 < content.index(index) < content.index(b"mdat" if codec == "h264" else CLUSTER)
+    assert os.listdir(tmp_path) == [name]
 
 
 @pytest.mark.parametrize("color", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.2, 0.6, 0.4)])
@@ -56,22 +68,12 @@ def test_colours_are_bt709(tmp_path: Path, color: tuple[float, float, float]) ->
     assert [planes[5, 5], planes[34, 5], planes[42, 5]] == pytest.approx(expected, abs=2)
 
 
-def test_index_comes_first_and_odd_rates_last(tmp_path: Path) -> None:
-    save_video(frames(3, 16, 16), tmp_path / "a.mp4", fps=30000 / 1001)
-    content = (tmp_path / "a.mp4").read_bytes()
-    assert 0 < content.index(b"moov") < content.index(b"mdat")
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        assert container.streams.video[0].average_rate == Fraction(30000, 1001)
-
-
-def test_strange_values_are_clamped(tmp_path: Path) -> None:
-    frame = torch.full((16, 16, 3), 7.0, dtype=torch.float64, requires_grad=True)
-    with VideoWriter(tmp_path / "a.mov") as writer:
-        writer.add(frame)
-        writer.add(torch.full((16, 16, 3), math.nan))
-    with av.open(str(tmp_path / "a.mov")) as container:
-        means = [f.to_ndarray(format="rgb24").mean() for f in container.decode(video=0)]
-    assert means == pytest.approx([255, 0], abs=2)
+def test_strange_values_are_clamped_and_odd_rates_kept(tmp_path: Path) -> None:
+    bright = torch.full((16, 16, 3), 7.0, dtype=torch.float64, requires_grad=True)
+    save_video([bright, torch.full((16, 16, 3), math.nan)], tmp_path / "a.mov", fps=30000 / 1001)
+    kind, _, colors = decoded(tmp_path / "a.mov")
+    assert [float(rgb.mean()) for rgb in colors] == pytest.approx([1, 0], abs=2 / 255)
+    assert kind == ("h264", Fraction(30000, 1001))
 
 
 def failing() -> Iterator[Tensor]:
@@ -85,12 +87,13 @@ def test_a_failed_video_leaves_the_old_file(tmp_path: Path, name: str) -> None:
     path.write_bytes(b"old")
     with pytest.raises(RuntimeError, match="renderer"):
         save_video(failing(), path)
-    with pytest.raises(ValueError, match="at least one frame"):
-        save_video([], path)
-    with pytest.raises(ValueError, match="frame 1 is"):
-        save_video([*frames(1, 16, 16), *frames(1, 16, 18)], path)
-    with pytest.raises(ValueError, match="a video frame is"):
-        save_video([torch.zeros(3, 16, 16)], path)
+    for wrong, says in (
+        ([], "at least one frame"),
+        ([torch.zeros(16, 16, 3), torch.zeros(16, 18, 3)], "frame 1 is"),
+        ([torch.zeros(3, 16, 16)], "a video frame is"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            save_video(wrong, path)
     assert os.listdir(tmp_path) == [name]
     assert path.read_bytes() == b"old"
 
@@ -150,8 +153,7 @@ def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None
 
 
 def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
-    still = torch.zeros(20, 60, 3)
-    pictures = [still.clone() for _ in range(5)]
+    pictures = [torch.zeros(20, 60, 3) for _ in range(5)]
     for k, picture in enumerate(pictures):
         picture[5:15, 10 * k : 10 * k + 10] = 1.0
     save_video(pictures, tmp_path / "a.gif")
@@ -159,31 +161,14 @@ def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
         assert torch.equal(got, sent)
 
 
-def test_webm_is_vp9_in_bt709_and_plays_while_it_loads(tmp_path: Path) -> None:
-    given, path = frames(8, 47, 65), tmp_path / "a.webm"
-    save_video(given, path, fps=25)
-    content = path.read_bytes()
-    assert 0 < content.index(b"\x1c\x53\xbb\x6b") < content.index(b"\x1f\x43\xb6\x75")  # cues before clusters
-    with av.open(str(path)) as container:
-        assert container.streams.video[0].codec_context.name == "vp9"
-        decoded = list(container.decode(video=0))
-    assert [round(frame.time * 25) for frame in decoded] == list(range(8))
-    for sent, got in zip(given, decoded, strict=True):
-        assert (got.height, got.width) == (48, 66)
-        assert (got.colorspace, got.color_primaries, got.color_trc, got.color_range) == (1, 1, 1, 1)
-        assert psnr(torch.from_numpy(got.to_ndarray(format="rgb24")).float()[:47, :65] / 255, sent) > 33
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm"])
 def test_a_video_without_a_count_holds_every_repetition(tmp_path: Path, name: str) -> None:
     given = frames(7, 32, 32)
     save_video(given, tmp_path / name, fps=30, loop=3)
-    with av.open(str(tmp_path / name)) as container:
-        decoded = list(container.decode(video=0))
-    assert len(decoded) == 21
-    assert [frame.time for frame in decoded] == pytest.approx([k / 30 for k in range(21)], abs=0.002)
-    for k, got in enumerate(decoded):
-        assert psnr(torch.from_numpy(got.to_ndarray(format="rgb24")).float() / 255, given[k % 7]) > 30
+    _, shown, colors = decoded(tmp_path / name)
+    assert [frame.time for frame in shown] == pytest.approx([k / 30 for k in range(21)], abs=0.002)
+    for k, rgb in enumerate(colors):
+        assert psnr(rgb, given[k % 7]) > 30
 
 
 @pytest.mark.parametrize(
@@ -192,15 +177,11 @@ def test_a_video_without_a_count_holds_every_repetition(tmp_path: Path, name: st
         ("a.gif", 51, None, "0.01 to 50"),
         ("a.webp", 91, None, "0.01 to 90"),
         ("a.gif", 30, -1, "loop count"),
-        ("a.webp", 30, 65_536, "loop count"),
         ("a.mp4", 30, 0, "play for ever"),
         ("a.webm", 30, 1001, "from 1 to 1000"),
         ("a.mp4", 0, None, "frames a second"),
-        ("a.mp4", -1, None, "frames a second"),
         ("a.mp4", math.nan, None, "frames a second"),
-        ("a.mp4", math.inf, None, "frames a second"),
         ("a.avi", 30, None, r"a\.avi"),
-        ("a", 30, None, "not a name for a video"),
         ("none/a.mp4", 30, None, "does not exist"),
     ],
 )

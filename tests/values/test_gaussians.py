@@ -13,15 +13,12 @@ from hypothesis import strategies as st
 from scenes import same_bits
 from torch import Tensor
 
-from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_multiply, quat_to_matrix
-from spackle.render.reference import ReferenceRenderer
 
 UNIT = st.floats(-1, 1)
 QUATS = st.tuples(UNIT, UNIT, UNIT, UNIT).filter(lambda q: math.hypot(*q) > 1e-2)
 OFFSETS = st.tuples(*[st.floats(-20, 20)] * 3)
 FACTORS = st.floats(0.05, 20)
-HALF = math.sqrt(0.5)
 PROPERTY = settings(deadline=None, max_examples=40)
 
 
@@ -62,29 +59,17 @@ def test_a_field_of_the_wrong_shape_is_named(field: str) -> None:
         dataclasses.replace(random_set(3), **{field: getattr(random_set(2), field)})
 
 
-def test_the_empty_set_has_length_zero_and_vanishes_in_a_join() -> None:
-    some = random_set(4, dtype=torch.float32)
-    assert len(Gaussians.empty()) == 0
-    assert Gaussians.empty(dtype=torch.float64).means.dtype == torch.float64
-    assert Gaussians.empty().covariances().shape == (0, 3, 3)
-    assert same_bits(Gaussians.cat([Gaussians.empty(), some, Gaussians.empty()]), some)
-
-
 def test_joined_sets_keep_their_order_bit_for_bit() -> None:
     first, second, third = (random_set(n, seed=n) for n in (3, 1, 5))
-    joined = Gaussians.cat(part for part in (first, second, third))
-    assert len(joined) == 9
+    joined = Gaussians.cat([Gaussians.empty(dtype=torch.float64), first, second, third])
+    assert (len(joined), len(Gaussians.empty())) == (9, 0)
     assert same_bits(joined.select(slice(0, 3)), first)
     assert same_bits(joined.select(torch.tensor([3])), second)
     assert same_bits(joined.select(torch.arange(9) >= 4), third)
-
-
-def test_conversion_reaches_every_tensor_and_detaching_cuts_every_gradient() -> None:
-    some = Gaussians(*(t.requires_grad_() for t in random_set(2).tensors))
-    assert {t.dtype for t in some.to(dtype=torch.float32).tensors} == {torch.float32}
-    assert all(t.requires_grad for t in some.to(dtype=torch.float32).tensors)
-    assert not any(t.requires_grad for t in some.detach().tensors)
-    assert same_bits(some.detach(), some)
+    asking = Gaussians(*(t.requires_grad_() for t in first.tensors))
+    assert all(t.requires_grad and t.dtype == torch.float32 for t in asking.to(dtype=torch.float32).tensors)
+    assert not any(t.requires_grad for t in asking.detach().tensors)
+    assert same_bits(asking.detach(), first)
 
 
 @PROPERTY
@@ -104,14 +89,11 @@ def test_quaternions_come_back_from_their_matrices(quat: tuple[float, ...]) -> N
     torch.testing.assert_close(quat_to_matrix(found), scipy_matrix(quat), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("quat", "about"),
-    [((0, 1, 0, 0), "x"), ((0, 0, 1, 0), "y"), ((0, 0, 0, 1), "z"), ((0, HALF, -HALF, 0), "a diagonal")],
-)
+@pytest.mark.parametrize("quat", [(0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1), (0, math.sqrt(0.5), -math.sqrt(0.5), 0)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_half_turns_are_well_conditioned(quat: tuple[float, ...], about: str, dtype: torch.dtype) -> None:
+def test_half_turns_are_well_conditioned(quat: tuple[float, ...], dtype: torch.dtype) -> None:
     found = quat_from_matrix(scipy_matrix(quat).to(dtype))
-    assert abs(float(found @ torch.tensor(quat, dtype=dtype))) == pytest.approx(1, abs=1e-6), about
+    assert abs(float(found @ torch.tensor(quat, dtype=dtype))) == pytest.approx(1, abs=1e-6)
     nearly = quat_from_matrix(scipy_matrix((1e-4, *quat[1:])).to(dtype))
     assert float(nearly[0]) == pytest.approx(1e-4, rel=1e-2)
 
@@ -155,20 +137,6 @@ def test_a_transform_moves_points_and_covariances_alike(quat: tuple[float, ...],
     assert torch.equal(moved.colors, some.colors)
 
 
-def test_moving_scene_and_camera_together_leaves_the_picture_and_scales_its_depth() -> None:
-    some, camera = random_set(12), Camera.from_focal(20, 16, 12).to(dtype=torch.float64)
-    matrix = similarity((0.9, 0.1, -0.3, 0.2), 2.5, (1, -2, 3))
-    rigid = matrix.clone()
-    rigid[:3, :3] /= 2.5
-    rigid[:3, 3] = matrix[:3, 3]
-    moved = dataclasses.replace(camera, world_to_camera=torch.linalg.inv(rigid))
-    before, after = ReferenceRenderer().render(some, camera), ReferenceRenderer().render(some.transform(matrix), moved)
-    assert float(before.alpha.max()) > 0.5
-    torch.testing.assert_close(after.rgb, before.rgb, rtol=0, atol=1e-9)
-    torch.testing.assert_close(after.alpha, before.alpha, rtol=0, atol=1e-9)
-    torch.testing.assert_close(after.depth, 2.5 * before.depth, rtol=0, atol=1e-8)
-
-
 def test_a_transform_keeps_single_precision_and_passes_gradients() -> None:
     some = Gaussians(*(t.requires_grad_() for t in random_set(3, dtype=torch.float32).tensors))
     moved = some.transform(similarity((1, 2, 3, 4), 2, (0, 0, 1)))
@@ -179,20 +147,11 @@ def test_a_transform_keeps_single_precision_and_passes_gradients() -> None:
     assert some.quats.grad is not None
 
 
-@pytest.mark.parametrize(
-    "block",
-    {
-        "mirror": torch.diag(double(1, 1, -1)),
-        "stretch": torch.diag(double(1, 1, 2)),
-        "shear": double([1, 0.1, 0], [0, 1, 0], [0, 0, 1]),
-        "nothing": torch.zeros(3, 3, dtype=torch.float64),
-        "flat": torch.diag(double(1, 1, 0)),
-        "nan": torch.full((3, 3), math.nan, dtype=torch.float64),
-    }.items(),
-    ids=lambda item: item[0],
-)
-def test_only_similarities_are_taken(block: tuple[str, Tensor]) -> None:
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = block[1]
-    with pytest.raises(ValueError, match="uniform scale"):
-        random_set(2).transform(matrix)
+def test_only_similarities_are_taken() -> None:
+    shear = double([1, 0.1, 0], [0, 1, 0], [0, 0, 1])
+    mirror, stretch, flat = (torch.diag(double(1, 1, last)) for last in (-1, 2, 0))
+    for block in (mirror, stretch, flat, shear, 0 * shear, math.nan * shear):
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3] = block
+        with pytest.raises(ValueError, match="uniform scale"):
+            random_set(2).transform(matrix)
