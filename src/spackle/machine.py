@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,22 @@ def hardware(device: torch.device) -> dict[str, Any]:
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     facts = {"cpu": names[0] if names else platform.machine(), "cores": os.cpu_count(), "threads": thread_count()}
     return facts | ({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {})
+
+
+def load_average() -> float | None:
+    """Of the machine over the last minute, where it tells."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
+def commit() -> str:
+    """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
+    git = ["git", "-C", str(Path(spackle.__file__).parent)]
+    try:  # a project that this package is only installed into does not track it
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
+        found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
+        return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def without_nan(value: Any) -> Any:

@@ -21,11 +21,18 @@ from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.layers import TINY
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.evaluation import efficiency, paper
-from spackle.evaluation.bench import time_image
+from spackle.evaluation import bench, paper
 from spackle.evaluation.case import Points
-from spackle.evaluation.efficiency import BASE_PATH, EXTRA, STAGES, Efficiency, Record, view_cost
-from spackle.evaluation.efficiency_tables import SIDE, efficiency_tables
+from spackle.evaluation.efficiency import (
+    BASE_PATH,
+    EXTRA,
+    SIDE,
+    STAGES,
+    Efficiency,
+    Record,
+    efficiency_tables,
+    view_cost,
+)
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.table import EMPTY
@@ -61,7 +68,7 @@ def results(disparities: tuple[float, ...] = (0.3, 0.4, 0.5), **facts: Any) -> E
 
 
 def test_the_networks_have_the_papers_parameters() -> None:
-    found = efficiency.count_parameters()
+    found = bench.count_parameters()
     assert (found["base"], found["residual"]) == (702_305_169, 8_021_376)
     assert round(found["base"] / 1e6, 2) == paper.PARAMETERS_M
     assert round(found["residual"] / 1e6, 2) == paper.ADDED_PARAMETERS_M
@@ -97,7 +104,7 @@ def test_times_are_medians_of_runs_that_add_up_and_spread_over_the_measured_imag
 
 
 def test_the_layouts_are_the_papers() -> None:
-    overhead, expanded, stages = efficiency_tables(results(), efficiency.count_parameters())
+    overhead, expanded, stages = efficiency_tables(results(), bench.count_parameters())
     assert overhead.label == "tab:efficiency_gaussian_overhead"
     assert [name for name, _ in overhead.groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
     rows = {line.cells[:2]: line.cells[2:] for line in overhead.lines}
@@ -122,7 +129,7 @@ def test_the_layouts_are_the_papers() -> None:
 
 
 def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
-    tables = efficiency_tables(results((0.6,), warm=False, load=None), efficiency.count_parameters())
+    tables = efficiency_tables(results((0.6,), warm=False, load=None), bench.count_parameters())
     assert tables[0].groups[1] == ("disparity 0.6", 2)
     assert {line.cells[2:] for line in tables[0].lines if "paper" in line.cells[1]} == {(EMPTY, EMPTY)}
     assert [line.cells[1] for line in tables[1].lines] == ["disparity 0.6"]
@@ -133,28 +140,11 @@ def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
 # --- timing
 
 
-def test_a_first_prediction_counts_only_where_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[BasePrediction] = []
-
-    def predict() -> BasePrediction:
-        calls.append(box_before_wall().lift())
-        return calls[-1]
-
-    cases = ((3, False, 10.0, (4, True)), (3, True, 10.0, (3, True)), (1, False, 0.0, (1, False)))
-    for runs, warm, cold_s, wanted in cases:
-        calls.clear()
-        monkeypatch.setattr(efficiency, "COLD_S", cold_s)
-        found, seconds, was_warm = efficiency.time_base(predict, runs, CPU, warm)
-        assert (len(calls), was_warm) == wanted
-        assert found is calls[-1]
-        assert len(seconds) == runs
-
-
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
     completer = Completer(prediction.gaussians, prediction.camera, renderer)
     for view in large_views(prediction, (0.3, 0.5)):
-        found = efficiency.time_view([0.25, 0.5, 4.0], completer, view.setting, view.camera, 3, CPU)
+        found = bench.time_view([0.25, 0.5, 4.0], completer, view.setting, view.camera, 3, CPU)
         assert found["added"] == len(completer.complete_view(view.camera)) > 0
         assert found["base_gaussians"] == len(prediction.gaussians)
         assert set(found["seconds"]) == set(STAGES)
@@ -164,7 +154,7 @@ def test_a_view_costs_what_a_completion_adds() -> None:
             assert figures[path] == pytest.approx(sum(figures[f"{name}_stage_ms"] for name in parts))
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
     closed = Completer(opaque, prediction.camera, renderer)
-    whole = efficiency.time_view([1.0], closed, "0", prediction.camera, 1, CPU)
+    whole = bench.time_view([1.0], closed, "0", prediction.camera, 1, CPU)
     assert (whole["added"], whole["seconds"]["rerender"]) == (0, [0.0])  # a view without holes: no second render
 
 
@@ -203,10 +193,21 @@ def test_points_suffice_infinite_gaussians_fail_an_image_and_a_memory_shortage_t
     known = case.depth()
     rows, columns = torch.nonzero(known.valid, as_tuple=True)
     points = Points(torch.stack([columns, rows], dim=-1) + 0.5, known.depth[rows, columns])
-    found = time_image(dataclasses.replace(case, depth=None, points=lambda: points), tools, *once)
+    found = bench.time_image(dataclasses.replace(case, depth=None, points=lambda: points), tools, *once)
     assert found["views"][0]["base_gaussians"] > 0
+    with monkeypatch.context() as patch:  # a first prediction in a process does not count
+        predictions: list[Any] = []
+        patch.setattr(RgbdBase, "predict", lambda *words: predictions.append(words) or predict(*words))
+        for warm, calls in ((False, 2), (True, 1)):
+            predictions.clear()
+            cold = bench.time_image(case, tools, once[0], warm)
+            assert (len(predictions), len(cold["views"][0]["seconds"]["base"]), cold["facts"]["warm"]) == (
+                calls,
+                1,
+                True,
+            )
     with pytest.raises(InputError, match="no depth map and no points"):
-        time_image(dataclasses.replace(case, depth=None), tools, *once)
+        bench.time_image(dataclasses.replace(case, depth=None), tools, *once)
 
     def too_large(*arguments: Any) -> BasePrediction:
         found = predict(*arguments)
@@ -218,11 +219,11 @@ def test_points_suffice_infinite_gaussians_fail_an_image_and_a_memory_shortage_t
 
     monkeypatch.setattr(RgbdBase, "predict", too_large)
     with pytest.raises(InputError, match="float32") as failed:
-        time_image(case, tools, *once)
+        bench.time_image(case, tools, *once)
     assert not isinstance(failed.value, BaseError)
     monkeypatch.setattr(RgbdBase, "predict", too_little)
     with pytest.raises(BaseError, match="not enough memory"):
-        time_image(case, tools, *once)
+        bench.time_image(case, tools, *once)
 
 
 def test_from_files_to_tables_and_on(scenes: Path, tmp_path: Path) -> None:
@@ -271,6 +272,7 @@ def test_sharp_is_timed_once_and_a_broken_image_is_named(scenes: Path, tmp_path:
     (view,) = found["images"][0]["views"]
     assert view["base_gaussians"] == gaussians_of(TINY)
     assert len(view["seconds"]["base"]) == 1
+    assert not found["images"][0]["facts"]["warm"]  # the first prediction, which counts
     assert math.isfinite(view["figures"]["overhead"])
     assert "network in fp32 on" in (tmp_path / "out" / "bench.md").read_text()
     cut_off(tmp_path / "data" / "Ball" / "left.png")

@@ -164,13 +164,12 @@ def bench(
     With --suite: time every stage on this machine, without a dataset: suite.json, suite.md.
     """
     from spackle.evaluation.bench import bench as run
-    from spackle.evaluation.bench import check_choice
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, residual_file, split_words
     from spackle.evaluation.suite import SuiteOptions, run_suite
     from spackle.progress import Reporter
 
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
-    check_choice(suite, given)
+    _check_choice(suite, given)
     disparities = parse_disparities(_with_words(context, disparity))
     bases = _settings(base, checkpoint, precision, low_memory, device)
     if dataset is None or root is None:
@@ -199,6 +198,20 @@ def bench(
         end = run(options, runs, base_runs, output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}"), reporter)
     if end == "stopped":
         raise typer.Exit(INTERRUPTED)
+
+
+def _check_choice(suite: bool, given: set[str]) -> None:
+    """InputError where the options `given`, by their long names, ask for no dataset and no suite, or for both."""
+    of_dataset = ("--dataset", "--root", "--limit", "--disparity")
+    of_suite = ("--only", "--compile", "--windows", "--side")
+    if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):
+        raise InputError(f"{' and '.join(missing)} missing: give --dataset NAME --root DIR, or --suite")
+    for name in of_dataset if suite else of_suite:
+        if name in given:
+            raise InputError(f"{name} is {'not for --suite' if suite else 'for --suite alone'}: leave one of them out")
+    for name in ("--windows", "--compile"):
+        if name in given and not {"--base", "--checkpoint"} & given:
+            raise InputError(f"{name} is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")
 
 
 def _given(context: typer.Context) -> set[str]:

@@ -1,26 +1,22 @@
-"""What a view costs in Gaussians and in time, stage by stage: the base alone, and with Spackle on top."""
+"""What views cost in Gaussians and in time, and the paper's two tables of it, its numbers beside those measured."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from spackle.bases.protocol import BasePrediction
-from spackle.bases.sharp.checkpoint import unused_shapes
-from spackle.bases.sharp.layers import FULL
-from spackle.bases.sharp.network import SharpNetwork
-from spackle.camera import Camera
-from spackle.evaluation.timing import MS, Lap, measure, now
-from spackle.gaussians import Gaussians
-from spackle.render import Renderer
-from spackle.render.protocol import Rendering
-from spackle.residual import Completer, ResidualNet
+from spackle.evaluation import paper
+from spackle.evaluation.table import EMPTY, Line, Table
+from spackle.evaluation.tables import PAPER_ROW, count_text
+from spackle.evaluation.timing import MS
+
+Record = dict[str, Any]  # ready for JSON
+Cells = tuple[str, ...]
+Text = Callable[[float], str]
 
 # Stages in the order of the work, as the tables call them.
 STAGES = {
@@ -32,21 +28,19 @@ STAGES = {
 }
 BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
 EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
-COLD_S = 10.0  # of a first prediction that takes longer, as SHARP's does, compiling kernels is a small part
-
-Record = dict[str, Any]  # ready for JSON
-
-
-def count_parameters() -> dict[str, float]:
-    """Of SHARP as its checkpoint has it, 702.31 M; of that used by inference; of the residual, 8.02 M; and its share.
-
-    They are counted in the networks, without weights. Inference needs neither SHARP's classifiers nor the part that
-    aligns depths.
-    """
-    with torch.device("meta"):
-        used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
-    base = used + sum(map(math.prod, unused_shapes(FULL).values()))
-    return {"base": base, "base_used": used, "residual": residual, "share": residual / base}
+SIDE = "right"  # the end of the swipe where the second camera of Middlebury's and Booster's pairs stands
+VIEW = (
+    f"One view of each image: the {SIDE} end of a swipe at that disparity (spackle.camera_path.extremes), where the "
+    "second camera of a stereo pair would stand; the paper does not say which view it timed"
+)
+PAPER = PAPER_ROW.format("SHARP")
+EXPANDED: Cells = ("Dataset", "Setting", "From", "Added GS", "Added GS (%)", "Merged GS", "base time (ms)")
+EXPANDED += ("Spackle time (ms)", "Time overhead", "base FPS", "Spackle FPS", "n")
+ODD_MARK = "†"
+ODD_NOTE = (
+    f"{ODD_MARK} Printed as published, though the row contradicts itself: 0.671 FPS is 1,490 ms and not 6,410.3, and "
+    "neither gives −3.3 %. The paper's caption speaks of measurement outliers."
+)
 
 
 class Spread(NamedTuple):
@@ -122,63 +116,198 @@ def view_cost(setting: str, base_gaussians: int, added: int, seconds: Mapping[st
     return {"setting": setting, **counts, "seconds": dict(seconds), "figures": figures}
 
 
-def time_base(
-    predict: Callable[[], BasePrediction], runs: int, device: torch.device, warm: bool
-) -> tuple[BasePrediction, list[float], bool]:
-    """Predict so many times: the prediction, the seconds of each run, and whether none was the first of its process.
-
-    The first one in a process (not `warm`) counts only if it takes more than `COLD_S`.
-    """
-    seconds: list[float] = []
-    cold = False
-    while len(seconds) < runs:
-        start = now(device)
-        prediction = predict()
-        seconds.append(now(device) - start)
-        if not warm and len(seconds) == 1:
-            cold = seconds[0] > COLD_S
-            seconds, warm = seconds if cold else [], True
-    return prediction, seconds, not cold
+def efficiency_tables(found: Efficiency, parameters: Mapping[str, float]) -> list[Table]:
+    """All of them; at least one image of `found` was measured."""
+    return [_overhead_table(found), _expanded_table(found, parameters), _stages_table(found)]
 
 
-@dataclasses.dataclass(frozen=True)
-class _LappedRenderer:
-    """A `Renderer` whose renders are laps, told apart from the completion around them."""
+def _overhead_table(found: Efficiency) -> Table:
+    """Added Gaussians and median times (tab:efficiency_gaussian_overhead)."""
+    title, base, settings = str(found.config["title"]), str(found.config["base"]["title"]), found.settings
 
-    renderer: Renderer
-    lap: Lap
+    def counts(name: str) -> list[Cells]:
+        rows = []
+        if name == title:
+            means = [(found.spread(s, "added").mean, 100 * found.spread(s, "share").mean) for s in settings]
+            rows.append((base, *(cell for pair in means for cell in _added(*pair))))
+        return [*rows, published(paper.GAUSSIANS[name])] if name in paper.GAUSSIANS else rows
 
-    def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
-        self.lap("completion")
-        drawn = self.renderer.render(gaussians, camera, **options)
-        self.lap("rerender")
-        return drawn
+    def published(numbers: tuple[float, ...]) -> Cells:
+        return (PAPER, *(cell for s in settings for cell in _added(*paper.at(numbers, float(s))[:2])))
+
+    lines = _grouped(found, counts)
+    lines.append(Line(("Average", *published(paper.AVERAGE)), rule=True))
+    lines.append(Line(("Runtime efficiency", *[EMPTY] * (1 + 2 * len(settings))), rule=True))
+    for name, figure, our_text, their_text, medians in (
+        ("Median time of the base (ms)", "base_ms", _ms, _ms, paper.MEDIAN_BASE_MS),
+        ("Median time with Spackle (ms)", "spackle_ms", _ms, _ms, paper.MEDIAN_SPACKLE_MS),
+        ("Median time overhead", "overhead", _share, _percent, paper.MEDIAN_OVERHEAD),
+    ):
+        ours = [cell for s in settings for cell in (our_text(found.spread(s, figure).median), EMPTY)]
+        values = [paper.at(medians, float(s))[0] for s in settings]
+        theirs = [cell for value in values for cell in (EMPTY if value is None else their_text(value), EMPTY)]
+        lines += [Line((name, base, *ours)), Line((EMPTY, PAPER, *theirs))]
+    return Table(
+        "tab:efficiency_gaussian_overhead",
+        "Efficiency and Gaussian overhead. Counts are means over images. Times are medians: ours over the images of "
+        f"{title}, the paper's over its six datasets. {_setup(found)}",
+        ("Dataset", "From", *("Added GS", "Added GS (%)") * len(settings)),
+        (("", 2), *((_setting(setting, "{}: disparity {}"), 2) for setting in settings)),
+        tuple(lines),
+        words=2,
+        notes=_notes(found),
+    )
 
 
-@torch.no_grad()
-def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussians:
-    """A view's aux Gaussians; one lap for each of `STAGES` behind the base ("rerender": only where there are holes)."""
-    before = completer.renderer.render(completer.base, camera)
-    lap("view")
-    shield = completer.photo_guard()
-    lap("photo")
-    inside = dataclasses.replace(completer, renderer=_LappedRenderer(completer.renderer, lap))
-    aux = inside.complete_view(camera, [shield], rendering=before)
-    lap("completion")
-    return aux
+def _expanded_table(found: Efficiency, parameters: Mapping[str, float]) -> Table:
+    """Counts, times and rates of each setting (tab:expanded_efficiency_gaussian_overhead)."""
+
+    def rows(title: str) -> list[Cells]:
+        found_rows = []
+        for setting in found.settings:
+            found_rows += [_our_row(found, setting)] if title == found.config["title"] else []
+            known = title in paper.TIMES and float(setting) in paper.DISPARITIES
+            found_rows += [_paper_row(title, setting)] if known else []
+        return found_rows
+
+    lines = _grouped(found, rows)
+    marked = any(ODD_MARK in cell for line in lines for cell in line.cells)
+    return Table(
+        "tab:expanded_efficiency_gaussian_overhead",
+        "Expanded efficiency and Gaussian overhead. Ours: counts are means and the rest are medians over images; FPS "
+        f"is one over the whole time from the photo to the view. {_setup(found)}",
+        EXPANDED,
+        (("", len(EXPANDED)),),
+        tuple(lines),
+        words=3,
+        notes=(*_notes(found), _parameters_note(parameters), *([ODD_NOTE] if marked else [])),
+    )
 
 
-def time_view(
-    base_s: Sequence[float], completer: Completer, setting: str, camera: Camera, runs: int, device: torch.device
-) -> Record:
-    """The cost of one view, which the tables call by `setting`; the base, on `device`, took `base_s` seconds."""
-    added = 0
+def _our_row(found: Efficiency, setting: str) -> Cells:
+    added, share, merged = (found.spread(setting, figure).mean for figure in ("added", "share", "merged"))
+    wanted, count = paper.IMAGES.get(str(found.config["title"])), len(found.measured)
+    texts = {"base_ms": _ms, "spackle_ms": _ms, "overhead": _share, "base_fps": _rate, "spackle_fps": _rate}
+    medians = (text(found.spread(setting, figure).median) for figure, text in texts.items())
+    counts = (str(found.config["base"]["title"]), *_added(added, 100 * share), count_text(merged))
+    return (_setting(setting), *counts, *medians, str(count) if wanted is None else f"{count}/{wanted}")
 
-    def view(lap: Lap) -> None:
-        nonlocal added
-        added = len(complete_in_laps(completer, camera, lap))
 
-    times = measure(runs, {"": view}, device)
-    none = np.zeros(runs)  # of a view without holes, which is not rendered again
-    stages = {name: (times.get(("", name), none) / MS).tolist() for name in STAGES if name != "base"}
-    return view_cost(setting, len(completer.base), added, {"base": base_s, **stages})
+def _paper_row(title: str, setting: str) -> Cells:
+    added, share, merged = paper.at(paper.GAUSSIANS[title], float(setting))
+    values = [value or 0.0 for value in paper.at(paper.TIMES[title], float(setting))]
+    times = [text(value) for text, value in zip((_ms, _ms, _percent, _rate, _rate), values, strict=True)]
+    if (title, float(setting)) == paper.ODD_TIME:
+        times = [text + ODD_MARK * (k in (0, 2, 3)) for k, text in enumerate(times)]
+    return (_setting(setting), PAPER, *_added(added, share), count_text(merged), *times, str(paper.IMAGES[title]))
+
+
+def _stages_table(found: Efficiency) -> Table:
+    """Where the time goes."""
+    rows: list[tuple[str, str, Text, bool]] = [
+        (title, f"{name}_stage_ms", _ms, name == EXTRA[0]) for name, title in STAGES.items()
+    ]
+    rows += [
+        (f"base path: the first {len(BASE_PATH)}", "base_ms", _ms, True),
+        (f"Spackle's own: the other {len(EXTRA)}", "extra_ms", _ms, False),
+        ("overhead, of the whole base path", "overhead", _share, True),
+        ("overhead, of the render of the view", "overhead_of_view", _share, False),
+    ]
+    lines = []
+    for title, figure, text, rule in rows:
+        spreads = [found.spread(setting, figure) for setting in found.settings]
+        cells = (f"{text(spread.median)} [{text(spread.q1)}, {text(spread.q3)}]" for spread in spreads)
+        lines.append(Line((title, *cells), rule))
+    return Table(
+        "tab:efficiency_stages",
+        f"Stages on {found.config['title']} in milliseconds: median over images [quartiles]. The render at the photo's "
+        f"camera is needed once a photo, however many views are asked for. {_setup(found)}",
+        ("Stage", *(_setting(setting, "{}: disparity {}") for setting in found.settings)),
+        (("", 1 + len(found.settings)),),
+        tuple(lines),
+        notes=_notes(found),
+    )
+
+
+def _parameters_note(counted: Mapping[str, float]) -> str:
+    """How large the networks are, and how large the paper says they are."""
+    base, added = counted["base"] / 1e6, counted["residual"] / 1e6
+    return (
+        f"Parameters in millions, counted in the networks: SHARP {base:.2f}, of which inference uses "
+        f"{counted['base_used'] / 1e6:.2f}; with Spackle {base + added:.2f}; Spackle alone {added:.2f} "
+        f"({100 * counted['share']:.2f} %). The paper: {paper.PARAMETERS_M}, {paper.MERGED_PARAMETERS_M}, "
+        f"{paper.ADDED_PARAMETERS_M} ({paper.ADDED_PARAMETERS_PERCENT} %)."
+    )
+
+
+def _grouped(found: Efficiency, rows: Callable[[str], Sequence[Cells]]) -> list[Line]:
+    """The rows of each dataset under its title, with a rule above the first."""
+    titles = dict.fromkeys([*paper.DATASETS, str(found.config["title"])])
+    return [
+        Line((EMPTY if number else title, *row), rule=not number)
+        for title in titles
+        for number, row in enumerate(rows(title))
+    ]
+
+
+def _setting(setting: str, pattern: str = "{}") -> str:
+    """ "S1" for 0.3, or by the pattern "S1: disparity 0.3"; other disparities than the paper's have no such name."""
+    if float(setting) not in paper.DISPARITIES:
+        return f"disparity {setting}"
+    return pattern.format(f"S{paper.DISPARITIES.index(float(setting)) + 1}", setting)
+
+
+def _added(added: float | None, percent: float | None) -> Cells:
+    return count_text(added), EMPTY if percent is None else f"{percent:.2f}"
+
+
+def _setup(found: Efficiency) -> str:
+    """The view, the base, the weights and the machine, for every caption."""
+    base, residual = found.config["base"], found.config["residual"]
+    hardware, versions = found.config["hardware"], found.config["versions"]
+    precision = found.measured[0]["facts"]["notes"].get("precision")
+    network = f"network in {precision} on {base['device']}" if precision else "no network"
+    weights = "seeds, no weights"
+    if residual["sha256"]:
+        weights = f"{residual['weights']} weights {residual['sha256'][:8]} in {residual['precision']}, on the processor"
+    place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
+    place += f", {hardware['gpu']} for the base, the rest on the processor" if "gpu" in hardware else ""
+    named = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return f"{VIEW}. Base {base['title']}: {base['says']} ({network}). Residual: {weights}. Machine: {place}; {named}."
+
+
+def _notes(found: Efficiency) -> tuple[str, ...]:
+    """How the times were taken, and what disturbed them."""
+    runs, base_runs = found.config["runs"], found.config["base_runs"]
+    notes = [
+        f"Each stage: median of {runs} runs after one that is not counted; the base: {base_runs} per image. Files are "
+        "read before the clock starts, and nothing is written. A time of several stages is the sum of their medians."
+    ]
+    facts = {image["name"]: image["facts"] for image in found.measured}
+    if cold := [name for name, known in facts.items() if not known["warm"]]:
+        notes.append(f"The base of {', '.join(cold)} was timed at its first prediction in a process: it was not warm.")
+    if loads := [float(known["load"]) for known in facts.values() if known["load"] is not None]:
+        notes.append(
+            f"Load of the machine before each image (with this benchmark in it): median {statistics.median(loads):.1f},"
+            f" {min(loads):.1f} to {max(loads):.1f}; above the number of cores, other processes made times longer."
+        )
+    if failed := [image["name"] for image in found.images if image["problem"] is not None]:
+        notes.append(f"{len(failed)} of {len(found.images)} images gave no figures: {', '.join(failed[:5])}.")
+    return tuple(notes)
+
+
+def _ms(value: float) -> str:
+    return f"{value:,.1f}"
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f}%"
+
+
+def _share(value: float) -> str:
+    """Small overheads keep two digits: the question is whether they are below one percent."""
+    return f"{100 * value:.2f}%" if value < 0.1 else f"{100 * value:.1f}%"
+
+
+def _rate(value: float) -> str:
+    return f"{value:.3f}" if value >= 0.1 else f"{value:.3g}"

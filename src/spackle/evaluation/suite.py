@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,21 +11,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import spackle
 from spackle.bases.lift import lift
 from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.sharp import SharpBase
 from spackle.digest import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation import suite_sections as sections
-from spackle.evaluation.bench import check_runs, load_average, load_part, save_part
+from spackle.evaluation.bench import check_runs, load_part, save_part
 from spackle.evaluation.efficiency import Record
 from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.evaluation.results import begin, write_json, write_text
 from spackle.evaluation.suite_sections import SIDE, Section, holed_scene
 from spackle.evaluation.table import EMPTY, Line, Table, to_markdown
 from spackle.image import Photo
-from spackle.machine import hardware, versions, without_nan
+from spackle.machine import commit, hardware, load_average, versions, without_nan
 from spackle.output_folder import alone_in, results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
@@ -168,17 +166,6 @@ def _section(name: str, options: SuiteOptions, device: torch.device, found: Mapp
         return sections.video_section(runs, lifting, renderer, network, sections.FRAMES if side >= SIDE else 4, device)
     base_scene = lifting()
     return sections.completion_section(runs, base_scene.gaussians, base_scene.camera, renderer, network, device)
-
-
-def commit() -> str:
-    """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
-    git = ["git", "-C", str(Path(spackle.__file__).parent)]
-    try:  # a project that this package is only installed into does not track it
-        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
-        found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
-        return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def plain_row(row: sections.Row) -> Record:

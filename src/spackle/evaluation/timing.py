@@ -1,14 +1,21 @@
-"""The clock of every benchmark: tasks that take turns, stage by stage."""
+"""The clock of every benchmark: tasks that take turns, stage by stage; and the stages of a view's completion."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+
+from spackle.camera import Camera
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer
 
 TOTAL = "total"
 MS = 1000.0
@@ -55,3 +62,30 @@ def now(device: torch.device = CPU) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
+
+
+@dataclasses.dataclass(frozen=True)
+class _LappedRenderer:
+    """A `Renderer` whose renders are laps, told apart from the completion around them."""
+
+    renderer: Renderer
+    lap: Lap
+
+    def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
+        self.lap("completion")
+        drawn = self.renderer.render(gaussians, camera, **options)
+        self.lap("rerender")
+        return drawn
+
+
+@torch.no_grad()
+def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussians:
+    """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
+    before = completer.renderer.render(completer.base, camera)
+    lap("view")
+    shield = completer.photo_guard()
+    lap("photo")
+    inside = dataclasses.replace(completer, renderer=_LappedRenderer(completer.renderer, lap))
+    aux = inside.complete_view(camera, [shield], rendering=before)
+    lap("completion")
+    return aux
