@@ -83,6 +83,11 @@ class Gaussians:
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.double()).to(dtype)
         return Gaussians(means, quats, self.scales * scale.to(dtype), self.opacities, self.colors)
 
+    @property
+    def finite(self) -> bool:
+        """Whether all numbers are finite."""
+        return all(bool(torch.isfinite(tensor).all()) for tensor in self.tensors)
+
     def covariances(self) -> Tensor:
         """World-space covariances Σ = R S Sᵀ Rᵀ, [N, 3, 3]."""
         factor = quat_to_matrix(self.quats) * self.scales[:, None, :]

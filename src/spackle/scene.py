@@ -159,8 +159,8 @@ def predict(
     loaded = photo if isinstance(photo, Photo) else load_photo(photo)
     source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
     prediction, choice = (open_base(BaseSettings(depth=source)) if base is None else open_loaded(base)).predict(loaded)
-    if choice.news:
-        LOG.info("%s: %s", loaded.path.name, choice.news)
+    if choice.note:
+        LOG.info("%s: %s", loaded.path.name, choice.note)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
     return complete(prediction, cameras, network=network, renderer=renderer)
 

@@ -103,9 +103,8 @@ def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
     tmp_path: Path, photo: Path, made: dict[str, Path]
 ) -> None:
     choice = pick(photo)[1]
-    assert (choice.base, choice.why, choice.passed_over) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert choice.news == choice.line
-    assert "--depth FILE, `spackle weights get sharp`" in choice.line
+    assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
+    assert "--depth FILE, `spackle weights get sharp`" in choice.note
     (tmp_path / "weights").mkdir()
     shutil.copy(made["sharp"], tmp_path / "weights")
     prediction, choice = pick(photo)
@@ -116,10 +115,10 @@ def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
     named, by_name = pick(inside, name="rgbd")
-    assert (by_name.why, by_name.news) == ("--base rgbd", "")
+    assert (by_name.why, by_name.note) == ("--base rgbd", "")
     assert same_bits(named.gaussians, prediction.gaussians)
     given, choice = pick(inside, depth=write_depth(tmp_path / "depth.npy"))
-    assert (choice.base, choice.why, choice.news) == ("rgbd", "--depth", "")
+    assert (choice.base, choice.why, choice.note) == ("rgbd", "--depth", "")
     assert float(given.gaussians.means[0, 2]) == pytest.approx(metres()[0, 0], rel=1e-5)
 
 
@@ -158,7 +157,7 @@ def test_a_base_is_loaded_once_and_not_before_a_photo_needs_it(
     base = open_base(BaseSettings())
     base.predict(load_photo(portrait(tmp_path / "p.jpg")))
     assert not quick
-    news = [base.predict(load_photo(photo))[1].news for _ in range(2)]
+    news = [base.predict(load_photo(photo))[1].note for _ in range(2)]
     assert [bool(line) for line in news] == [True, False]
     assert len(quick) == 1
     model = open_base(BaseSettings("hf:me/small", precision="fp32", device="cpu"))
@@ -224,7 +223,7 @@ def test_broken_depth_in_the_photo_is_passed_over(tmp_path: Path, monkeypatch: p
     photo, log = broken_portrait(tmp_path / "photo.jpg"), list[str]()
     choice = pick(photo, log)[1]
     assert (choice.base, choice.why) == ("lite", f"the depth in the photo cannot be used, {NO_SHARP}")
-    assert choice.passed_over[0].startswith(f"the depth in the photo: {photo}: ")
+    assert choice.failures[0].startswith(f"the depth in the photo: {photo}: ")
     assert [line.startswith(f"photo.jpg: going on without the depth in the photo: {photo}: ") for line in log] == [True]
     with pytest.raises(InputError, match=r"photo\.jpg"):
         pick(photo, name="rgbd")
@@ -234,7 +233,7 @@ def test_broken_depth_in_the_photo_is_passed_over(tmp_path: Path, monkeypatch: p
         return DepthMap(depth, depth > 0, None, None, "depth", path)
 
     monkeypatch.setattr("spackle.bases.open.load_photo_depth", wrong)
-    assert f"{HEIGHT}×{WIDTH} but photo {photo} is {WIDTH}×{HEIGHT}" in pick(photo)[1].passed_over[0]
+    assert f"{HEIGHT}×{WIDTH} but photo {photo} is {WIDTH}×{HEIGHT}" in pick(photo)[1].failures[0]
     with pytest.raises(InputError, match=f"{HEIGHT}×{WIDTH}"):
         pick(photo, name="rgbd")
 
@@ -263,7 +262,7 @@ def test_damaged_weights_of_sharp_are_passed_over_once_for_all_photos(
     base = open_base(BaseSettings(), log.append)
     choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
     assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used"] * 2
-    assert (len(log), said in log[0], said in choices[0].passed_over[0]) == (1, True, True)
+    assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):
         with pytest.raises(BaseError, match=said):
@@ -320,7 +319,7 @@ def test_everything_may_fail_one_after_the_other(tmp_path: Path, sharp: Path, sh
     photo = broken_portrait(tmp_path / "photo.jpg")
     garbage(sharp)
     choice = pick(photo)[1]
-    assert (choice.base, len(choice.passed_over)) == ("lite", 2)
+    assert (choice.base, len(choice.failures)) == ("lite", 2)
     assert choice.why == "the depth in the photo cannot be used, SHARP cannot be used"
     shipped.write_bytes(b"nothing")
     log: list[str] = []
@@ -424,11 +423,11 @@ def test_tables_call_weights_apples_where_they_came_from_apple(tmp_path: Path) -
     file, record = tmp_path / "my_sharp.pt", tmp_path / "my_sharp.pt.json"
     file.write_bytes(b"weights")
     unknown = "a network of SHARP's shape, from the photo alone, by weights of unknown origin: my_sharp.pt"
-    assert BaseSettings("sharp", checkpoint=file).says == unknown
-    for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].says)):
+    assert BaseSettings("sharp", checkpoint=file).description == unknown
+    for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].description)):
         record.write_text(json.dumps({"url": url, "size": 7, "sha256": sha256(b"weights").hexdigest()}))
-        assert BaseSettings("sharp", checkpoint=file).says == says
-    assert BaseSettings("lite", checkpoint=file).says == KINDS["lite"].says
+        assert BaseSettings("sharp", checkpoint=file).description == says
+    assert BaseSettings("lite", checkpoint=file).description == KINDS["lite"].description
 
 
 # In Python.

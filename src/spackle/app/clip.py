@@ -15,7 +15,7 @@ from torch import Tensor
 import spackle
 from spackle.app.complete import PhotoCompleter
 from spackle.app.video import PathOptions, VideoOptions
-from spackle.bases.open import BaseSettings, Choice, all_finite
+from spackle.bases.open import BaseSettings, Choice
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, spelled, view_at
@@ -148,7 +148,7 @@ class _Run:
             drawn = self._completer.add(small.rgb, prediction)
         except ValueError as error:
             raise InputError(f"{photo.path}: no camera path: {error}: check depth and focal length") from error
-        if not all_finite(drawn.gaussians[1]):
+        if not drawn.gaussians[1].finite:
             raise InputError(f"{photo.path}: a view too extreme to complete: give a smaller --disparity")
         return drawn
 
@@ -158,8 +158,8 @@ class _Run:
         if self._first is None:
             self._base, self._first = self._base.only(choice), (photo, prediction, choice)
             name, focal = self._clip.path.name, prediction.camera.focal[0]
-            if choice.news:
-                self._reporter.say(f"{name}: {choice.news}")
+            if choice.note:
+                self._reporter.say(f"{name}: {choice.note}")
             self._reporter.say(
                 f"{name}: {len(self._clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
                 f"for each, focal length {focal:.0f} px ({prediction.lens_source or photo.focal_source})"
@@ -197,8 +197,8 @@ class _Run:
             "flicker": _flicker(notes),
             "seconds": {**seconds, "by_stage": stages, "total": round(sum(seconds.values()), 3)},
         }
-        if choice.passed_over:
-            report["base"]["passed_over"] = list(choice.passed_over)
+        if choice.failures:
+            report["base"]["passed_over"] = list(choice.failures)
         return report
 
 

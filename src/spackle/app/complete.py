@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spackle.app.video import FrameMaker, PathOptions
-from spackle.bases.open import BaseSettings, Choice, all_finite, open_base
+from spackle.bases.open import BaseSettings, Choice, open_base
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, PathError, extremes
@@ -101,15 +101,15 @@ class PhotoCompleter:
         views = self._plan(photo.path, prediction)
         with reporter.stage("complete", seconds) as step:
             scene, saved_view = self._fill(prediction, views, step)
-            if not all_finite(scene.aux):
+            if not scene.aux.finite:
                 raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
         return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
 
     def _tell(self, photo: Photo, prediction: BasePrediction, choice: Choice, reporter: Reporter) -> None:
         """Which base it was, and what it took."""
         name = photo.path.name
-        if choice.news:
-            reporter.say(f"{name}: {choice.news}")
+        if choice.note:
+            reporter.say(f"{name}: {choice.note}")
         reporter.say(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"

@@ -20,9 +20,9 @@ from spackle.app.complete import (
 )
 from spackle.app.report import base_before, is_done, make_report, summary
 from spackle.app.video import PathOptions, video_problem
-from spackle.bases.depth_map import DepthMap, calibrations_beside
+from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.lite.base import LiteBase
-from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase, find_depth
+from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
 from spackle.bases.sharp import SharpBase
 from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError

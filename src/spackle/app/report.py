@@ -41,8 +41,8 @@ def make_report(
         "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
-    if choice.passed_over:
-        report["base"]["passed_over"] = list(choice.passed_over)
+    if choice.failures:
+        report["base"]["passed_over"] = list(choice.failures)
     if weights == "seeds":
         report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
     if done.saved_view is not None:

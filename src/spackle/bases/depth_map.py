@@ -24,6 +24,7 @@ Array = NDArray[Any]
 StrPath = str | os.PathLike[str]
 Quantity = Literal["depth", "disparity"]
 
+SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
 ASPECT_TOLERANCE = 0.01
@@ -51,6 +52,33 @@ class DepthMap:
                 f"depth map {self.path} is {own_width}×{own_height} but photo {photo} is {width}×{height}: "
                 "give a depth map with the photo's size or aspect ratio"
             )
+
+    def with_focal(self, focal_px: float) -> DepthMap:
+        """The map of another lens: replaces the focal length of `K`, in pixels of the map."""
+        if self.K is None or self.quantity == "depth" or self.note:  # metres that depend on no lens
+            return dataclasses.replace(self, K=None)
+        # depth = baseline · focal / disparity
+        K, ratio = self.K.clone(), focal_px / float(self.K[0, 0])
+        K[0, 0] = K[1, 1] = focal_px
+        quantum = self.quantum and self.quantum / ratio
+        return dataclasses.replace(self, depth=self.depth * ratio, K=K, quantum=quantum)
+
+
+def find_depth(depth: Path, photo: Path) -> Path:
+    """The depth map of a photo: the file itself, or the one in a folder that has the photo's name.
+
+    Raises:
+        InputError: a folder without such a file.
+    """
+    if not os.path.isdir(depth):
+        return depth
+    for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which a.png may mean too
+        for suffix in SUFFIXES:
+            candidate = depth / f"{name}{suffix}"
+            if os.path.isfile(candidate) and candidate.resolve() != photo.resolve():
+                return candidate
+    names = ", ".join(f"{photo.stem}{suffix}" for suffix in SUFFIXES)
+    raise InputError(f"{photo}: no depth map in {depth}: looked for {names}")
 
 
 def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath | None = None) -> DepthMap:

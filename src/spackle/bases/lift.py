@@ -43,15 +43,19 @@ class RgbdBase:
 
     name = "rgbd"
 
-    def __init__(self, depth: DepthMap) -> None:
+    def __init__(self, depth: DepthMap, lens_source: str = "calibration") -> None:
         self.depth = depth
+        self.lens_source = lens_source  # of the map's intrinsics; "" if they are the user's
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
         self.depth.check_shape(photo.height, photo.width, photo.path)
         photo = resize_photo(photo)
         prediction = lift(photo.rgb, self.depth, self._camera(photo))
-        return dataclasses.replace(prediction, lens_source="" if self.depth.K is None else "calibration")
+        notes = prediction.notes | ({"depth": self.depth.note} if self.depth.note else {})
+        return dataclasses.replace(
+            prediction, notes=notes, lens_source="" if self.depth.K is None else self.lens_source
+        )
 
     def _camera(self, photo: Photo) -> Camera:
         """The calibration's lens where there is one, on the photo's pixels; else the photo's."""

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import spackle
-from spackle.bases.open import BaseSettings, find_depth, kind_of
+from spackle.bases.depth_map import find_depth
+from spackle.bases.open import NETWORKS, BaseSettings, kind_of
 from spackle.camera_path import MAX_DISPARITY, spelled
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import ViewChoices
@@ -46,8 +47,11 @@ class DatasetOptions:
         """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
         kind_of(self.base.name)  # a dataset says of which base it is, so no `auto`
         self.base.check()
-        self.base.check_has_depth()
         depth = self.base.depth
+        if depth is None and not self.base.kind.network:
+            raise InputError(
+                f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
+            )
         if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
             raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
         low, high = self.choices.disparity

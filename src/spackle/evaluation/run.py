@@ -138,7 +138,7 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, 
         raise InputError(f"{case.name}: has no second photo")
     loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
-    alignment = _align(loaded, prediction, evaluation, evaluation.base.takes_depth) if options.near else None
+    alignment = _align(loaded, prediction, evaluation, not options.base.kind.network) if options.near else None
     if alignment:
         at, scale = (loaded.camera, prediction.camera), alignment.scale
         wanted = [Wanted(NEAR, view.name, to_base(view.camera, *at, scale), view.rgb) for view in loaded.seconds]

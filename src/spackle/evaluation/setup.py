@@ -154,7 +154,8 @@ class Evaluation:
         Raises:
             InputError: the case has no depth for a base that takes it, or a file of it cannot be used.
         """
-        return open_loaded(RgbdBase(known_depth(loaded.case))) if self.base.takes_depth else self.base
+        network = self.options.base.kind.network
+        return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
 
 def open_evaluation(options: EvaluateOptions) -> Evaluation:
@@ -225,7 +226,7 @@ def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequen
         "base": {
             "name": base.public_name,
             "title": base.title,
-            "says": base.says,
+            "says": base.description,
             "weights": base_digest(base.files),
             "precision": base.precision,
             "device": options.device.type,
