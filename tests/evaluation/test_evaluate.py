@@ -33,7 +33,7 @@ from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.methods import Shot, make_method
-from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim, ssim_map
+from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim_average, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
 from spackle.evaluation.results import ImageResult, Mean, Row
 from spackle.evaluation.results import Run as Results
@@ -66,14 +66,16 @@ def test_psnr_and_ssim_are_scikit_images(seed: int) -> None:
     image, truth = noisy(seed)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
     mean, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
-    assert ssim(image, truth) == pytest.approx(mean, abs=1e-6)
+    assert ssim_average(ssim_map(image, truth)) == pytest.approx(mean, abs=1e-6)
     assert np.abs(ssim_map(image, truth).numpy() - full).max() < 1e-6
     mask = torch.zeros(image.shape[:2], dtype=torch.bool)
     mask[:20, -30:] = True  # up to the border, where half of a hole may be
     for found, part in ((psnr(image, truth), np.s_[:]), (psnr(image, truth, mask), np.s_[:20, -30:])):
         expected = theirs.peak_signal_noise_ratio(truth.numpy()[part], image.numpy()[part], data_range=1)
         assert found == pytest.approx(expected, abs=1e-6)
-    assert ssim(image, truth, mask) == pytest.approx(float(ssim_map(image, truth)[mask].mean()), abs=1e-12)
+    assert ssim_average(ssim_map(image, truth), mask) == pytest.approx(
+        float(ssim_map(image, truth)[mask].mean()), abs=1e-12
+    )
     changed = torch.where(mask[..., None], image, torch.zeros_like(image))
     assert psnr(changed, truth, mask) == psnr(image, truth, mask)
 
@@ -82,9 +84,9 @@ def test_metrics_of_nothing_and_of_equal_images() -> None:
     image, truth = noisy()
     nothing = torch.zeros(image.shape[:2], dtype=torch.bool)
     assert math.isnan(psnr(image, truth, nothing))
-    assert math.isnan(ssim(image, truth, nothing))
+    assert math.isnan(ssim_average(ssim_map(image, truth), nothing))
     assert psnr(image, image) == math.inf
-    assert ssim(image, image) == pytest.approx(1, abs=1e-12)
+    assert ssim_average(ssim_map(image, image)) == pytest.approx(1, abs=1e-12)
     assert reduction(0.2, 0.05) == pytest.approx(0.75)
     assert math.isnan(reduction(0.0, 0.0))
 

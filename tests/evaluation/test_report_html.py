@@ -20,7 +20,7 @@ from evaluation_data import run_config, write_boxes
 from PIL import Image
 
 from spackle.evaluation.plots import SCENES, STYLES, Series, draw, evenly, overhead_plot
-from spackle.evaluation.report import BUDGET, MOST, ReportSource, encode, fitting, make_report, size_of
+from spackle.evaluation.report import BUDGET, MOST, ReportSource, encode, fitting, make_report
 from spackle.evaluation.results import ImageResult, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.table import BEST, Table
@@ -195,7 +195,8 @@ def test_many_evaluations_still_fit() -> None:
     noise = Image.effect_noise((960, 720), 90).convert("RGB")
     fits = fitting([{"base": encode(noise), "spackle": encode(noise)}] * 12)
     assert sum(len(data) * 4 / 3 for case in fits for data in case.values()) <= BUDGET
-    width, height = size_of(fits[0]["base"])
+    with Image.open(io.BytesIO(fits[0]["base"])) as opened:
+        width, height = opened.size
     assert width < 960
     assert abs(width / height - 4 / 3) < 0.02
     whole = [{"base": encode(Image.new("RGB", (960, 720)))}]

@@ -105,7 +105,7 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
         if not (math.isfinite(focal_px) and focal_px > 0):
             raise InputError(f"--focal-px must be a positive number, got {focal_px}")
         lens = lens and dataclasses.replace(lens, focal_px=focal_px)
-    stored, is_png = _read(path)
+    stored, is_png = read_array(path)
     values = np.where(np.isfinite(stored), stored, 0)
     if negative := int((values < 0).sum()):
         raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
@@ -124,7 +124,7 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
 
 
 @dataclasses.dataclass(frozen=True)
-class _Calibration:
+class Calibration:
     """A rectified stereo pair: the left camera and the way back from disparity to depth."""
 
     focal_px: float
@@ -138,9 +138,10 @@ class _Calibration:
 
     @property
     def K(self) -> Tensor:
+        """[3, 3] intrinsics of the left camera, in pixels."""
         return torch.tensor([[self.focal_px, 0.0, self.cx], [0.0, self.focal_px, self.cy], [0.0, 0.0, 1.0]])
 
-    def check(self, path: StrPath) -> _Calibration:
+    def check(self, path: StrPath) -> Calibration:
         """Itself; InputError naming the file where the numbers make no sense."""
         for name in ("focal_px", "baseline_m", "scale"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
@@ -155,10 +156,19 @@ def calibrations_beside(path: Path) -> tuple[Path, Path]:
     return path.with_name("scene.json"), path.with_name("calib.txt")
 
 
-def _find_calibration(path: Path, calib: StrPath | None) -> _Calibration | None:
+def read_calibration(path: StrPath) -> Calibration:
+    """A pair's calibration from a `scene.json`, or else from Middlebury's `calib.txt`.
+
+    Raises:
+        InputError: the file is missing, no calibration, or has numbers that make no sense.
+    """
+    lens = _read_scene(path, None) if Path(path).suffix.lower() == ".json" else None
+    return lens or _read_calib(path)
+
+
+def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
     if calib is not None:
-        check_file(calib, "calibration")
-        return _read_scene(calib, None) if Path(calib).suffix.lower() == ".json" else _read_calib(calib)
+        return read_calibration(calib)
     (scene, text), stem = calibrations_beside(path), path.stem.lower()
     if scene.is_file() and (lens := _read_scene(scene, path.name)):
         return lens
@@ -169,14 +179,14 @@ def _find_calibration(path: Path, calib: StrPath | None) -> _Calibration | None:
     return None
 
 
-def _read_calib(path: StrPath) -> _Calibration:
+def _read_calib(path: StrPath) -> Calibration:
     """Middlebury's text: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs in pixels, baseline in millimetres."""
-    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", _read_text(path), re.MULTILINE))
+    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", read_text(path), re.MULTILINE))
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
     try:
         matrix = [float(n) for n in re.findall(number, entries["cam0"])]
         focal, _, cx, _, _, cy, *_ = matrix
-        lens = _Calibration(focal, cx, cy, float(entries.get("doffs", 0)), float(entries["baseline"]) / 1000)
+        lens = Calibration(focal, cx, cy, float(entries.get("doffs", 0)), float(entries["baseline"]) / 1000)
         if "width" in entries and "height" in entries:
             lens = dataclasses.replace(lens, size=(int(entries["width"]), int(entries["height"])))
     except (KeyError, ValueError) as error:
@@ -186,15 +196,15 @@ def _read_calib(path: StrPath) -> _Calibration:
     return lens.check(path)
 
 
-def _read_scene(path: StrPath, disparity: str | None) -> _Calibration | None:
+def _read_scene(path: StrPath, disparity: str | None) -> Calibration | None:
     """A `scene.json`; None where it is about another file than `disparity`."""
     try:
-        scene = json.loads(_read_text(path))
+        scene = json.loads(read_text(path))
         if disparity is not None and scene.get("disparity") != disparity:
             return None
         focal, cx, cy, doffs, baseline = (float(scene[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
         scale, invalid = float(scene.get("disparity_scale", 1)), float(scene.get("invalid", "inf"))
-        lens = _Calibration(focal, cx, cy, doffs, baseline, scale, invalid)
+        lens = Calibration(focal, cx, cy, doffs, baseline, scale, invalid)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(
             f"{path}: not a scene description: needs focal_px, cx, cy, doffs_px and baseline_m as JSON numbers"
@@ -202,9 +212,10 @@ def _read_scene(path: StrPath, disparity: str | None) -> _Calibration | None:
     return lens.check(path)
 
 
-def _read_text(path: StrPath) -> str:
-    if check_file(path, "calibration") > MAX_TEXT_BYTES:
-        raise InputError(f"{path}: too long for a calibration: give another file")
+def read_text(path: StrPath, kind: str = "calibration", at_most: int = MAX_TEXT_BYTES) -> str:
+    """A short text file; InputError where it is missing, or has more than `at_most` bytes."""
+    if check_file(path, kind) > at_most:
+        raise InputError(f"{path}: too long for a {kind}: give another file")
     return Path(path).read_text(encoding="utf-8", errors="replace")
 
 
@@ -219,7 +230,7 @@ def _as_depth(stored: Array, is_png: bool, path: StrPath) -> tuple[Array, Array,
     return stored, np.isfinite(stored), 1.0
 
 
-def _as_disparity(stored: Array, is_png: bool, lens: _Calibration, path: StrPath) -> tuple[Array, Array, float]:
+def _as_disparity(stored: Array, is_png: bool, lens: Calibration, path: StrPath) -> tuple[Array, Array, float]:
     """Depth in metres, validity and the unit of the stored values in 1/m."""
     height, width = stored.shape
     if lens.size and max(abs(lens.size[0] / width - 1), abs(lens.size[1] / height - 1)) > CALIBRATED_SIZE_TOLERANCE:
@@ -241,8 +252,8 @@ def grid_step(values: Array) -> float | None:
     return float(np.gcd.reduce(np.diff(distinct))) if len(distinct) >= MIN_DISTINCT else 1.0
 
 
-def _read(path: StrPath) -> tuple[Array, bool]:
-    """The stored numbers [H, W] of any format, and whether they come from a PNG."""
+def read_array(path: StrPath) -> tuple[Array, bool]:
+    """The stored numbers [H, W] of any format, and whether they come from a PNG; InputError where it is none."""
     try:
         with open(path, "rb") as file:
             magic = file.read(8)

@@ -106,62 +106,45 @@ def definitions(names: tuple[str, ...]) -> list[str]:
 def reduction(before: float, after: float) -> float:
     """1 − after / before, the relative decrease of the HAR (paper, eq. 11); NaN without any hole.
 
-    The paper's own numbers (tab:controlled_disocclusion) are the reduction of a dataset's mean HAR, not the mean of
-    its images' reductions; so are those of our tables.
+    The paper's numbers (tab:controlled_disocclusion), and ours, are the reduction of a dataset's mean HAR.
     """
     return 1 - after / before if before > 0 else math.nan
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """-10 log10 of the mean squared difference over pixels and channels, in dB; higher is better.
-
-    Args:
-        image: [H, W, 3] sRGB 0..1.
-        truth: [H, W, 3].
-        mask: [H, W] bool, the pixels that count; all where None.
-
-    Returns:
-        Decibels; infinite where both are equal, NaN where no pixel counts.
-    """
-    if mask is None:
-        mask = torch.ones(image.shape[:2], dtype=torch.bool)
-    return hole_psnr(image.double(), truth.double(), mask)
-
-
-def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) of each sRGB channel, averaged; 1 is equal, higher is better.
-
-    Without a mask the average runs over the pixels whose window lies within the picture, as published. A mask may reach
-    the picture's border, where much of a hole is; there the picture is mirrored to fill the window.
-
-    Args:
-        image: [H, W, 3] sRGB 0..1.
-        truth: [H, W, 3].
-        mask: [H, W] bool, the pixels that count.
-
-    Returns:
-        The average; NaN where no pixel counts.
-    """
-    return ssim_average(ssim_map(image, truth), mask)
+    """`hole_psnr` in float64 over the pixels of `mask` [H, W], all where None: in dB, higher is better."""
+    everywhere = torch.ones(image.shape[:2], dtype=torch.bool)
+    return hole_psnr(image.double(), truth.double(), everywhere if mask is None else mask)
 
 
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:
-    """`ssim` of a map that is at hand: [H, W, 3]."""
-    if mask is None:
-        edge = WINDOW // 2
-        return float(similarity[edge:-edge, edge:-edge].mean())
-    return float(similarity[mask].mean())
+    """Structural similarity (Wang et al. 2004) from its map; 1 is equal, higher is better.
+
+    Without a mask the average runs over the pixels whose window lies within the picture, as published. A mask may reach
+    the picture's border, where much of a hole is.
+
+    Args:
+        similarity: [H, W, 3], see `ssim_map`.
+        mask: [H, W] bool, the pixels that count.
+
+    Returns:
+        The average over pixels and channels; NaN where no pixel counts.
+    """
+    edge = WINDOW // 2
+    return float((similarity[edge:-edge, edge:-edge] if mask is None else similarity[mask]).mean())
 
 
 def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
-    """SSIM at each pixel and channel, [H, W, 3] float64, under a Gaussian window of 11 pixels with σ 1.5."""
+    """SSIM at each pixel and channel, [H, W, 3] float64, under a Gaussian window of 11 pixels with σ 1.5.
+
+    At the border the picture is mirrored to fill the window. `image` and `truth` are [H, W, 3] sRGB 0..1.
+    """
     x, y = (picture.double().permute(2, 0, 1).contiguous() for picture in (image, truth))
     mean_x, mean_y, square_x, square_y, product = (_blur(moment) for moment in (x, y, x * x, y * y, x * y))
     variance_x, variance_y = square_x - mean_x**2, square_y - mean_y**2
     covariance = product - mean_x * mean_y
     likeness = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    similarity = likeness / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))
-    return similarity.permute(1, 2, 0)
+    return (likeness / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))).permute(1, 2, 0)
 
 
 def _blur(image: Tensor) -> Tensor:
@@ -206,8 +189,8 @@ def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dic
         try:
             with _quiet(), contextlib.nullcontext() if download else _off_the_network(attempts):
                 options: dict[str, Any] = DEFINITIONS[name].options or {}
-                states[name] = f"pyiqa {getattr(pyiqa, '__version__', 'unknown')}"
                 metrics[name] = _measure_by(pyiqa.create_metric(name, device=torch.device(device), **options))
+                states[name] = f"pyiqa {getattr(pyiqa, '__version__', 'unknown')}"
         except Exception as error:  # whatever a stranger's package raises is one line of the report
             why = f"pyiqa cannot load it: {reason_in_a_line(error)}"
             if attempts:

@@ -9,7 +9,7 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from spackle.errors import InputError
@@ -92,14 +92,9 @@ def check_matplotlib(option: str) -> None:
 
 
 def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None], height: float = HEIGHT) -> bytes:
-    """Series on a pair of axes, as an SVG file; the same values give the same bytes.
+    """Series on axes with the titles `x` and `y`, as an SVG file `height` inches high; `finish` sets scales and ticks.
 
-    Args:
-        series: in the order of the legend.
-        x: title of the axis.
-        y: title of the axis.
-        finish: sets scales and ticks.
-        height: inches.
+    The same values give the same bytes.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -123,25 +118,21 @@ def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None
 
 def plots_of(run: Run) -> list[Plot]:
     """The plots of an evaluation that its figures allow."""
-    if run.near:
-        made = [overhead_plot(run), *(scenes_plot(run, figure) for figure in SCENE_FIGURES)]
-    else:
-        made = [holes_plot(run), overhead_plot(run)]
+    scenes = [scenes_plot(run, figure) for figure in SCENE_FIGURES] if run.near else []
+    made = [*([] if run.near else [holes_plot(run)]), overhead_plot(run), *scenes]
     return [plot for plot in made if plot]
 
 
 def holes_plot(run: Run) -> Plot | None:
     """HAR against disparity, before and after, and the paper's."""
 
-    def known(found: Iterable[tuple[float, float | None]]) -> list[tuple[float, float]]:
-        return [(move, value) for move, value in found if value is not None]
-
     def means(figure: str, method: str) -> list[tuple[float, float]]:
         moves = sorted(map(float, run.config["disparities"]))
-        return known((move, run.mean(figure, method, f"{move:g}").value) for move in moves)
+        found = [(move, run.mean(figure, method, f"{move:g}").value) for move in moves]
+        return [(move, value) for move, value in found if value is not None]
 
     def papers(place: int) -> list[tuple[float, float]]:
-        return known((move, paper.at(paper.HOLES.get(run.title), move)[place]) for move in paper.DISPARITIES)
+        return list(zip(paper.DISPARITIES, paper.HOLES.get(run.title, ())[place::3], strict=False))
 
     series = [Series(f"before: {run.base} alone", "base", means("har_before", run.methods[0]), line="--")]
     filling = [method for method in run.methods if method in FILLING]
@@ -174,8 +165,7 @@ def overhead_plot(run: Run) -> Plot | None:
     for method in (name for name in run.methods if name in ADDING):
         dots = [
             (100 * before, 100 * share)
-            for record in run.measured
-            for row in record.rows
+            for row in run.rows
             if row.method == method
             and (before := row.figures.get("har_before")) is not None
             and (share := row.figures.get("aux_share")) is not None
@@ -189,11 +179,8 @@ def overhead_plot(run: Run) -> Plot | None:
     shown = sum(len(one.points) for one in series)
     note = "One dot for each image and view." if shown == count else f"{shown:,} of {count:,} images and views."
     if not run.near and run.title in paper.HOLES:
-        found = [
-            (paper.at(paper.HOLES[run.title], m)[0], paper.at(paper.GAUSSIANS[run.title], m)[1])
-            for m in (paper.DISPARITIES)
-        ]
-        means = [(100 * hole, share) for hole, share in found if hole is not None and share is not None]
+        holes, shares = paper.HOLES[run.title][::3], paper.GAUSSIANS[run.title][1::3]
+        means = [(100 * hole, share) for hole, share in zip(holes, shares, strict=True)]
         series.append(Series("Spackle on SHARP (paper), means", "spackle", means, True))
 
     def finish(axes: Axes) -> None:

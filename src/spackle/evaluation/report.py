@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -19,17 +20,7 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import NEAR
-from spackle.evaluation.results import (
-    IMAGES,
-    RESULTS,
-    TIMES,
-    ImageResult,
-    Run,
-    load_run,
-    read_json,
-    stem_of,
-    write_text,
-)
+from spackle.evaluation.results import RESULTS, TIMES, ImageResult, Run, image_file, load_run, read_json
 from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, rank, thumbnail
 from spackle.evaluation.table import BEST, EMPTY, Table
 from spackle.evaluation.tables import ADDING, NOT_RUN, PAPER_ROW, count_text, make_tables, method_name, ratio_text
@@ -105,31 +96,21 @@ def make_report(sources: Sequence[ReportSource], bench: Mapping[str, Any] | None
     return UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", page) + "\n"
 
 
-def write_report(sources: Sequence[ReportSource], bench: Mapping[str, Any] | None, output: Path) -> None:
-    """report.html."""
-    write_text(make_report(sources, bench), output / REPORT)
-
-
 def source_of(run: Run, folder: Path, versions: Mapping[str, Any], machine: Mapping[str, Any]) -> ReportSource:
-    """An evaluation for a report, with the pictures that lie in its folder."""
+    """An evaluation for a report, with the pictures in its folder."""
 
     def pictures(index: int) -> dict[str, bytes]:
-        files = {name: picture_file(folder, index, run.records[index].name, name) for name in columns(run)}
+        files = {name: image_file(folder, index, run.records[index].name, f".{name}.webp") for name in columns(run)}
         return {name: file.read_bytes() for name, file in files.items() if file.is_file()}
 
     return ReportSource(run, pictures, versions, machine)
 
 
 def load_source(folder: Path) -> ReportSource:
-    """A finished evaluation for a report.
-
-    Raises:
-        InputError: there is none.
-    """
+    """A finished evaluation for a report; InputError where there is none."""
     run = load_run(folder)
-    about = read_json(folder / RESULTS).get("versions", {})
     times = read_json(folder / TIMES) if (folder / TIMES).is_file() else {}
-    return source_of(run, folder, about, times.get("hardware", {}))
+    return source_of(run, folder, read_json(folder / RESULTS).get("versions", {}), times.get("hardware", {}))
 
 
 def find_bench(folders: Sequence[Path]) -> dict[str, Any] | None:
@@ -169,16 +150,16 @@ def findings(run: Run) -> list[str]:
             means_text = [f"{METHODS[m].title} {v:.{digits}f}{unit}" for m, v in means.items() if v is not None]
             lines += [f"{what}: {', '.join(means_text)}."] if means_text else []
         return lines
-    method = next((name for name in ADDING if name in run.methods), None)
-    for move in run.config["disparities"] if method else ():
-        figures = ("har_before", "har", "aux", "aux_share")
-        before, after, added, share = (run.mean(figure, str(method), f"{move:g}").value for figure in figures)
-        if before is not None and after is not None and added is not None and share is not None:
-            lines.append(
-                f"At disparity {move:g} the base alone leaves {_percent(before)} of the pixels open, "
-                f"{METHODS[str(method)].title} {_percent(after)}, with {count_text(added)} added Gaussians a view "
-                f"({_percent(share)} of the base's)."
-            )
+    for method in [name for name in ADDING if name in run.methods][:1]:
+        for move in run.config["disparities"]:
+            means = [run.mean(name, method, f"{move:g}").value for name in ("har_before", "har", "aux_share", "aux")]
+            if None not in means:
+                before, after, share, added = (value or 0.0 for value in means)
+                lines.append(
+                    f"At disparity {move:g} the base alone leaves {_percent(before)} of the pixels open, "
+                    f"{METHODS[method].title} {_percent(after)}, with {count_text(added)} added Gaussians a view "
+                    f"({_percent(share)} of the base's)."
+                )
     return lines
 
 
@@ -229,17 +210,17 @@ def _case(run: Run, record: ImageResult, place: str, pictures: Mapping[str, byte
     """An image: its pictures one over the other, and the figures of the view that they show."""
     shown = record.facts["shown"]
     rows = [row for row in record.rows if (row.setting, row.view) == (shown["setting"], shown["view"])]
-    hole = next((row.figures.get("har_before") for row in rows), None)
+    by_method = {row.method: row.figures for row in rows}
+    hole = next((figures.get("har_before") for figures in by_method.values()), None)
     names = list(pictures)
     left = "base" if "base" in pictures and len(names) > 1 else names[0]
-    width, height = size_of(pictures[left])
-    by_method = {row.method: row.figures for row in rows}
+    with Image.open(io.BytesIO(pictures[left])) as image:
+        width, height = image.size
     keys = [key for key in COLUMNS if any(figures.get(key) is not None for figures in by_method.values())]
     cells = []
     for method in (name for name in run.methods if name in by_method):
-        values = [by_method[method].get(key) for key in keys]
-        texts = [EMPTY if v is None else COLUMNS[key][1](v) for key, v in zip(keys, values, strict=True)]
-        cells.append((column_title(run, method), *texts))
+        values = [(COLUMNS[key][1], by_method[method].get(key)) for key in keys]
+        cells.append((column_title(run, method), *(EMPTY if v is None else text(v) for text, v in values)))
     return {
         "name": record.name,
         "place": place,
@@ -251,16 +232,9 @@ def _case(run: Run, record: ImageResult, place: str, pictures: Mapping[str, byte
         "right": next((n for n in ("spackle", *reversed(names)) if n in pictures and n != left), left),
         "width": width,
         "height": height,
-        "heads": [
-            COLUMNS[key][0].replace(" ↑", "\N{NO-BREAK SPACE}↑").replace(" ↓", "\N{NO-BREAK SPACE}↓") for key in keys
-        ],
+        "heads": [re.sub(" ([↑↓])", "\N{NO-BREAK SPACE}\\1", COLUMNS[key][0]) for key in keys],
         "rows": cells,
     }
-
-
-def picture_file(folder: Path, index: int, image: str, method: str) -> Path:
-    """Where an evaluation keeps the picture of an image by a method; "truth" is one of them."""
-    return folder / IMAGES / f"{stem_of(index, image)}.{method}.webp"
 
 
 def save_picture(picture: Tensor, path: Path) -> None:
@@ -276,24 +250,18 @@ def encode(image: Image.Image) -> bytes:
     return file.getvalue()
 
 
-def size_of(data: bytes) -> tuple[int, int]:
-    """Width and height of a picture."""
-    with Image.open(io.BytesIO(data)) as image:
-        return image.width, image.height
-
-
 def fitting(cases: Sequence[Mapping[str, bytes]]) -> list[dict[str, bytes]]:
     """The same pictures, all of them smaller where they are too many bytes together."""
+
+    def shrunk(data: bytes, side: int) -> bytes:
+        with Image.open(io.BytesIO(data)) as image:
+            small = image.convert("RGB")
+        small.thumbnail((side, side))
+        return encode(small)
+
     fits = [dict(case) for case in cases]
     for side in SMALLER:
         if sum(len(data) * 4 // 3 for case in fits for data in case.values()) <= BUDGET:
             break
-        fits = [{name: _shrunk(data, side) for name, data in case.items()} for case in cases]
+        fits = [{name: shrunk(data, side) for name, data in case.items()} for case in cases]
     return fits
-
-
-def _shrunk(data: bytes, side: int) -> bytes:
-    with Image.open(io.BytesIO(data)) as image:
-        small = image.convert("RGB")
-    small.thumbnail((side, side))
-    return encode(small)

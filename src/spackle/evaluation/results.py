@@ -91,6 +91,11 @@ class Run:
         return [record for record in self.records if record.problem is None]
 
     @property
+    def rows(self) -> list[Row]:
+        """Of all images."""
+        return [row for record in self.measured for row in record.rows]
+
+    @property
     def base_gaussians(self) -> float | None:
         """Mean over the images; the same for all where the base is SHARP."""
         counts = [record.facts["base_gaussians"] for record in self.measured]
@@ -98,19 +103,18 @@ class Run:
 
     def mean(self, figure: str, method: str, setting: str) -> Mean:
         """Over all views of all images: each novel view counts once, as in the paper's "per novel view"."""
-        rows = [row for record in self.measured for row in record.rows]
-        values = [r.figures[figure] for r in rows if (r.method, r.setting) == (method, setting) and figure in r.figures]
-        found = [value for value in values if value is not None]
-        return Mean(math.fsum(found) / len(found) if found else None, len(found), len(values) - len(found))
+        own = [row.figures for row in self.rows if (row.method, row.setting) == (method, setting)]
+        found = [value for figures in own if (value := figures.get(figure)) is not None]
+        bad = sum(figure in figures for figures in own) - len(found)
+        return Mean(math.fsum(found) / len(found) if found else None, len(found), bad)
 
     def plain(self) -> dict[str, Any]:
         """Ready for JSON: everything, and the means beside it."""
-        rows = [row for record in self.measured for row in record.rows]
         means = [
             {"setting": setting, "method": method, "figure": figure} | dataclasses.asdict(mean)
-            for setting in dict.fromkeys(row.setting for row in rows)
+            for setting in dict.fromkeys(row.setting for row in self.rows)
             for method in self.methods
-            for figure in dict.fromkeys(name for row in rows for name in row.figures)
+            for figure in dict.fromkeys(name for row in self.rows for name in row.figures)
             if (mean := self.mean(figure, method, setting)).count + mean.bad
         ]
         problems = {record.name: record.problem for record in self.records if record.problem is not None}
@@ -119,15 +123,10 @@ class Run:
 
 
 def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
-    """Make the folder this configuration's, or check that it is.
-
-    Args:
-        output: the folder.
-        config: its "kind" tells whose results there are, see `KINDS`.
-        parts: the folder in it for what is finished.
+    """Make a folder this configuration's, with a folder for finished `parts`; `KINDS` has the configuration's "kind".
 
     Raises:
-        InputError: it holds another one; the message tells where they differ.
+        InputError: it holds another configuration; the message tells where they differ.
     """
     make_folder(output / parts)
     remove_half_written(output, output / parts)
@@ -146,6 +145,11 @@ def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
 def stem_of(index: int, name: str) -> str:
     """What an image's files are called."""
     return f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}"
+
+
+def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
+    """One of an image's files: its record (.json), its strip (.png), or its picture by a method (.METHOD.webp)."""
+    return output / IMAGES / (stem_of(index, name) + suffix)
 
 
 def save_record(record: ImageResult, photo: str, seconds: float, path: Path) -> None:

@@ -22,7 +22,16 @@ from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import NEAR, Wanted, large_views, measure
-from spackle.evaluation.results import ImageResult, Run, begin, load_record, save_record, write_json, write_text
+from spackle.evaluation.results import (
+    ImageResult,
+    Run,
+    begin,
+    image_file,
+    load_record,
+    save_record,
+    write_json,
+    write_text,
+)
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
@@ -88,18 +97,14 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
             if stop():
                 return None
             inputs = inputs_digest(case)
-            one = load_record(_image_file(output, index, case, ".json"), inputs)
-            if one is None or not _image_file(output, index, case, ".png").is_file():
+            one = load_record(image_file(output, index, case.name, ".json"), inputs)
+            if one is None or not image_file(output, index, case.name, ".png").is_file():
                 if index and not begun:
                     reporter.say(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun, one = True, _do_image(evaluation, index, case, inputs, output, reporter)
             found.append(one)
             step(index + 1, len(cases))
     return found
-
-
-def _image_file(output: Path, index: int, case: Case, suffix: str) -> Path:
-    return output / results.IMAGES / (results.stem_of(index, case.name) + suffix)
 
 
 def _do_image(
@@ -119,9 +124,9 @@ def _do_image(
         reporter.say(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
     for name, picture in pictures.items():
-        report.save_picture(picture, report.picture_file(output, index, case.name, name))
-    save_png(strip(pictures), _image_file(output, index, case, ".png"))
-    save_record(record, inputs, seconds, _image_file(output, index, case, ".json"))
+        report.save_picture(picture, image_file(output, index, case.name, f".{name}.webp"))
+    save_png(strip(pictures), image_file(output, index, case.name, ".png"))
+    save_record(record, inputs, seconds, image_file(output, index, case.name, ".json"))
     reporter.detail(f"  {case.name}: {seconds:.1f} s")
     return record, seconds
 
@@ -212,7 +217,7 @@ def _finish(
         raise InputError(f"{options.root}: none of {len(found)} images gave figures (the lines above say why)")
     _write_tables([run], output)
     if ranking := rank(run):
-        strips = {case.name: _image_file(output, k, case, ".png") for k, case in enumerate(evaluation.cases)}
+        strips = {case.name: image_file(output, k, case.name, ".png") for k, case in enumerate(evaluation.cases)}
         for name, order in ((results.BEST, ranking.names), (results.WORST, ranking.names[::-1])):
             with atomic_path(output / name) as temporary:
                 sheet(run, ranking, order[:CASES], strips).save(temporary)
@@ -220,7 +225,8 @@ def _finish(
     total = round(sum(seconds.values()), 3)
     write_json({"hardware": machine, "total": total, "seconds": seconds}, output / results.TIMES)
     if html:
-        report.write_report([report.source_of(run, output, versions(), machine)], report.find_bench([output]), output)
+        page = report.make_report([report.source_of(run, output, versions(), machine)], report.find_bench([output]))
+        write_text(page, output / report.REPORT)
     about: Mapping[str, Any] = {"versions": versions(), "definitions": definitions(options.wanted_metrics)}
     write_json({**about, **run.plain()}, output / results.RESULTS)
     count, passed = len(run.measured), len(found) - len(run.measured)
@@ -262,6 +268,6 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     with results_folder(output, files):
         _write_tables(runs, output)
         if html:
-            report.write_report(sources, report.find_bench(folders), output)
+            write_text(report.make_report(sources, report.find_bench(folders)), output / report.REPORT)
     names = ", ".join(f"{run.title} ({run.config['protocol']}, {run.base})" for run in runs)
     reporter.say(f"{names} -> {', '.join(str(output / name) for name in files)}")

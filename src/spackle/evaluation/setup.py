@@ -20,20 +20,19 @@ from spackle.digest import digest_of, weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
 from spackle.evaluation.datasets import DATASETS, get_dataset
-from spackle.evaluation.methods import METHODS, make_method
+from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
+from spackle.inpaint.opencv import OpenCV
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual
 from spackle.training.features import load_features
 
 BASE = BaseSettings("sharp")
-DEFAULT_METHODS = ("base", "spackle")
 MAX_LIMIT = 1_000_000
 MAX_DISPARITIES = 6  # columns of a table
-NO_FEATURES = "not run: weights: give SqueezeNet's with --features FILE"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +42,7 @@ class EvaluateOptions:
     dataset: str
     root: Path
     protocol: str = "large-view"
-    methods: Sequence[str] = DEFAULT_METHODS
+    methods: Sequence[str] = ("base", "spackle")
     disparities: Sequence[float] = DISPARITIES  # of the large views
     metrics: Sequence[str] | None = None  # the protocol's where None
     base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too
@@ -72,9 +71,8 @@ class EvaluateOptions:
     @property
     def opened(self) -> BaseSettings:
         """The base's settings, without a precision that is the residual's alone."""
-        return (
-            dataclasses.replace(self.base, precision="auto") if "--precision" in self.base.kind.refuses else self.base
-        )
+        alone = "--precision" in self.base.kind.refuses
+        return dataclasses.replace(self.base, precision="auto") if alone else self.base
 
     def check(self) -> None:
         """InputError for an option that cannot be used, whatever the images."""
@@ -101,11 +99,8 @@ class EvaluateOptions:
                 raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
         elif self.direct_ft is not None:
             raise InputError(f"--direct-ft {self.direct_ft}: no method takes it: add direct-ft to --methods")
-        self._check_disparities()
         if self.limit is not None and not 1 <= self.limit <= MAX_LIMIT:
             raise InputError(f"--limit must be between 1 and {MAX_LIMIT}, got {self.limit}")
-
-    def _check_disparities(self) -> None:
         if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
             raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
         for value in self.disparities:
@@ -166,33 +161,28 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     """
     options.check()
     dataset = get_dataset(options.dataset)
-    cases = _limited(dataset.cases(options.root), options.limit)
+    cases, limit = dataset.cases(options.root), options.limit
+    if limit is not None and limit < len(cases):  # evenly over their order
+        cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)
-    weights, direct = residual_file(options.residual), None
+    weights, direct, features = residual_file(options.residual), None, None
     network = None if weights is None else load_residual(weights)
     if options.direct_ft is not None:
         direct = open_base(dataclasses.replace(options.base, checkpoint=_there(options.direct_ft, "--direct-ft")))
-    wanted, features = options.wanted_metrics, None
+    wanted = options.wanted_metrics
     if options.features is not None and "distance" in wanted:
         features = load_features("squeezenet", _there(options.features, "--features"))
-    names = [name for name in wanted if name in DEFINITIONS]
-    published, found = open_metrics(names, options.device.type, options.download)
+    published, found = open_metrics(
+        [name for name in wanted if name in DEFINITIONS], options.device.type, options.download
+    )
     states = dict.fromkeys(wanted, OWN) | found
     if "distance" in wanted and features is None:
-        states["distance"] = NO_FEATURES
+        states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
     if "inpaint2d" in options.methods:
-        _check_opencv()
-    base, renderer = open_base(options.opened), get_renderer(options.base.device)
-    gauges = Gauges(wanted, published, features)
+        OpenCV("--methods inpaint2d:", "or leave the method out")  # raises without the package, before any work
     config = _configuration(options, dataset, cases) | {"metrics": states}  # metric → who measures it, or why nobody
-    return Evaluation(options, cases, base, direct, network, renderer, gauges, config)
-
-
-def _limited(cases: Sequence[Case], limit: int | None) -> list[Case]:
-    """So many of them, evenly over their order; all where there is no limit."""
-    if limit is None or limit >= len(cases):
-        return list(cases)
-    return [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+    base, renderer = open_base(options.opened), get_renderer(options.base.device)
+    return Evaluation(options, cases, base, direct, network, renderer, Gauges(wanted, published, features), config)
 
 
 def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
@@ -242,13 +232,3 @@ def _there(path: Path, option: str) -> Path:
     if not path.is_file():
         raise InputError(f"{option} {path}: no such file: check the name")
     return path
-
-
-def _check_opencv() -> None:
-    """InputError where the method inpaint2d has no OpenCV, before any work."""
-    try:
-        make_method("inpaint2d", None)
-    except InputError as error:
-        raise InputError(
-            "--methods inpaint2d: needs a package: pip install 'spackle-nvs[opencv]', or leave the method out"
-        ) from error

@@ -76,25 +76,27 @@ def mean_of(record: ImageResult, figure: str, method: str) -> float | None:
 
 def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str, Path]) -> Image.Image:
     """A row for each image, captioned; a column for each method, and the truth where there is one."""
-    by_name = {record.name: record for record in run.measured}
+    facts = {record.name: record.facts for record in run.measured}
     pictures = {name: Image.open(strips[name]).convert("RGB") for name in names}
     titles = [column_title(run, name) for name in columns(run)]
     width = max(max(picture.width for picture in pictures.values()), SIDE * 2)
     height = sum(picture.height + LINE + GAP for picture in pictures.values()) + LINE
     canvas = Image.new("RGB", (width, height), "white")
     draw = ImageDraw.Draw(canvas)
-    by = ranking.criterion.replace("↑", "(higher is better)").replace(
-        "↓", "(lower is better)"
-    )  # the font has no arrows
-    draw.text((4, 3), f"{run.title}, {run.config['protocol']}, by {by}", "black", font_size=FONT)
+    title = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
+    title = title.replace("↑", "(higher is better)").replace("↓", "(lower is better)")  # the font has no arrows
+    draw.text((4, 3), title, "black", font_size=FONT)
     y = LINE
     for name in names:
-        shown = by_name[name].facts["shown"]
+        shown = facts[name]["shown"]
         text = f"{name}, {shown['setting']} {shown['view']}: {ranking.values[name]:.4g}"
         draw.text((4, y + 3), text, "black", font_size=FONT)
         canvas.paste(pictures[name], (0, y + LINE))
         for index, title in enumerate(titles):
-            _label(draw, title, index * pictures[name].width // len(titles), y + LINE)
+            at = index * pictures[name].width // len(titles) + 5, y + LINE + 4
+            left, top, right, bottom = draw.textbbox(at, title, font_size=FONT)
+            draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill="black")
+            draw.text(at, title, "white", font_size=FONT)
         y += pictures[name].height + LINE + GAP
     return canvas
 
@@ -104,9 +106,3 @@ def column_title(run: Run, name: str) -> str:
     if name == TRUTH:
         return TRUTH
     return f"base ({run.base})" if name == "base" else METHODS[name].title
-
-
-def _label(draw: ImageDraw.ImageDraw, text: str, x: int, y: int) -> None:
-    box = draw.textbbox((x + 5, y + 4), text, font_size=FONT)
-    draw.rectangle((box[0] - 3, box[1] - 2, box[2] + 3, box[3] + 2), fill="black")
-    draw.text((x + 5, y + 4), text, "white", font_size=FONT)

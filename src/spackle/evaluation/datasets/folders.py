@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -47,15 +48,11 @@ def scene_folders(root: Path, dataset: str) -> list[Path]:
     layout = LAYOUTS[dataset]
     found = sorted(_walk(root, layout, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
     if not found:
-        other = looks_like(root)
+        # Another dataset that has scenes there, after a short look.
+        other = next((name for name, layout in LAYOUTS.items() if any(_walk(root, layout, GUESS_FOLDERS))), None)
         hint = f"; this looks like {other}" if other else ""
         raise InputError(f"{root}: no scene of {dataset} at or below it: expected {layout.expected}{hint}")
     return found
-
-
-def looks_like(root: Path) -> str | None:
-    """The dataset that has scenes at or below `root`, after a short look."""
-    return next((name for name, layout in LAYOUTS.items() if any(_walk(root, layout, GUESS_FOLDERS))), None)
 
 
 def by_name(scenes: Sequence[Path], name: Callable[[Path], str] = lambda scene: scene.name) -> dict[str, Path]:
@@ -86,17 +83,10 @@ def _walk(root: Path, layout: Layout, budget: int) -> Iterator[Path]:
                 yield folder
             elif depth < MAX_DEPTH and budget > 0:
                 budget -= 1
-                below += _subfolders(folder, layout.skip)
+                with contextlib.suppress(OSError), os.scandir(folder) as entries:  # no right to look into it
+                    names = [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+                    below += [folder / name for name in sorted(names) if name not in layout.skip]
         level = below
-
-
-def _subfolders(folder: Path, skip: frozenset[str]) -> list[Path]:
-    try:
-        with os.scandir(folder) as entries:
-            names = [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
-    except OSError:  # no right to look into it
-        return []
-    return [folder / name for name in sorted(names) if name not in skip]
 
 
 def _has(folder: Path, *names: str) -> bool:

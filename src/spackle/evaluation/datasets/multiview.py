@@ -38,12 +38,19 @@ class Posed:
     ids: NDArray[Any] | None = None  # of the points that it sees
 
 
-def posed_by(model: Model, names: Sequence[str], photos: Sequence[Path]) -> list[Posed]:
-    """The views of a model with the photo files that they stand for, all in the same order."""
+def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[str] | None = None) -> list[Posed]:
+    """The views of a scene's model with their photo files, in the same order; called like the files without `names`.
+
+    Raises:
+        InputError: a single view.
+    """
+    check_two(scene, len(model.views))
+    stems = names or [photo.stem for photo in photos]
     posed = []
-    for view, name, photo in zip(model.views, names, photos, strict=True):
+    for view, name, photo in zip(model.views, stems, photos, strict=True):
         z = model.points(view).z
-        posed.append(Posed(name, photo, view.camera, float(z.median()) if len(z) else math.nan, view.ids))
+        middle = float(z.median()) if len(z) else math.nan
+        posed.append(Posed(f"{scene.name}/{name}", photo, view.camera, middle, view.ids))
     return posed
 
 
@@ -71,25 +78,29 @@ def make_cases(
         metric: the poses' lengths are metres.
     """
 
-    def beside(other: Posed, to_world: Tensor) -> SecondView:
-        relative = other.camera.world_to_camera @ to_world
-        camera = dataclasses.replace(other.camera, world_to_camera=relative).to(dtype=torch.float32)
-        return SecondView(other.name, other.photo, camera)
-
-    def make_case(index: int, seconds: Sequence[int]) -> Case:
+    cases = []
+    for index, others in near_views(views, range(len(views)) if wanted is None else wanted).items():
         view, to_world = views[index], torch.linalg.inv(views[index].camera.world_to_camera)
-        return Case(
+        seconds = [
+            SecondView(other.name, other.photo, _placed(other.camera, other.camera.world_to_camera @ to_world))
+            for other in (views[k] for k in others)
+        ]
+        case = Case(
             view.name,
             view.photo,
-            dataclasses.replace(view.camera, world_to_camera=torch.eye(4)).to(dtype=torch.float32),
+            _placed(view.camera, torch.eye(4)),
             points=partial(model.points, model.views[index]) if model and len(model.views[index].ids) else None,
             bounds=(bounds or {}).get(view.photo),
-            seconds=tuple(beside(views[other], to_world) for other in seconds),
+            seconds=tuple(seconds),
             metric=metric,
         )
+        cases.append(case)
+    return cases
 
-    chosen = near_views(views, range(len(views)) if wanted is None else wanted)
-    return [make_case(index, others) for index, others in chosen.items()]
+
+def _placed(camera: Camera, world_to_camera: Tensor) -> Camera:
+    """In float32."""
+    return dataclasses.replace(camera, world_to_camera=world_to_camera).to(dtype=torch.float32)
 
 
 def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple[int, ...]]:
@@ -119,16 +130,13 @@ def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple
 def _sees_the_same(view: Posed, other: Posed) -> bool:
     if view.ids is not None and other.ids is not None:
         return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
-    return _has_middle_of(view, other) and _has_middle_of(other, view)
-
-
-def _has_middle_of(view: Posed, other: Posed) -> bool:
-    """Whether the point at the middle of the other's picture and depth is in this picture."""
-    camera = other.camera
-    middle = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64)
-    uv, z = view.camera.project(camera.unproject(middle, torch.tensor(other.depth, dtype=torch.float64)))
-    size = torch.tensor([view.camera.width, view.camera.height])
-    return bool((z > 0) & (uv >= 0).all() & (uv <= size).all())
+    for one, two in ((view, other), (other, view)):  # the middle of each picture and depth, in the other picture
+        size, seen_in = torch.tensor([two.camera.width, two.camera.height], dtype=torch.float64), one.camera
+        middle = two.camera.unproject(size / 2, torch.tensor(two.depth, dtype=torch.float64))
+        uv, z = seen_in.project(middle)
+        if not bool((z > 0) & (uv >= 0).all() & (uv <= torch.tensor([seen_in.width, seen_in.height])).all()):
+            return False
+    return True
 
 
 def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count: int) -> dict[str, list[int]]:
@@ -150,7 +158,12 @@ def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count:
     order = _in_turns(scenes)[:count]
     held = {scene: frames(scene) for scene in order}
     shares = _shares({scene: len(held[scene]) for scene in order}, count)
-    return {scene: _equally(held[scene], shares[scene], scene) for scene in scenes if scene in held}
+    picked: dict[str, list[int]] = {}
+    for scene in (scene for scene in scenes if scene in held):
+        length, share = len(held[scene]), shares[scene]
+        start = _hash(scene) % length / length if share else 0
+        picked[scene] = [held[scene][int((place + start) * length / share)] for place in range(share)]
+    return picked
 
 
 def _in_turns(scenes: Sequence[str]) -> list[str]:
@@ -174,12 +187,6 @@ def _shares(sizes: dict[str, int], count: int) -> dict[str, int]:
             shares[name] += more
             left -= more
     return shares
-
-
-def _equally(frames: Sequence[int], count: int, seed: str) -> list[int]:
-    """`count` frames at equal distances."""
-    start = _hash(seed) % len(frames) / len(frames) if count else 0
-    return [frames[int((place + start) * len(frames) / count)] for place in range(count)]
 
 
 def _hash(name: str) -> int:

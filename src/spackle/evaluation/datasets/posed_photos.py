@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.bases.depth_map import load_depth
+from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
 from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
-from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, pair_of_2014, read_text
+from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, pair_of_2014
 
 ETH3D_MODEL = "dslr_calibration_undistorted"
 LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that is there
@@ -57,10 +57,9 @@ def _photos_of(scene: Path) -> list[Case]:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
     model = read_model(folder)
-    check_two(scene, len(model.views))
-    photos = [_photo(scene, view.name) for view in model.views]
-    names = [f"{scene.name}/{Path(view.name).stem}" for view in model.views]
-    return make_cases(posed_by(model, names, photos), model=model, metric=True)
+    return make_cases(
+        posed_by(scene, model, [_photo(scene, view.name) for view in model.views]), model=model, metric=True
+    )
 
 
 def _photo(scene: Path, name: str) -> Path:
@@ -75,7 +74,7 @@ def _photo(scene: Path, name: str) -> Path:
 
 
 def _pair_of(scene: Path) -> Case:
-    """The truth lies beside the photos, or in the folder that its own archive makes."""
+    """The truth is beside the photos, or in the folder that its own archive makes."""
     apart = scene.parent.parent / "two_view_training_gt" / scene.name
     places = [at / name for at in (scene, apart) for name in TRUTHS_2014]
     return pair_of_2014(scene, next((place for place in places if place.is_file()), None))
@@ -113,14 +112,12 @@ class Tanks:
 def _read_tanks(scene: Path) -> tuple[Model, list[Posed]]:
     folder = model_folder(scene)
     model = read_model(folder)
-    check_two(scene, len(model.views))
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
     photos = [top / "images" / view.name for view in model.views]
     for photo in photos:
         if not photo.is_file():
             raise InputError(f"{photo}: no such photo, but {folder} has it: put the scene's photos there")
-    names = [f"{scene.name}/{Path(view.name).with_suffix('').as_posix()}" for view in model.views]
-    return model, posed_by(model, names, photos)
+    return model, posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
 
 
 class Llff:
@@ -149,19 +146,14 @@ def _llff_cases(scene: Path) -> list[Case]:
     if photos is None:
         raise InputError(f"{scene}: no photos: expected them in {', '.join(LLFF_PHOTOS)}")
     check_two(scene, len(photos))
-    table = _read_bounds(scene / LLFF_BOUNDS, len(photos)) if (scene / LLFF_BOUNDS).is_file() else None
-    bounds = (
-        {} if table is None else {p: (float(row[15]), float(row[16])) for p, row in zip(photos, table, strict=True)}
-    )
-    model = read_model(model_folder(scene)) if (scene / "sparse").is_dir() else None
-    if model is not None:
-        check_two(scene, len(model.views))
+    rows = _read_bounds(scene / LLFF_BOUNDS, len(photos)) if (scene / LLFF_BOUNDS).is_file() else ()
+    bounds = {photo: (float(row[15]), float(row[16])) for photo, row in zip(photos, rows, strict=False)}
+    if (scene / "sparse").is_dir():
+        model = read_model(model_folder(scene))
         files = _match(scene, [view.name for view in model.views], photos)
-        views = posed_by(model, [f"{scene.name}/{file.stem}" for file in files], files)
-        return make_cases(views, model=model, bounds=bounds)
-    assert table is not None  # a scene has one or the other
+        return make_cases(posed_by(scene, model, files), model=model, bounds=bounds)
     views = []
-    for photo, row in zip(photos, table, strict=True):
+    for photo, row in zip(photos, rows, strict=True):  # a scene has one or the other
         near, far = bounds[photo]
         views.append(Posed(f"{scene.name}/{photo.stem}", photo, _camera_of_row(row), 2 / (1 / near + 1 / far)))
     return make_cases(views, bounds=bounds)

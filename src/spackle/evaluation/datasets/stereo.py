@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.depth_map import Calibration, DepthMap, load_depth, read_array, read_calibration, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case, SecondView
 from spackle.evaluation.datasets.folders import by_name, photo_files, scene_folders
 from spackle.image import check_file, read_image
 
-MAX_TEXT_BYTES = 1 << 16
 # Middlebury and Booster calibrate with tools that put (0, 0) into the middle of the first pixel; here it is that
 # pixel's corner. (Middlebury's smaller sizes have the big one's principal point divided plainly, so there it is known
 # to half a pixel only; the pair does not notice, because both cameras move alike.)
@@ -41,95 +40,70 @@ class BrokenPhoto(InputError):
     """A photo that is there and cannot be read: a matter of its own case, and not of the folder's layout."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Pair:
-    """Two cameras side by side that look the same way."""
+def _depth_map(
+    lens: Calibration, disparity: NDArray[Any], known: NDArray[np.bool_], unit: float, path: Path
+) -> DepthMap:
+    """z = focal · baseline / (disparity + doffs).
 
-    left: Camera  # at the world's origin
-    doffs: float  # the right principal point's x minus the left one's, pixels
-    baseline: float  # the right eye stands this far to the right; the unit is the dataset's length
+    Args:
+        lens: of the pair.
+        disparity: [H, W] as stored, `unit` pixels each.
+        known: [H, W].
+        unit: pixels.
+        path: for messages.
+    """
+    reach = float(lens.K[0, 0]) * lens.baseline_m
+    with np.errstate(all="ignore"):  # what is not known may be anything
+        z = torch.from_numpy((reach / (disparity * unit + lens.doffs_px)).astype(np.float32))
+    valid = torch.from_numpy(known) & torch.isfinite(z) & (z > 0)
+    if not valid.any():
+        raise InputError(f"{path}: not one pixel has a disparity: the file is damaged, or of another dataset")
+    quantum = None
+    if disparity.dtype.kind in "iu":  # whole numbers: the grid that they lie on, in 1/length
+        steps = np.diff(np.unique(disparity[valid.numpy()].astype(np.int64)))
+        quantum = float(np.gcd.reduce(steps) if len(steps) else 1) * unit / reach
+    return DepthMap(z.where(valid, 0.0), valid, lens.K, quantum, "disparity", path)
 
-    @staticmethod
-    def of(lens: tuple[float, float, float], doffs: float, baseline: float, size: tuple[int, int]) -> Pair:
-        """From (focal, cx, cy) in pixels with centres at half-integers, and (width, height)."""
-        focal, cx, cy = lens
-        matrix = torch.tensor([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
-        return Pair(Camera(matrix, torch.eye(4), *size), doffs, baseline)
 
-    @property
-    def right(self) -> Camera:
-        """The right camera in the left one's frame."""
-        K, pose = self.left.K.clone(), torch.eye(4)
-        K[0, 2] += self.doffs
-        pose[0, 3] = -self.baseline
-        return dataclasses.replace(self.left, K=K, world_to_camera=pose)
+def _pair(
+    name: str,
+    photos: tuple[Path, Path],
+    lens: Calibration,
+    size: tuple[int, int],
+    depth: Callable[[], DepthMap],
+    *,
+    metric: bool = True,
+) -> Case:
+    """The left photo, with the right one as its second view; `lens` counts from the first pixel's corner."""
+    for photo in photos:
+        if not photo.exists():
+            check_file(photo, "photo")  # raises; a photo that cannot be read is named in its turn
+    left = Camera(lens.K, torch.eye(4), *size)
+    K, pose = lens.K, torch.eye(4)
+    K[0, 2] += lens.doffs_px
+    pose[0, 3] = -lens.baseline_m
+    right = SecondView("right", photos[1], Camera(K, pose, *size))
+    return Case(name, photos[0], left, depth=depth, seconds=(right,), metric=metric)
 
-    def depth(self, disparity: NDArray[Any], known: NDArray[np.bool_], unit: float, path: Path) -> DepthMap:
-        """z = focal · baseline / (disparity + doffs).
 
-        Args:
-            disparity: [H, W] as stored, `unit` pixels each.
-            known: [H, W].
-            unit: pixels.
-            path: for messages.
-        """
-        reach = self.left.focal[0] * self.baseline
-        with np.errstate(all="ignore"):  # what is not known may be anything
-            z = torch.from_numpy((reach / (disparity * unit + self.doffs)).astype(np.float32))
-        valid = torch.from_numpy(known) & torch.isfinite(z) & (z > 0)
-        if not valid.any():
-            raise InputError(f"{path}: not one pixel has a disparity: the file is damaged, or of another dataset")
-        quantum = None
-        if disparity.dtype.kind in "iu":  # whole numbers: the grid that they lie on, in 1/length
-            steps = np.diff(np.unique(disparity[valid.numpy()].astype(np.int64)))
-            quantum = float(np.gcd.reduce(steps) if len(steps) else 1) * unit / reach
-        return DepthMap(z.where(valid, 0.0), valid, self.left.K, quantum, "disparity", path)
-
-    def case(self, name: str, photos: tuple[Path, Path], depth: Callable[[], DepthMap], *, metric: bool) -> Case:
-        """The left photo, with the right one as its second view."""
-        for photo in photos:
-            if not photo.exists():
-                check_file(photo, "photo")  # raises; what is there and cannot be read is named in its turn
-        right = SecondView("right", photos[1], self.right)
-        return Case(name, photos[0], self.left, depth=depth, seconds=(right,), metric=metric)
+def _from_corner(lens: Calibration) -> Calibration:
+    return dataclasses.replace(lens, cx=lens.cx + HALF_PIXEL, cy=lens.cy + HALF_PIXEL)
 
 
 def pair_of_2014(folder: Path, truth: Path | None = None) -> Case:
     """A folder in the format of Middlebury 2014: im0.png, im1.png, calib.txt, and disp0.pfm or disp0GT.pfm."""
     calib = folder / "calib.txt"
-    pair = _read_calib(calib)
+    lens = _from_corner(read_calibration(calib))
+    if lens.size is None or min(lens.size) < 1:
+        raise InputError(f"{calib}: needs a width and a height above 0: the file is damaged")
     found = [at for at in (truth, *(folder / name for name in TRUTHS_2014)) if at is not None and at.is_file()]
     if not found:
         raise InputError(f"{folder}: no {' or '.join(TRUTHS_2014)}: unpack the ground truth, or leave test scenes out")
 
     def depth() -> DepthMap:
-        return dataclasses.replace(load_depth(found[0], calib=calib), K=pair.left.K)
+        return dataclasses.replace(load_depth(found[0], calib=calib), K=lens.K)
 
-    return pair.case(folder.name, (folder / "im0.png", folder / "im1.png"), depth, metric=True)
-
-
-def _read_calib(path: Path) -> Pair:
-    """Middlebury's `calib.txt`, in metres: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline in mm, width, height."""
-    number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-    facts = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", read_text(path, "calibration"), re.MULTILINE))
-    try:
-        focal, _, cx, _, _, cy, *_ = (float(n) for n in re.findall(number, facts["cam0"]))
-        doffs, baseline = float(facts.get("doffs", 0)), float(facts["baseline"]) / 1000
-        size = int(facts["width"]), int(facts["height"])
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{path}: not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs, baseline, width, height"
-        ) from error
-    if not (focal > 0 and baseline > 0 and min(size) > 0):
-        raise InputError(f"{path}: focal length, baseline and size must be positive: the file is damaged")
-    return Pair.of((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), doffs, baseline, size)
-
-
-def read_text(path: Path, kind: str, at_most: int = MAX_TEXT_BYTES) -> str:
-    """A short text; InputError where there is none."""
-    if check_file(path, kind) > at_most:
-        raise InputError(f"{path}: too long for a {kind}: give another file")
-    return path.read_text(encoding="utf-8", errors="replace")
+    return _pair(folder.name, (folder / "im0.png", folder / "im1.png"), lens, lens.size, depth)
 
 
 def _picture_size(path: Path) -> tuple[int, int]:
@@ -191,9 +165,8 @@ def _of_2006(folder: Path) -> Case:
         dmin = float(read_text(folder / "dmin.txt", "offset of the disparities"))
     except ValueError as error:
         raise InputError(f"{folder / 'dmin.txt'}: not a number: unpack the scene again") from error
-    lens = FOCAL_2006 / shrink, width / 2, height / 2
-    pair = Pair.of(lens, dmin / shrink, BASELINE_2006, (width, height))
-    return pair.case(folder.name, (left, right), lambda: _levels(pair, folder / "disp1.png", 1 / shrink), metric=True)
+    lens = Calibration(FOCAL_2006 / shrink, width / 2, height / 2, dmin / shrink, BASELINE_2006)
+    return _pair(folder.name, (left, right), lens, (width, height), _levels(lens, folder / "disp1.png", 1 / shrink))
 
 
 def _of_2003(folder: Path) -> Case:
@@ -206,13 +179,13 @@ def _of_2003(folder: Path) -> Case:
     width, height = _picture_size(left)
     scale = WIDTH_2003_FULL // width if width in (450, 900, 1800) else SCALE_2001
     size = width / WIDTH_OLD
-    lens = FOCAL_OLD * size, width / 2, height / 2
-    pair = Pair.of(lens, DOFFS_OLD * size, BASELINE_OLD, (width, height))
-    return pair.case(folder.name, (left, right), lambda: _levels(pair, truths[0], 1 / scale), metric=False)
+    lens = Calibration(FOCAL_OLD * size, width / 2, height / 2, DOFFS_OLD * size, BASELINE_OLD)
+    depth = _levels(lens, truths[0], 1 / scale)
+    return _pair(folder.name, (left, right), lens, (width, height), depth, metric=False)
 
 
-def _levels(pair: Pair, path: Path, unit: float) -> DepthMap:
-    """The whole numbers of a grey picture as disparities of `unit` pixels each."""
+def _levels(lens: Calibration, path: Path, unit: float) -> Callable[[], DepthMap]:
+    """Reads the whole numbers of a grey picture as disparities of `unit` pixels each."""
 
     def levels(image: Any) -> NDArray[Any]:
         if image.mode not in ("L", "I", "I;16", "I;16B", "RGB"):
@@ -220,23 +193,23 @@ def _levels(pair: Pair, path: Path, unit: float) -> DepthMap:
         values = np.asarray(image)
         return values if values.ndim == 2 else values[..., 0]  # grey that was saved as colour
 
-    stored = read_image(path, levels)
-    return pair.depth(stored, stored > 0, unit, path)
+    def depth() -> DepthMap:
+        stored = read_image(path, levels)
+        return _depth_map(lens, stored, stored > 0, unit, path)
+
+    return depth
 
 
 def _described(folder: Path) -> Case:
     """By a `scene.json`, whose principal point has pixel centres at half-integers; its lengths may be nominal."""
     path = folder / "scene.json"
+    lens, facts = read_calibration(path), json.loads(read_text(path))
     try:
-        facts = json.loads(read_text(path, "scene description"))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
-        focal, cx, cy, doffs, baseline = (float(facts[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            f"{path}: not a scene description: needs the photos, the disparity map and the lens"
-        ) from error
-    pair = Pair.of((focal, cx, cy), doffs, baseline, _picture_size(left))
-    return pair.case(folder.name, (left, right), lambda: load_depth(truth, calib=path), metric=False)
+    except KeyError as error:
+        raise InputError(f"{path}: not a scene description: needs the photos and the disparity map") from error
+    depth = functools.partial(load_depth, truth, calib=path)
+    return _pair(folder.name, (left, right), lens, _picture_size(left), depth, metric=False)
 
 
 class Booster:
@@ -271,23 +244,22 @@ def _booster_cases(scene: Path) -> list[Case]:
             problems.append(str(error))
     if size is None:
         return [Case(f"{scene.name}/{p.stem}", p, problem=why) for p, why in zip(photos, problems, strict=True)]
-    pair = _read_opencv(scene / "calib_00-02.xml", size)
+    lens = _read_opencv(scene / "calib_00-02.xml")
     truth = scene / "disp_00.npy"
     if not truth.is_file():
         raise InputError(f"{truth}: no such disparity map: give train/balanced; Booster's test scenes have none")
 
     def depth() -> DepthMap:
-        stored = _read_disparities(truth)
-        return pair.depth(stored, np.isfinite(stored) & (stored > 0), 1.0, truth)
+        stored, _ = read_array(truth)
+        return _depth_map(lens, stored, np.isfinite(stored) & (stored > 0), 1.0, truth)
 
-    def case(photo: Path) -> Case:
-        right = scene / "camera_02" / photo.name
-        return pair.case(f"{scene.name}/{photo.stem}", (photo, right), depth, metric=True)
+    return [
+        _pair(f"{scene.name}/{photo.stem}", (photo, scene / "camera_02" / photo.name), lens, size, depth)
+        for photo in photos
+    ]
 
-    return [case(photo) for photo in photos]
 
-
-def _read_opencv(path: Path, size: tuple[int, int]) -> Pair:
+def _read_opencv(path: Path) -> Calibration:
     text = read_text(path, "calibration")
 
     def matrix(entry: ElementTree.Element) -> NDArray[np.float64]:
@@ -297,23 +269,10 @@ def _read_opencv(path: Path, size: tuple[int, int]) -> Pair:
     try:
         entries = {entry.tag: entry for entry in ElementTree.fromstring(text)}
         left, right = (matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
-        baseline = float(entries["baselineLR"].text or "") / 1000
-        focal, cx, cy = float(left[0, 0]), float(left[0, 2]), float(left[1, 2])
-        if not (focal > 0 and baseline > 0):
-            raise ValueError("focal length and baseline must be positive")
+        cx, baseline = float(left[0, 2]), float(entries["baselineLR"].text or "") / 1000
+        lens = Calibration(float(left[0, 0]), cx, float(left[1, 2]), float(right[0, 2]) - cx, baseline)
     except (ElementTree.ParseError, KeyError, ValueError, IndexError) as error:
         raise InputError(
             f"{path}: not a Booster calibration ({reason_in_a_line(error)}): needs proj_matL, proj_matR and baselineLR"
         ) from error
-    return Pair.of((focal, cx + HALF_PIXEL, cy + HALF_PIXEL), float(right[0, 2]) - cx, baseline, size)
-
-
-def _read_disparities(path: Path) -> NDArray[Any]:
-    """Float disparities [H, W]; nothing is unpickled."""
-    try:
-        stored: NDArray[Any] = np.load(path, allow_pickle=False)
-    except Exception as error:  # NumPy at work on a stranger's bytes raises anything
-        raise InputError(f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged") from error
-    if stored.ndim != 2 or stored.dtype.kind != "f":
-        raise InputError(f"{path}: {stored.dtype} of shape {stored.shape}: expected disparities as floats, [H, W]")
-    return stored
+    return _from_corner(lens.check(path))
