@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case, load_case
 from spackle.evaluation.efficiency import SIDE, STAGES, Efficiency, Record, efficiency_tables, view_cost
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.results import IMAGES, begin, stem_of, write_json, write_text
+from spackle.evaluation.results import begin, image_file, load_part, save_part, write_json, write_text
 from spackle.evaluation.run import inputs_digest, problem_of
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
@@ -65,7 +64,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
                 if stop():
                     reporter.say("stopped; the same command goes on from here")
                     return "stopped"
-                path, inputs = output / IMAGES / f"{stem_of(index, case.name)}.json", inputs_digest(case)
+                path, inputs = image_file(output, index, case.name, ".json"), inputs_digest(case)
                 image = load_part(path, inputs)
                 if image is None:
                     try:
@@ -160,20 +159,6 @@ def count_parameters() -> dict[str, float]:
         used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
     base = used + sum(map(math.prod, unused_shapes(FULL).values()))
     return {"base": base, "base_used": used, "residual": residual, "share": residual / base}
-
-
-def save_part(path: Path, inputs: object, found: Record) -> None:
-    """Write what was measured, and of which inputs."""
-    write_json({"inputs": inputs, "found": found}, path)
-
-
-def load_part(path: Path, inputs: object) -> Record | None:
-    """What an earlier run measured; None where it is not there, or of other inputs than these (None: of any)."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return dict(content["found"]) if inputs in (None, content["inputs"]) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def check_runs(runs: int, base_runs: int | None) -> None:

@@ -152,9 +152,9 @@ def findings(run: Run) -> list[str]:
         return lines
     for method in [name for name in ADDING if name in run.methods][:1]:
         for move in run.config["disparities"]:
-            means = [run.mean(name, method, f"{move:g}").value for name in ("har_before", "har", "aux_share", "aux")]
-            if None not in means:
-                before, after, share, added = (value or 0.0 for value in means)
+            found = [run.mean(name, method, f"{move:g}").value for name in ("har_before", "har", "aux_share", "aux")]
+            if None not in found:
+                before, after, share, added = (value or 0.0 for value in found)
                 lines.append(
                     f"At disparity {move:g} the base alone leaves {_percent(before)} of the pixels open, "
                     f"{METHODS[method].title} {_percent(after)}, with {count_text(added)} added Gaussians a view "

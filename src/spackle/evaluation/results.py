@@ -142,27 +142,21 @@ def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
         raise InputError(f"{output}: holds {results} of another kind ({'; '.join(lines)}): choose another -o")
 
 
-def stem_of(index: int, name: str) -> str:
-    """What an image's files are called."""
-    return f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}"
-
-
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
     """One of an image's files: its record (.json), its strip (.png), or its picture by a method (.METHOD.webp)."""
-    return output / IMAGES / (stem_of(index, name) + suffix)
+    return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
 
 
-def save_record(record: ImageResult, photo: str, seconds: float, path: Path) -> None:
-    """Write what became of an image, with the digest of its files."""
-    write_json({"inputs": photo, "seconds": seconds, "record": dataclasses.asdict(record)}, path)
+def save_part(path: Path, inputs: object, found: Mapping[str, Any]) -> None:
+    """Write what one image or section gave, and of which inputs."""
+    write_json({"inputs": inputs, "found": found}, path)
 
 
-def load_record(path: Path, photo: str) -> tuple[ImageResult, float] | None:
-    """What an earlier run found, and how long it took; None where it is not there, or about other files."""
+def load_part(path: Path, inputs: object) -> dict[str, Any] | None:
+    """What an earlier run found; None where it is not there, or of other inputs than these (None: of any)."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        found = ImageResult.of(content["record"]), float(content["seconds"])
-        return found if content["inputs"] == photo else None
+        return dict(content["found"]) if inputs in (None, content["inputs"]) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

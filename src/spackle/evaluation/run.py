@@ -22,16 +22,7 @@ from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import NEAR, Wanted, large_views, measure
-from spackle.evaluation.results import (
-    ImageResult,
-    Run,
-    begin,
-    image_file,
-    load_record,
-    save_record,
-    write_json,
-    write_text,
-)
+from spackle.evaluation.results import ImageResult, Run, begin, image_file, load_part, save_part, write_json, write_text
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
@@ -97,36 +88,49 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
             if stop():
                 return None
             inputs = inputs_digest(case)
-            one = load_record(image_file(output, index, case.name, ".json"), inputs)
-            if one is None or not image_file(output, index, case.name, ".png").is_file():
+            one = _load(output, index, case, inputs)
+            if one is None:
                 if index and not begun:
                     reporter.say(f"{output}: going on, {index} of {len(cases)} images are done")
-                begun, one = True, _do_image(evaluation, index, case, inputs, output, reporter)
+                begun = True
+                try:
+                    one = _do_image(evaluation, index, case, inputs, output, reporter)
+                except BaseError:
+                    raise
+                except InputError as error:  # the next run tries it again
+                    problem = problem_of(case, error, evaluation.options.root)
+                    reporter.say(f"passed over: {problem}")
+                    one = ImageResult(case.name, problem=problem), 0.0
             found.append(one)
             step(index + 1, len(cases))
     return found
 
 
+def _load(output: Path, index: int, case: Case, inputs: str) -> tuple[ImageResult, float] | None:
+    """What an earlier run found of an image, and in how many seconds; None where it is to be done."""
+    part = load_part(image_file(output, index, case.name, ".json"), inputs)
+    if part is None or not image_file(output, index, case.name, ".png").is_file():
+        return None
+    try:
+        return ImageResult.of(part["record"]), float(part["seconds"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
 def _do_image(
     evaluation: Evaluation, index: int, case: Case, inputs: str, output: Path, reporter: Reporter
 ) -> tuple[ImageResult, float]:
-    """One image; a problem of its own is its record, which the next run tries again."""
+    """Examine an image and save its record and pictures."""
     start = time.perf_counter()
-    try:
-        record, pictures = examine(case, evaluation)
-    except BaseError:
-        raise
-    except InputError as error:
-        problem = problem_of(case, error, evaluation.options.root)
-        reporter.say(f"passed over: {problem}")
-        return ImageResult(case.name, problem=problem), 0.0
+    record, pictures = examine(case, evaluation)
     for remark in record.remarks:
         reporter.say(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
     for name, picture in pictures.items():
         report.save_picture(picture, image_file(output, index, case.name, f".{name}.webp"))
     save_png(strip(pictures), image_file(output, index, case.name, ".png"))
-    save_record(record, inputs, seconds, image_file(output, index, case.name, ".json"))
+    found = {"record": dataclasses.asdict(record), "seconds": seconds}
+    save_part(image_file(output, index, case.name, ".json"), inputs, found)
     reporter.detail(f"  {case.name}: {seconds:.1f} s")
     return record, seconds
 

@@ -17,10 +17,10 @@ from spackle.bases.sharp import SharpBase
 from spackle.digest import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation import suite_sections as sections
-from spackle.evaluation.bench import check_runs, load_part, save_part
+from spackle.evaluation.bench import check_runs
 from spackle.evaluation.efficiency import Record
 from spackle.evaluation.motorcycle import load_motorcycle
-from spackle.evaluation.results import begin, write_json, write_text
+from spackle.evaluation.results import begin, load_part, save_part, write_json, write_text
 from spackle.evaluation.suite_sections import SIDE, Section, holed_scene
 from spackle.evaluation.table import EMPTY, Line, Table, to_markdown
 from spackle.image import Photo
