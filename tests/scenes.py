@@ -46,6 +46,18 @@ def texture(height: int, width: int, hue: tuple[float, float, float] = (0.5, 0.4
     return torch.tensor(hue) + 0.1 * torch.stack(waves, dim=-1)
 
 
+def random_gaussians(count: int = 400, seed: int = 3, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """Gaussians with three different scales, turned any way, before a camera at the origin."""
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        torch.rand(count, 3, generator=g) * torch.tensor([2.0, 1.5, 4.0]) + torch.tensor([-1.0, -0.75, 2.0]),
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 3, generator=g) * 0.1 + 0.02,
+        torch.rand(count, generator=g),
+        torch.rand(count, 3, generator=g),
+    ).to(dtype=dtype)
+
+
 def slanted_plane(near: float, far: float, axis: int, width: int = 160, height: int = 120, focal: float = 150) -> Scene:
     """A plane whose depth runs from `far` at the first row (axis 0) or column (axis 1) to `near` at the last."""
     ramp = torch.linspace(1 / far, 1 / near, (height, width)[axis])
@@ -84,6 +96,45 @@ def cast(camera: Camera, z: float) -> Tensor:
 def shifted(camera: Camera, right: float, focus: float = 4.0) -> Camera:
     """The photo's camera moved sideways, still looking at the same spot."""
     return camera.looking(torch.tensor([right, 0.0, 0.0]), torch.tensor([0.0, 0.0, focus]))
+
+
+def turned_camera(width: int, height: int, focal: float) -> Camera:
+    """A camera that is neither at the origin nor level, its principal point off the middle."""
+    camera = Camera.from_focal(focal, width, height)
+    camera.K[0, 2] += 2.3
+    camera.K[1, 2] -= 1.1
+    return camera.looking(torch.tensor([0.5, -0.3, -0.8]), torch.tensor([0.2, 0.4, 5.0]))
+
+
+def random_scene(
+    seed: int,
+    n: int,
+    camera: Camera,
+    solidity: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+    sizes: tuple[float, float] = (0.6, 12.0),
+) -> Gaussians:
+    """Gaussians in and around the view, some behind the camera; no two at nearly the same depth.
+
+    With more solidity more of them are opaque: pixels fill up, alphas reach their clamp. `sizes` are the least and the
+    greatest standard deviation on the image, in pixels.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    z = 0.6 + 4 * (torch.arange(n) + 0.5 * uniform(n)) / n
+    z = torch.where(uniform(n) < 0.1, -z, z)
+    uv = (uniform(n, 2) * 1.8 - 0.4) * torch.tensor([camera.width, camera.height])
+    pixels = sizes[0] * (sizes[1] / sizes[0]) ** uniform(n, 3)
+    return Gaussians(
+        camera.unproject(uv, z),
+        torch.randn(n, 4, generator=generator),
+        pixels * z.abs()[:, None] / camera.focal[0],
+        1.02 * uniform(n) ** (1 / solidity),
+        uniform(n, 3),
+    ).to(dtype=dtype)
 
 
 def away(camera: Camera) -> Camera:

@@ -102,8 +102,6 @@ def listing(path: Path) -> None:
 
 
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
-    "empty": (lambda path: path.touch(), "the file is empty"),
-    "missing": (lambda path: None, "no such"),
     "text": (lambda path: path.write_text("no clip"), "not a video"),
     "headless": (lambda path: path.write_bytes(write_clip(path, moving(4)).read_bytes()[:-200]), "damaged"),
     "cut off": (cut_off, "cut off"),

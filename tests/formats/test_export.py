@@ -26,7 +26,7 @@ from plain_scenes import (
     spz_rows,
 )
 from rich.console import Console
-from scenes import box_before_wall, psnr, shifted, slanted_plane
+from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
 from spackle.app.export import WRITERS, export_scene
 from spackle.camera import Camera
@@ -63,18 +63,6 @@ BOUNDS = {
 }
 
 
-def turned(count: int = 400, seed: int = 3) -> Gaussians:
-    """Gaussians with three different scales, turned any way, before the eye."""
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        torch.rand(count, 3, generator=g) * torch.tensor([2.0, 1.5, 4.0]) + torch.tensor([-1.0, -0.75, 2.0]),
-        torch.randn(count, 4, generator=g),
-        torch.rand(count, 3, generator=g) * 0.1 + 0.02,
-        torch.rand(count, generator=g),
-        torch.rand(count, 3, generator=g),
-    )
-
-
 def encode(kind: str, gaussians: Gaussians) -> bytes:
     return FORMATS[kind][0](gaussians)
 
@@ -100,7 +88,7 @@ def looks(found: Gaussians, gaussians: Gaussians, *cameras: Camera) -> float:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_scene_read_back_is_the_scene(kind: str) -> None:
     decibels, place, size, turn, color, opacity = BOUNDS[kind]
-    gaussians = turned()
+    gaussians = random_gaussians()
     found, expected = read(kind, encode(kind, gaussians)), in_file_order(kind, gaussians)
     middle = expected.scales.median(dim=1).values[:, None]
     assert float(((found.means - expected.means).abs() / middle).max()) <= place
@@ -130,7 +118,7 @@ EXTREMES = {
 @pytest.mark.parametrize("extreme", EXTREMES)
 def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -> None:
     given = {name: torch.tensor(values) for name, values in EXTREMES[extreme].items()}
-    gaussians = dataclasses.replace(turned(4), **given)
+    gaussians = dataclasses.replace(random_gaussians(4), **given)
     found, expected = read(kind, encode(kind, gaussians)), in_file_order(kind, gaussians)
     assert all(bool(torch.isfinite(t).all()) for t in found.tensors)
     torch.testing.assert_close(found.opacities, expected.opacities, rtol=0, atol=0.003)
@@ -149,7 +137,7 @@ def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_one_gaussian_and_none(kind: str) -> None:
-    one = turned(1)
+    one = random_gaussians(1)
     torch.testing.assert_close(read(kind, encode(kind, one)).means, one.means, rtol=0, atol=0.03)
     if kind in ("sog", "glb"):
         with pytest.raises(InputError, match="without Gaussians"):
@@ -169,7 +157,7 @@ def moved() -> Camera:
 
 def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     camera = moved()
-    gltf, _ = glb_parts(encode_glb(turned(1), camera, 1))
+    gltf, _ = glb_parts(encode_glb(random_gaussians(1), camera, 1))
     (scene, photo), (lens,) = gltf["nodes"], gltf["cameras"]
     assert scene["extras"] == {"spackle_base": 1}
     assert gltf["scenes"][0]["nodes"] == [0, 1]
@@ -182,13 +170,13 @@ def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     flipped = there[:3] * torch.tensor([1.0, -1.0, -1.0])
     expected = torch.linalg.inv(camera.world_to_camera) @ torch.tensor([0.1, 0.2, 1.0, 1.0])
     torch.testing.assert_close(flipped, expected[:3])
-    still, _ = glb_parts(encode_glb(turned(1), Camera.from_focal(50, 64, 48)))
+    still, _ = glb_parts(encode_glb(random_gaussians(1), Camera.from_focal(50, 64, 48)))
     assert "matrix" not in still["nodes"][1]
     assert "extras" not in still["nodes"][0]
 
 
 def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
-    gaussians = turned(700)
+    gaussians = random_gaussians(700)
     data = encode_compressed_ply(gaussians, Camera.from_focal(50, 64, 48), 300)
     found = read("compressed.ply", data)
     expected = in_file_order("compressed.ply", gaussians, 300)
@@ -239,7 +227,7 @@ def test_spz_shows_what_is_near_and_a_far_sky(far: float) -> None:
 
 @pytest.mark.parametrize("size", [1e-4, 1e4])
 def test_spz_takes_scenes_of_any_unit(size: float) -> None:
-    gaussians = turned()
+    gaussians = random_gaussians()
     scaled = dataclasses.replace(gaussians, means=gaussians.means * size, scales=gaussians.scales * size)
     assert spz_grid(scaled)[1] == 0
     error = (read("spz", encode_spz(scaled)).means / size - gaussians.means).abs()
@@ -315,7 +303,7 @@ def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
 
 
 def test_rotations_too_long_to_square_keep_their_direction(tmp_path: Path) -> None:
-    one = turned(4)
+    one = random_gaussians(4)
     huge = dataclasses.replace(one, quats=one.quats / one.quats.norm(dim=-1, keepdim=True) * 3e38)
     assert encode_splat(huge) == encode_splat(one)
     save_ply(huge, tmp_path / "huge.ply")
@@ -340,21 +328,17 @@ def test_bad_requests_leave_nothing(scene: Path, tmp_path: Path) -> None:
     assert scene.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("suffix", "name", "value"),
-    [
-        ("spz", "formats.spz.MAX_COUNT", 3000),
-        ("sog", "formats.sog.LARGEST_SIDE", 40),
-        ("glb", "formats.gltf.LARGEST_FILE", 200_000),
-    ],
-)
+LIMITS = [("spz", "MAX_COUNT", 3000), ("sog", "LARGEST_SIDE", 40), ("gltf", "LARGEST_FILE", 1 << 17)]
+
+
+@pytest.mark.parametrize(("suffix", "limit", "value"), LIMITS)
 def test_too_large_a_scene_is_told_and_an_older_file_stays(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, name: str, value: int
+    scene: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, limit: str, value: int
 ) -> None:
-    output = scene.with_name(f"a.{suffix}")
+    output = scene.with_suffix(f".{suffix}".replace("gltf", "glb"))
     output.write_bytes(b"older")
-    monkeypatch.setattr(f"spackle.{name}", value)
-    with pytest.raises(InputError, match=rf"a\.{suffix}: 3,840 Gaussians are too many"):
+    monkeypatch.setattr(f"spackle.formats.{suffix}.{limit}", value)
+    with pytest.raises(InputError, match=rf"{output.name}: 3,840 Gaussians are too many"):
         export_scene(scene, [output], told()[0])
     assert output.read_bytes() == b"older"
     assert len(list(scene.parent.iterdir())) == 2
@@ -376,7 +360,7 @@ def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
     given, found = os.environ.get("SPLAT_TRANSFORM"), shutil.which("splat-transform")
     if not (given or found):
         pytest.skip("splat-transform is not installed: npm install -g @playcanvas/splat-transform")
-    data, path = encode(kind, turned(50)), tmp_path / f"a.{kind}"
+    data, path = encode(kind, random_gaussians(50)), tmp_path / f"a.{kind}"
     path.write_bytes(data)
     command = ["node", given] if given else [str(found)]
     done = subprocess.run([*command, "-q", path, tmp_path / "b.ply"], capture_output=True, text=True, check=False)
@@ -392,7 +376,7 @@ def test_gsply_reads_the_scene(kind: str, tmp_path: Path) -> None:
     """It compiles its reader when it is first used, and leaves SPZ's axes as they are."""
     gsply = pytest.importorskip("gsply")
     path = tmp_path / f"a.{kind}"
-    path.write_bytes(encode(kind, turned(50)))
+    path.write_bytes(encode(kind, random_gaussians(50)))
     raw, expected = gsply.read_spz(path) if kind == "spz" else gsply.plyread(path), read(kind, path.read_bytes())
     means, quats, scales, opacities = map(torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities))
     flip = torch.tensor([1.0, -1.0, -1.0]) if kind == "spz" else torch.ones(3)

@@ -15,6 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from photos import read_ply
+from scenes import random_gaussians
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
@@ -33,17 +34,6 @@ from spackle.gaussians import Gaussians
 PROPERTIES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 PROPERTIES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 GIVEN = [*PROPERTIES[:3], *PROPERTIES[6:]]  # SHARP writes no normals
-
-
-def scene(count: int, seed: int = 0) -> Gaussians:
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        torch.randn(count, 3, generator=g) * 5,
-        torch.randn(count, 4, generator=g),
-        torch.rand(count, 3, generator=g) * 0.1 + 1e-5,
-        torch.rand(count, generator=g),
-        torch.rand(count, 3, generator=g),
-    )
 
 
 def raw(gaussians: Gaussians, linear: bool = False) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -78,16 +68,12 @@ SHARP_AFTER = "".join(
 
 def sharp_tail(color_space: int) -> bytes:
     numbers = [*np.eye(4).ravel(), 500.0, 0, 320, 0, 500, 240, 0, 0, 1]
-    return (
-        np.array(numbers, "<f4").tobytes()
-        + struct.pack("<2I2i2f", 640, 480, 1, 3, 0.1, 0.9)
-        + bytes([color_space, 1, 5, 0])
-    )
+    return struct.pack("<25f2I2i2f4B", *numbers, 640, 480, 1, 3, 0.1, 0.9, color_space, 1, 5, 0)
 
 
-def close(a: Gaussians, b: Gaussians, tolerance: float = 2e-5) -> None:
+def close(a: Gaussians, b: Gaussians) -> None:
     for x, y in zip(a.tensors, b.tensors, strict=True):
-        torch.testing.assert_close(x, y, rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(x, y, rtol=2e-5, atol=2e-5)
 
 
 def written(path: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -98,7 +84,7 @@ def written(path: Path) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def test_independent_reader_finds_what_was_meant(tmp_path: Path) -> None:
-    gaussians = scene(300)
+    gaussians = random_gaussians(300)
     save_ply(gaussians, tmp_path / "a.ply")
     found, expected = written(tmp_path / "a.ply"), raw(gaussians)
     expected[:, 10:] /= np.linalg.norm(expected[:, 10:], axis=1, keepdims=True)
@@ -126,7 +112,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, BLOCK - 1, BLOCK, BLOCK + 777])
 def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: int) -> None:
-    base, more = scene(count), scene(3 * BLOCK + 1, seed=1)
+    base, more = random_gaussians(count), random_gaussians(3 * BLOCK + 1, seed=1)
     save_ply(base, tmp_path / "base.ply")
     save_ply(Gaussians.cat([base, more]), tmp_path / "both.ply")
     rows = [(tmp_path / name).read_bytes().split(b"end_header\n", 1)[1] for name in ("base.ply", "both.ply")]
@@ -148,7 +134,7 @@ def test_first_rows_depend_on_the_first_gaussians_alone(tmp_path: Path, count: i
 @pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
-    gaussians = scene(20)
+    gaussians = random_gaussians(20)
     shuffled = [*reversed(GIVEN), *(f"f_rest_{k}" for k in range(45))]
     rows = np.concatenate([raw(gaussians)[:, ::-1], np.full((20, 45), 0.25)], axis=1)
     head = "element camera 2\nproperty double fov\nproperty uchar used\n"
@@ -165,7 +151,7 @@ def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
 
 @pytest.mark.parametrize(("color_space", "linear"), [(0, False), (1, True)])
 def test_sharp_file(tmp_path: Path, color_space: int, linear: bool) -> None:
-    gaussians = scene(3)
+    gaussians = random_gaussians(3)
     content = ply(raw(gaussians, linear), GIVEN, after=SHARP_AFTER, tail=sharp_tail(color_space))
     (tmp_path / "a.ply").write_bytes(content)
     close(load_ply(tmp_path / "a.ply"), gaussians)
@@ -179,15 +165,15 @@ def test_older_sharp_file(tmp_path: Path) -> None:
     after = "element intrinsic 4\nproperty float intrinsic\nelement extrinsic 12\nproperty float extrinsic\n"
     turn = [[0.0, 1.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0]]
     tail = struct.pack("<4f12f", 700, 710, 320, 200, *np.ravel(turn))
-    (tmp_path / "a.ply").write_bytes(ply(raw(scene(3), linear=True), GIVEN, after=after, tail=tail))
-    close(load_ply(tmp_path / "a.ply"), scene(3))
+    (tmp_path / "a.ply").write_bytes(ply(raw(random_gaussians(3), linear=True), GIVEN, after=after, tail=tail))
+    close(load_ply(tmp_path / "a.ply"), random_gaussians(3))
     camera = load_ply_camera(tmp_path / "a.ply")
     assert camera is not None
     assert camera.K.tolist() == [[700, 0, 160], [0, 710, 100], [0, 0, 1]]
     assert camera.world_to_camera[:3].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     for bad in (0.0, math.nan):
         tail = struct.pack("<4f12f", bad, 710, 320, 200, *np.ravel(turn))
-        (tmp_path / "a.ply").write_bytes(ply(raw(scene(3)), GIVEN, after=after, tail=tail))
+        (tmp_path / "a.ply").write_bytes(ply(raw(random_gaussians(3)), GIVEN, after=after, tail=tail))
         with pytest.raises(InputError, match="stored camera"):
             load_ply_camera(tmp_path / "a.ply")
 
@@ -206,7 +192,7 @@ def test_bytes_as_values_and_an_opacity_of_one(tmp_path: Path) -> None:
 
 def test_what_a_comment_keeps(tmp_path: Path) -> None:
     path, camera = tmp_path / "a.ply", Camera.from_focal(50.25, 64, 48)
-    save_ply(scene(9), path, camera=camera, base_count=7, disparity=0.3)
+    save_ply(random_gaussians(9), path, camera=camera, base_count=7, disparity=0.3)
     found = load_ply_camera(path)
     assert found is not None
     assert torch.equal(found.K, camera.K)
@@ -221,18 +207,18 @@ def test_what_a_comment_keeps(tmp_path: Path) -> None:
             path.write_bytes(content.replace(kept, kept.split()[0] + b" " + value))
             with pytest.raises(InputError, match=r"a\.ply: the stored"):
                 load(path)
-    save_ply(scene(9), path)
+    save_ply(random_gaussians(9), path)
     assert load_ply_camera(path) is load_ply_base_count(path) is load_ply_disparity(path) is None
 
 
-GOOD = ply(raw(scene(3)), GIVEN)
-ASCII = ply(raw(scene(3)), GIVEN, order="ascii")
-SHARP = ply(raw(scene(3)), GIVEN, after=SHARP_AFTER, tail=sharp_tail(0))
+GOOD = ply(raw(random_gaussians(3)), GIVEN)
+ASCII = ply(raw(random_gaussians(3)), GIVEN, order="ascii")
+SHARP = ply(raw(random_gaussians(3)), GIVEN, after=SHARP_AFTER, tail=sharp_tail(0))
 LISTED = "element face 1\nproperty list uchar int vertex_indices\n"
 
 
 def spoiled(column: int, value: float, kind: str = "float") -> bytes:
-    rows = raw(scene(3))
+    rows = raw(random_gaussians(3))
     rows[1:, column] = value
     return ply(rows, GIVEN, kind)
 
@@ -254,7 +240,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "type": (GOOD.replace(b"property float opacity", b"property half opacity"), "header"),
     "property first": (GOOD.replace(b"element vertex 3\n", b""), "header"),
     "list in vertex": (GOOD.replace(b"end_header", b"property list uchar int i\nend_header"), "lists in"),
-    "list before": (ply(raw(scene(3)), GIVEN, head=LISTED), "lists in"),
+    "list before": (ply(raw(random_gaussians(3)), GIVEN, head=LISTED), "lists in"),
     "NaN": (spoiled(0, math.nan), "2 of 3 Gaussians are not finite"),
     "NaN opacity": (spoiled(6, math.nan), "2 of 3 Gaussians are not finite"),
     "large scale": (spoiled(7, 1000), "2 of 3"),
@@ -294,9 +280,9 @@ def test_random_damage_is_an_input_error_or_a_scene(tmp_path_factory: Any, whole
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    save_ply(scene(3), path)
+    save_ply(random_gaussians(3), path)
     before = path.read_bytes()
-    broken = scene(2 * BLOCK)
+    broken = random_gaussians(2 * BLOCK)
     broken.means[-1, 0] = math.nan
     for name in ("a.ply", "new.ply"):
         with pytest.raises(ValueError, match="not all finite"):
@@ -331,5 +317,5 @@ def test_atomic_path(tmp_path: Path) -> None:
 def test_unwritable_outputs(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match="cannot write"):
-        save_ply(scene(1), tmp_path / name)
+        save_ply(random_gaussians(1), tmp_path / name)
     assert os.listdir(tmp_path) == ["file"]

@@ -52,19 +52,15 @@ def test_it_draws_what_the_processors_renderer_draws(gpu: GsplatRenderer) -> Non
             agree(found, CPU.render(BASE, camera, eps2d=eps2d))
 
 
-def test_sets_are_drawn_as_one_and_none_is_black(gpu: GsplatRenderer) -> None:
-    halves = [BASE.select(slice(0, 100)), BASE.select(slice(100, None))]
-    assert same_bits(gpu.render(halves, SIDE), gpu.render(BASE, SIDE))
+def test_sets_are_drawn_as_one_none_is_black_and_what_is_not_finite_is_left_out(gpu: GsplatRenderer) -> None:
+    whole = gpu.render(BASE, SIDE)
+    assert same_bits(gpu.render([BASE.select(slice(0, 100)), BASE.select(slice(100, None))], SIDE), whole)
     nothing = gpu.render([], SIDE)
     assert nothing.rgb.shape == (35, 45, 3)
-    assert not any(bool(image.any()) for image in (nothing.rgb, nothing.depth, nothing.alpha))
-
-
-def test_what_is_not_finite_is_left_out(gpu: GsplatRenderer) -> None:
+    assert not any(bool(image.any()) for image in nothing.tensors)
     broken = dataclasses.replace(BASE, means=BASE.means.clone())
     broken.means[7, 1] = torch.nan
-    kept = torch.arange(len(BASE)) != 7
-    assert same_bits(gpu.render(broken, SIDE), gpu.render(BASE.select(kept), SIDE))
+    assert same_bits(gpu.render(broken, SIDE), gpu.render(BASE.select(torch.arange(len(BASE)) != 7), SIDE))
 
 
 def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> None:
@@ -86,12 +82,12 @@ def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRende
     tiles = torch.zeros(3, 3, dtype=torch.bool)
     tiles[1, 2] = tiles[0, 0] = True
     mask = tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
+    black = Rendering(*(torch.zeros_like(image) for image in whole.tensors))
     for onto in (under, None):
         found = gpu.render(BASE, SIDE, tiles=tiles, onto=onto)
-        for name in ("rgb", "depth", "alpha"):
-            image, kept = getattr(found, name), getattr(onto, name) if onto else torch.zeros_like(getattr(whole, name))
-            assert torch.equal(image[~mask], kept[~mask]), name
-            torch.testing.assert_close(image[mask], getattr(whole, name)[mask], rtol=0, atol=1e-6)
+        for image, drawn, kept in zip(found.tensors, whole.tensors, (onto or black).tensors, strict=True):
+            assert torch.equal(image[~mask], kept[~mask])
+            torch.testing.assert_close(image[mask], drawn[mask], rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="expected"):
         gpu.render(BASE, SIDE, tiles=tiles[:2])
 

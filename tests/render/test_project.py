@@ -9,35 +9,20 @@ import numpy as np
 import pytest
 import torch
 from plain_project import project_plainly
+from scenes import random_scene, turned_camera
 
-from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.pipeline import project, wanted_tiles
 from spackle.render.project import BLOCK, DEPTH, RECORD, KernelCamera, Splats, natural_log
 from spackle.render.protocol import ALPHA_MIN
 
-CAMERA = Camera.from_focal(90.0, 150, 110).looking(torch.tensor([0.5, -0.3, -0.8]), torch.tensor([0.2, 0.4, 5.0]))
+CAMERA = turned_camera(150, 110, 90.0)
 ROUNDING = 2.0**-23
 
 
 def cloud(n: int, seed: int = 0) -> Gaussians:
-    """Of any shape, from a thousandth of a pixel to half the image; some faint, behind the camera or out of view."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> torch.Tensor:
-        return torch.rand(*shape, generator=generator)
-
-    z = 0.5 + 5 * uniform(n)
-    z = torch.where(uniform(n) < 0.1, -z, z)
-    uv = (uniform(n, 2) * 2.0 - 0.5) * torch.tensor([CAMERA.width, CAMERA.height])
-    pixels = 1e-3 * (5e4 ** uniform(n, 3))
-    return Gaussians(
-        CAMERA.unproject(uv, z),
-        torch.randn(n, 4, generator=generator),
-        pixels * z.abs()[:, None] / CAMERA.focal[0],
-        1.3 * uniform(n) ** 3,
-        uniform(n, 3),
-    )
+    """Of any shape, from a thousandth of a pixel to half the image."""
+    return random_scene(seed, n, CAMERA, 0.3, sizes=(1e-3, 50.0))
 
 
 def found_in(splats: Splats, spans: np.ndarray) -> np.ndarray:
@@ -102,26 +87,6 @@ def test_the_smallest_and_the_farthest_end_where_float32_would():
     assert 100 < check(distant) < 300
 
 
-def test_gaussians_go_behind_those_that_are_there():
-    scene, view = cloud(BLOCK + 9), KernelCamera.of(CAMERA, 0.0)
-    wanted = wanted_tiles(view, None)
-    alone, spans = project([scene], view, wanted)
-    there = Splats.allocate(1000)
-    for array in (there.records, there.boxes, there.keys, there.ids):
-        array.fill(9)
-    splats, later = project([scene], view, wanted, there, 300)
-    assert splats is there
-    np.testing.assert_array_equal(later, np.add(spans, [300, 0]))
-    ids = found_in(alone, spans)
-    np.testing.assert_array_equal(found_in(there, later), ids + 300)
-    np.testing.assert_array_equal(there.records[ids + 300], alone.records[ids])
-    np.testing.assert_array_equal(there.boxes[300 : 300 + len(scene), 1], alone.boxes[: len(scene), 1])
-    assert (there.records[:300] == 9).all()
-    assert (there.records[300 + len(scene) :] == 9).all()
-    assert (there.boxes[:300] == 9).all()
-    assert (there.boxes[300 + len(scene) :] == 9).all()
-
-
 def test_what_is_seen_edge_on_keeps_its_slope():
     """A needle a million times as long as thick: its covariance has no digit to spare."""
     scene = cloud(400, seed=5)
@@ -131,13 +96,7 @@ def test_what_is_seen_edge_on_keeps_its_slope():
 
 def test_logarithms_hold_over_their_whole_range():
     generator = np.random.default_rng(0)
-    values = np.concatenate(
-        [
-            np.geomspace(1e-37, 1e30, 3001),
-            np.linspace(0.65, 1.5, 3001),
-            1 + generator.normal(size=200) * 1e-6,
-            [1.0, math.sqrt(0.5), math.sqrt(2.0), ALPHA_MIN, 0.999],
-        ]
-    ).astype(np.float32)
+    special = [1.0, math.sqrt(0.5), math.sqrt(2.0), ALPHA_MIN, 0.999, *(1 + generator.normal(size=200) * 1e-6)]
+    values = np.float32([*np.geomspace(1e-37, 1e30, 3001), *np.linspace(0.65, 1.5, 3001), *special])
     found = np.array([natural_log(x) for x in values])
     np.testing.assert_allclose(found, np.log(values.astype(np.float64)), rtol=4e-16, atol=0)

@@ -92,21 +92,15 @@ def test_a_view_looks_at_its_target_with_its_up_upwards(eye: Any, target: Any, u
     assert (rotation @ up)[1] < 0  # y points down
 
 
-def test_without_an_up_a_key_is_what_a_trajectory_would_look_like() -> None:
-    eye, target = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([0.0, 0.1, 4.0])
-    path = KeyframePath((Keyframe(0, tuple(eye.tolist()), tuple(target.tolist())), KEYS[1]))
-    view = path.cameras(CAMERA, 2, DEPTHS)[0]
-    torch.testing.assert_close(view.world_to_camera, CAMERA.looking(eye, target).world_to_camera)
-    assert torch.equal(view.K, CAMERA.K)
-
-
 def test_frames_begin_and_end_at_the_keys_and_the_lens_zooms() -> None:
     path = KeyframePath(KEYS)
+    same = CAMERA.looking(*(torch.tensor(part) for part in (KEYS[1].eye, KEYS[1].target)))
     views = path.cameras(CAMERA, 5, DEPTHS)  # at 0, 0.5, 1, 1.5, 2 s
     keys = path.key_cameras(CAMERA, DEPTHS)
     for index, key in ((0, 0), (1, 1), (4, 2)):
         assert torch.equal(views[index].world_to_camera, keys[key].world_to_camera)
         torch.testing.assert_close(views[index].position, torch.tensor(KEYS[key].eye), atol=1e-6, rtol=0)
+    torch.testing.assert_close(views[1].world_to_camera, same.world_to_camera)  # as a trajectory would look from there
     assert views[1].focal[0] == pytest.approx(32 / math.tan(math.radians(20)))
     assert views[4].focal[0] == pytest.approx(60)
     assert 60 < views[2].focal[0] < views[1].focal[0]
@@ -122,13 +116,9 @@ def test_a_closed_path_comes_back_without_showing_the_first_view_twice() -> None
     jumps = (eyes - eyes.roll(1, 0)).norm(dim=1)
     assert float(jumps[0]) < 2 * float(jumps.median())
     assert len({tuple(eye.tolist()) for eye in eyes}) == 30
+    in_disparity = dataclasses.replace(path, unit="disparity").cameras(CAMERA, 30, DEPTHS)
+    torch.testing.assert_close(in_disparity[7].position, max_offset(CAMERA, 1.0, DEPTHS) * eyes[7])
     torch.testing.assert_close(path.at([3.0], CAMERA, DEPTHS)[0].position, eyes[0], atol=1e-6, rtol=0)
-
-
-def test_disparity_as_the_unit_moves_the_eye_as_far_as_a_trajectory_goes() -> None:
-    keys = (Keyframe(0, (0.3, 0.0, 0.0), (0.0, 0.0, 2.0)), Keyframe(1, (-0.3, 0.0, 0.0), (0.0, 0.0, 2.0)))
-    view = KeyframePath(keys, unit="disparity").cameras(CAMERA, 2, DEPTHS)[0]
-    assert float(view.position[0]) == pytest.approx(max_offset(CAMERA, 0.3, DEPTHS), abs=1e-6)
 
 
 def test_what_happens_between_keys_is_looked_at_too() -> None:
@@ -191,19 +181,14 @@ def closed_form(kind: str, offset: float, near: float, k: int, frames: int) -> t
 def test_paths_have_their_closed_forms(kind: str, frames: int) -> None:
     path = trajectory(kind, PHOTO, 0.4, RANGE, frames)  # type: ignore[arg-type]
     assert len(path) == frames
+    if kind == "swipe" and frames > 1:
+        ends = extremes(PHOTO, 0.4, RANGE)
+        assert all(torch.equal(a.world_to_camera, path[k].world_to_camera) for a, k in zip(ends, (0, -1), strict=True))
     for k, camera in enumerate(path):
         uv, _ = camera.project(torch.tensor([0.0, 0.0, RANGE.focus]))
         assert uv.tolist() == pytest.approx([200, 150], abs=1e-3)
         assert torch.equal(camera.K, PHOTO.K)
         assert camera.position.tolist() == pytest.approx(closed_form(kind, 0.8, 2.0, k, frames), abs=1e-6)
-
-
-def test_the_extremes_are_the_ends_of_a_swipe() -> None:
-    left, right = extremes(PHOTO, 0.5, RANGE)
-    ends = trajectory("swipe", PHOTO, 0.5, RANGE, 31)
-    for camera, end, x in ((left, ends[0], -1.0), (right, ends[-1], 1.0)):
-        assert torch.equal(camera.world_to_camera, end.world_to_camera)
-        assert camera.position.tolist() == pytest.approx([x, 0, 0], abs=1e-6)
 
 
 def test_impossible_paths_are_refused() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import same_bits
+from scenes import random_gaussians, same_bits
 from torch import Tensor
 
 from spackle.gaussians import Gaussians, quat_from_matrix, quat_multiply, quat_to_matrix
@@ -32,17 +32,6 @@ def double(*values: object) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def random_set(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Gaussians:
-    """Gaussians in front of a camera at the origin."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=dtype)
-
-    means = (uniform(count, 3) - 0.5) * 2 + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
-    return Gaussians(means, uniform(count, 4) - 0.5, 0.05 + 0.3 * uniform(count, 3), uniform(count), uniform(count, 3))
-
-
 def similarity(quat: tuple[float, ...], factor: float, offset: tuple[float, ...]) -> Tensor:
     """[4, 4] rotation, then scale, then translation."""
     matrix = torch.eye(4, dtype=torch.float64)
@@ -54,13 +43,13 @@ def similarity(quat: tuple[float, ...], factor: float, offset: tuple[float, ...]
 def test_a_field_of_the_wrong_shape_is_named(field: str) -> None:
     wrong = torch.zeros(3, 1) if field == "opacities" else torch.zeros(3, 5)
     with pytest.raises(ValueError, match=rf"Gaussians\.{field} has shape"):
-        dataclasses.replace(random_set(3), **{field: wrong})
+        dataclasses.replace(random_gaussians(3), **{field: wrong})
     with pytest.raises(ValueError, match="Gaussians"):
-        dataclasses.replace(random_set(3), **{field: getattr(random_set(2), field)})
+        dataclasses.replace(random_gaussians(3), **{field: getattr(random_gaussians(2), field)})
 
 
 def test_joined_sets_keep_their_order_bit_for_bit() -> None:
-    first, second, third = (random_set(n, seed=n) for n in (3, 1, 5))
+    first, second, third = (random_gaussians(n, n, torch.float64) for n in (3, 1, 5))
     joined = Gaussians.cat([Gaussians.empty(dtype=torch.float64), first, second, third])
     assert (len(joined), len(Gaussians.empty())) == (9, 0)
     assert same_bits(joined.select(slice(0, 3)), first)
@@ -74,19 +63,14 @@ def test_joined_sets_keep_their_order_bit_for_bit() -> None:
 
 @PROPERTY
 @given(QUATS)
-def test_rotation_matrices_are_scipys(quat: tuple[float, ...]) -> None:
-    found = quat_to_matrix(double(*quat))
-    torch.testing.assert_close(found, scipy_matrix(quat), rtol=0, atol=1e-12)
-    torch.testing.assert_close(quat_to_matrix(7.5 * double(*quat)), found, rtol=0, atol=1e-12)
-
-
-@PROPERTY
-@given(QUATS)
-def test_quaternions_come_back_from_their_matrices(quat: tuple[float, ...]) -> None:
-    found = quat_from_matrix(scipy_matrix(quat))
+def test_rotation_matrices_are_scipys_and_quaternions_come_back_from_them(quat: tuple[float, ...]) -> None:
+    matrix = scipy_matrix(quat)
+    for factor in (1, 7.5):
+        torch.testing.assert_close(quat_to_matrix(factor * double(*quat)), matrix, rtol=0, atol=1e-12)
+    found = quat_from_matrix(matrix)
     assert float(found.norm()) == pytest.approx(1, abs=1e-12)
     assert found[0] >= 0
-    torch.testing.assert_close(quat_to_matrix(found), scipy_matrix(quat), rtol=0, atol=1e-12)
+    torch.testing.assert_close(quat_to_matrix(found), matrix, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("quat", [(0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1), (0, math.sqrt(0.5), -math.sqrt(0.5), 0)])
@@ -129,7 +113,7 @@ def test_covariances_have_the_squared_scales_as_eigenvalues(quat: tuple[float, .
 @PROPERTY
 @given(QUATS, FACTORS, OFFSETS)
 def test_a_transform_moves_points_and_covariances_alike(quat: tuple[float, ...], factor: float, offset: tuple) -> None:
-    some, matrix = random_set(6), similarity(quat, factor, offset)
+    some, matrix = random_gaussians(6, dtype=torch.float64), similarity(quat, factor, offset)
     moved, linear = some.transform(matrix), matrix[:3, :3]
     torch.testing.assert_close(moved.means, torch.stack([linear @ m + matrix[:3, 3] for m in some.means]))
     torch.testing.assert_close(moved.covariances(), linear @ some.covariances() @ linear.T, rtol=1e-8, atol=1e-10)
@@ -138,7 +122,7 @@ def test_a_transform_moves_points_and_covariances_alike(quat: tuple[float, ...],
 
 
 def test_a_transform_keeps_single_precision_and_passes_gradients() -> None:
-    some = Gaussians(*(t.requires_grad_() for t in random_set(3, dtype=torch.float32).tensors))
+    some = Gaussians(*(t.requires_grad_() for t in random_gaussians(3).tensors))
     moved = some.transform(similarity((1, 2, 3, 4), 2, (0, 0, 1)))
     assert {t.dtype for t in moved.tensors} == {torch.float32}
     (moved.means.sum() + moved.quats[:, 0].sum() + moved.scales.sum()).backward()
@@ -154,4 +138,4 @@ def test_only_similarities_are_taken() -> None:
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, :3] = block
         with pytest.raises(ValueError, match="uniform scale"):
-            random_set(2).transform(matrix)
+            random_gaussians(2, dtype=torch.float64).transform(matrix)

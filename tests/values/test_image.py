@@ -13,8 +13,6 @@ import numpy as np
 import pillow_heif
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
 
 from spackle.errors import InputError
@@ -133,16 +131,9 @@ def test_focal_from_exif(tmp_path: Path, tags: dict[str, Any], expected: float |
     assert photo.focal_px == pytest.approx(expected or film_to_pixels(30, 480, 320), rel=1e-4)
 
 
-TAGS = st.dictionaries(
-    st.sampled_from([0x920A, 0xA405, 0xA002, 0xA20E, 0xA210]),
-    st.floats() | st.integers() | st.sampled_from(["", "4.2 mm", b"\0\0", None, (1, 2)]),
-)
-
-
-@given(TAGS)
-def test_focal_from_exif_survives_anything(tags: dict[int, object]) -> None:
-    focal = focal_from_exif(tags, 480, 320)
-    assert focal is None or (math.isfinite(focal) and focal > 0)
+@pytest.mark.parametrize("value", ["", "4.2 mm", b"\0\0", None, (1, 2), -1, math.nan, math.inf, 10**400])
+def test_nonsense_in_exif_is_no_focal_length(value: object) -> None:
+    assert focal_from_exif(dict.fromkeys([0x920A, 0xA405, 0xA002, 0xA20E, 0xA210], value), 480, 320) is None
 
 
 def test_given_focal_lengths(tmp_path: Path) -> None:
@@ -173,14 +164,7 @@ def test_resize(tmp_path: Path) -> None:
         expected = unit(image.resize((100, 66), Image.Resampling.LANCZOS))
     assert (small.rgb - expected).abs().max() < 2 / 255
     assert resize_photo(photo) is photo
-
-
-@given(st.integers(1, 9000), st.integers(1, 9000), st.integers(2, 4000))
-def test_working_size(width: int, height: int, cap: int) -> None:
-    scale = min(1, cap / max(width, height))
-    for found, side in zip(working_size(width, height, cap), (width, height), strict=True):
-        assert 1 <= found <= cap
-        assert abs(found - side * scale) <= 1
+    assert [working_size(9000, 1, 100), working_size(3, 5000, 1000)] == [(100, 1), (1, 1000)]
 
 
 def png_claiming(width: int, height: int) -> bytes:

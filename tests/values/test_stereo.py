@@ -40,9 +40,8 @@ def test_parallax_is_crossed_before_the_screen_none_on_it_and_uncrossed_behind(
     assert across == pytest.approx(60 * ipd * (1 / z - 1 / convergence), abs=1e-3)
     assert down == pytest.approx(0, abs=1e-4)  # rows stay rows: nothing is toed in
     assert parallax(stereo, CAMERA, [x, y, convergence])[0] == pytest.approx(0, abs=1e-3)
-    assert (
-        parallax(stereo, CAMERA, [x, y, convergence / 2])[0] > 0 > parallax(stereo, CAMERA, [x, y, 2 * convergence])[0]
-    )
+    near, far = (parallax(stereo, CAMERA, [x, y, factor * convergence])[0] for factor in (0.5, 2))
+    assert near > 0 > far
 
 
 def test_eyes_stand_beside_a_view_that_is_turned() -> None:
