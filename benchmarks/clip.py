@@ -16,6 +16,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,7 +27,6 @@ from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.evaluation.motorcycle import load_motorcycle
-from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
 from spackle.render import get_renderer
@@ -38,13 +38,14 @@ from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0
 PATH = 4  # the clip is the beginning of a path of this many times its length
+Truth = tuple[Camera, Rendering]
+Sums = dict[str, list[Tensor]]  # a figure → its pixels, a tensor for each frame
 SAME_DEPTH = 0.02  # relative difference within which two views see the same thing
 # Of the simulated depth network, from frame to frame: scale, shift (of the median) and waves of inverse depth.
 SCALE_NOISE, SHIFT_NOISE, WAVE_NOISE = 0.05, 0.02, 0.01
 
 
-@dataclasses.dataclass(frozen=True)
-class World:
+class World(NamedTuple):
     """What the clip is taken of."""
 
     still: Gaussians
@@ -52,8 +53,7 @@ class World:
     camera: Camera
 
 
-@dataclasses.dataclass(frozen=True)
-class Clip:
+class Clip(NamedTuple):
     """How the camera, and how the board moves."""
 
     name: str
@@ -124,14 +124,6 @@ def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
     return 1 / (inverse + SHIFT_NOISE * float(inverse.median()) * rolls[1]).clamp_min(0.1 * float(inverse.median()))
 
 
-@dataclasses.dataclass(frozen=True)
-class Truth:
-    """The true view."""
-
-    camera: Camera
-    view: Rendering
-
-
 def play(
     world: World, clip: Clip, frames: int, disparity: float, noisy: bool, steady: bool
 ) -> Iterator[tuple[Drawn, Truth]]:
@@ -147,52 +139,38 @@ def play(
         drawn = completer.add(taken.rgb, lift(taken.rgb, depth_map(depth), own))
         pose = drawn.camera.world_to_camera @ camera.world_to_camera
         truth = dataclasses.replace(drawn.camera, world_to_camera=pose)
-        yield drawn, Truth(truth, renderer.render(scene, truth))
+        yield drawn, (truth, renderer.render(scene, truth))
 
 
 def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
     """Of what stands still, from a true view into the one before: [H, W, 2], and where both see the same, [H, W]."""
-    grid = pixel_grid(now.view.depth)
-    points = now.camera.unproject(grid, now.view.depth)
-    uv, z = was.camera.project(points)
-    seen = sample(was.view.depth[..., None], uv)[..., 0]
-    return uv - grid, ((seen / z - 1).abs() < SAME_DEPTH) & (now.view.alpha > 0.99)
+    (camera, view), (camera_before, before) = now, was
+    grid = pixel_grid(view.depth)
+    uv, z = camera_before.project(camera.unproject(grid, view.depth))
+    seen = sample(before.depth[..., None], uv)[..., 0]
+    return uv - grid, ((seen / z - 1).abs() < SAME_DEPTH) & (view.alpha > 0.99)
 
 
-class Sums:
-    """Sums and counts of pixels over many frames."""
-
-    def __init__(self) -> None:
-        self.sums: dict[str, Tensor] = collections.defaultdict(lambda: torch.zeros(2, dtype=torch.float64))
-
-    def add(self, name: str, values: Tensor) -> None:
-        self.sums[name] += torch.tensor([float(values.double().sum()), values.numel()])
-
-    def mean(self, name: str) -> float:
-        total, count = map(float, self.sums[name])
-        return total / max(1.0, count)
+def mean(parts: list[Tensor]) -> float:
+    """Over all pixels of all frames."""
+    values = torch.cat([part.flatten().double() for part in parts] or [torch.zeros(1)])
+    return float(values.mean()) if len(values) else 0.0
 
 
-def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool, folder: Path | None) -> Sums:
+def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool) -> Sums:
     """Both ways through the same clip, side by side."""
-    sums = Sums()
+    sums: Sums = collections.defaultdict(list)
     past: dict[str, tuple[Drawn, Truth]] = {}
-    ways: list[Iterator[tuple[Drawn, Truth]]] = [play(world, clip, frames, disparity, noisy, steady=noisy)]
     # Where the depth is exact there is nothing to hold still, so the same run has both.
-    ways += [play(world, clip, frames, disparity, noisy, steady=False)] if noisy else []
-    for index, runs in enumerate(zip(*ways, strict=True)):
+    steady = [noisy, False] if noisy else [False]
+    for runs in zip(*(play(world, clip, frames, disparity, noisy, way) for way in steady), strict=True):
         now = {"carried": runs[0], "alone": runs[-1]}
-        sums.add("holes", runs[0][0].hole.float())
-        for name, (drawn, truth) in now.items():
+        sums["holes"].append(runs[0][0].hole)
+        for name, (drawn, (_, truth)) in now.items():
             view = drawn.alone if name == "alone" else drawn.view
-            known = drawn.hole & (truth.view.alpha > 0.99)
-            sums.add(f"{name} off", (view.rgb - truth.view.rgb)[known].square())
+            sums[f"{name} off"].append((view.rgb - truth.rgb)[drawn.hole & (truth.alpha > 0.99)].square())
             if past:
                 compare(sums, name, now[name], past[name])
-        if folder is not None:
-            (drawn, truth), (lone, _) = now.values()
-            pictures = [truth.view.rgb, lone.before.rgb, lone.alone.rgb, drawn.view.rgb]
-            save_png(torch.cat(pictures, dim=1), folder / f"{clip.name.replace(' ', '_')}_{int(noisy)}_{index:03d}.png")
         past = now
     return sums
 
@@ -206,7 +184,7 @@ def compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, T
     for kind, chosen in (("hole", drawn.hole & (held > 0.999)), ("seen", ~drawn.hole & (held < 0.001))):
         value = flicker(view.rgb, view_before.rgb, flow, chosen & same)
         if value is not None:
-            sums.add(f"{name} {kind}", torch.full((int((chosen & same).sum()),), 255 * value))
+            sums[f"{name} {kind}"].append(torch.full((int((chosen & same).sum()),), 255 * value))
 
 
 def main() -> None:
@@ -214,21 +192,21 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=384, help="pixels along the frame's longer side")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--disparity", type=float, default=0.3)
-    parser.add_argument("--save", type=Path, help="folder for pictures: truth, base, alone, carried")
-    parser.add_argument("--clip", type=int, help="only this clip, by its number")
     options = parser.parse_args()
     world = load_world(options.side)
-    if options.save:
-        options.save.mkdir(parents=True, exist_ok=True)
     heads = ("depth", "holes", "seen", "alone", "carried", "ratio", "alone dB", "carried dB")  # PSNR in the holes
     print(f"{'clip':18}", *(f"{head:>10}" for head in heads))
     for noisy in (False, True):
-        for clip in CLIPS if options.clip is None else [CLIPS[options.clip]]:
-            sums = judge(world, clip, options.frames, options.disparity, noisy, options.save)
-            alone, carried = sums.mean("alone hole"), sums.mean("carried hole")
-            figures = (sums.mean("carried seen"), alone, carried, carried / alone)
-            figures += tuple(-10 * math.log10(sums.mean(f"{name} off")) for name in ("alone", "carried"))
-            cells = ["noisy" if noisy else "exact", f"{sums.mean('holes'):.1%}", *(f"{value:.2f}" for value in figures)]
+        for clip in CLIPS:
+            sums = judge(world, clip, options.frames, options.disparity, noisy)
+            alone, carried = mean(sums["alone hole"]), mean(sums["carried hole"])
+            figures: tuple[float, ...] = (mean(sums["carried seen"]), alone, carried, carried / alone)
+            figures += tuple(-10 * math.log10(mean(sums[f"{name} off"])) for name in ("alone", "carried"))
+            cells = [
+                "noisy" if noisy else "exact",
+                f"{mean(sums['holes']):.1%}",
+                *(f"{value:.2f}" for value in figures),
+            ]
             print(f"{clip.name:18}", *(f"{cell:>10}" for cell in cells), flush=True)
 
 
