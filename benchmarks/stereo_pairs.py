@@ -1,6 +1,6 @@
 """Completed views of stereo pairs beside the true right photo: seeds, trained weights, 2D inpainting; Markdown tables.
 
-    python benchmarks/stereo_pairs.py FOLDER [--residual FILE] [--features squeezenet_v1.0.npz] [--pictures OUT]
+    python benchmarks/stereo_pairs.py FOLDER [--residual FILE] [--features squeezenet_v1.0.npz]
 
 FOLDER holds one folder a scene: a left and a right photo, a disparity map and a `scene.json` that names them and gives
 disparity_scale, focal_px, cx, cy, doffs_px and baseline_m (see `spackle.training.sources.load_pair`). The first table
@@ -17,11 +17,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from spackle import Completer, Gaussians, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.lift import lift
-from spackle.formats import save_png
 from spackle.inpaint.opencv import OpenCV
 from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual
@@ -49,7 +47,7 @@ class Scene:
         ways = {"seeds": None, "trained": network}
         self.ways = {name: Completer(self.base, self.camera, self.renderer, net) for name, net in ways.items()}
 
-    def pair(self, features: FeatureNet | None, pictures: Path | None) -> list[float]:
+    def pair(self, features: FeatureNet | None) -> list[float]:
         """Numbers of the right camera's view."""
         before = self.renderer.render(self.base, self.beside)
         hole, har = hole_mask(before.alpha), hole_area_ratio(before.alpha)
@@ -62,9 +60,6 @@ class Scene:
         numbers += [self.photo_psnr(aux) for aux, _ in found]
         if features is not None:
             numbers += [hole_distance(features, rgb, self.right, hole) for rgb in views]
-        if pictures is not None:
-            pictures.mkdir(parents=True, exist_ok=True)
-            save_png(torch.cat([before.rgb, *views, self.right], dim=1), pictures / f"{self.name}.png")
         return numbers
 
     def swipes(self) -> list[float]:
@@ -94,8 +89,7 @@ def print_table(columns: Sequence[str], scenes: Sequence[Scene], measure: Callab
     for scene in scenes:
         rows.append(measure(scene))
         print_row(scene.name, rows[-1])
-    mean: Tensor = torch.tensor(rows, dtype=torch.float64).mean(0)
-    print_row("mean", mean.tolist())
+    print_row("mean", torch.tensor(rows, dtype=torch.float64).mean(0).tolist())
 
 
 def print_row(name: str, values: Sequence[float]) -> None:
@@ -108,8 +102,6 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--residual", type=Path, default=SHIPPED)
     parser.add_argument("--features", type=Path, help="SqueezeNet 1.0's weights")
-    parser.add_argument("--pictures", type=Path, help="folder for base, seeds, trained and truth side by side")
-    parser.add_argument("--no-swipes", action="store_true", help="the first table alone, in a minute or two")
     chosen = parser.parse_args()
     features = None if chosen.features is None else load_features("squeezenet", chosen.features)
     network = load_residual(chosen.residual)
@@ -117,9 +109,8 @@ def main() -> None:
     if not scenes:
         parser.error(f"{chosen.folder}: no folder with a scene.json in it")
     more = [] if features is None else ["distance: seeds", "trained"]
-    print_table([*COLUMNS, *more], scenes, lambda scene: scene.pair(features, chosen.pictures))
-    if not chosen.no_swipes:
-        print_table(SWIPES, scenes, Scene.swipes)
+    print_table([*COLUMNS, *more], scenes, lambda scene: scene.pair(features))
+    print_table(SWIPES, scenes, Scene.swipes)
 
 
 if __name__ == "__main__":

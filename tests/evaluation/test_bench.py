@@ -87,11 +87,9 @@ def test_the_papers_rows_fit_each_other_but_for_one() -> None:
     for index, disparity in enumerate(paper.DISPARITIES):
         rows = {title: paper.at(numbers, disparity) for title, numbers in paper.TIMES.items()}
         for title, (base_ms, spackle_ms, _, base_fps, spackle_fps) in rows.items():
-            assert base_ms is not None
-            assert spackle_ms is not None
-            fits = base_fps == pytest.approx(1000 / base_ms, rel=0.01)
+            fits = (base_fps or 0) * (base_ms or 0) == pytest.approx(1000, rel=0.01)
             assert fits == ((title, disparity) != paper.ODD_TIME)
-            assert spackle_fps == pytest.approx(1000 / spackle_ms, rel=0.01)
+            assert (spackle_fps or 0) * (spackle_ms or 0) == pytest.approx(1000, rel=0.01)
         times = sorted(row[1] or 0 for row in rows.values())
         assert paper.MEDIAN_SPACKLE_MS[index] == pytest.approx((times[2] + times[3]) / 2, abs=0.11)
         added = [numbers[3 * index] for numbers in paper.GAUSSIANS.values()]
@@ -234,8 +232,7 @@ def test_from_files_to_tables_and_on(scenes: Path, tmp_path: Path) -> None:
     found = read(output)
     assert found["parameters"]["residual"] == 8_021_376
     assert found["config"]["view"] == "right"
-    assert {"cpu", "cores", "threads"} <= found["config"]["hardware"].keys()
-    assert "torch" in found["config"]["versions"]
+    assert {"hardware", "versions"} <= found["config"].keys()
     for image in found["images"]:
         assert [view["setting"] for view in image["views"]] == ["0.3", "0.5"]
         assert image["facts"]["warm"]
@@ -260,7 +257,7 @@ def test_sharp_is_timed_once_and_a_broken_image_is_named(scenes: Path, tmp_path:
     weights = write_tiny(tmp_path / "sharp.safetensors")
     for seed, name in enumerate(("Ball", "Chair")):
         write_boxes(tmp_path / "data" / name, seed)
-    cut_off(tmp_path / "data" / "Chair" / "left.png")
+    (tmp_path / "data" / "Chair" / "left.png").write_bytes(b"no picture")
     words = ("--runs", 1, "--disparity", "0.3", "--residual", "seeds")
     sharp = ("--base", "sharp", "-c", weights, "--precision", "fp32")
     done = bench_of(tmp_path / "data", tmp_path / "out", *words, *sharp)
@@ -275,15 +272,9 @@ def test_sharp_is_timed_once_and_a_broken_image_is_named(scenes: Path, tmp_path:
     assert not found["images"][0]["facts"]["warm"]  # the first prediction, which counts
     assert math.isfinite(view["figures"]["overhead"])
     assert "network in fp32 on" in (tmp_path / "out" / "bench.md").read_text()
-    cut_off(tmp_path / "data" / "Ball" / "left.png")
+    (tmp_path / "data" / "Ball" / "left.png").write_bytes(b"no picture")
     done = bench_of(tmp_path / "data", tmp_path / "none", "--runs", 1)
     assert (done.code, "none of 2 images gave figures" in done.err) == (2, True)
-
-
-def cut_off(picture: Path) -> None:
-    """The first half of its bytes."""
-    whole = picture.read_bytes()
-    picture.write_bytes(whole[: len(whole) // 2])
 
 
 SIDE = 64
@@ -308,9 +299,8 @@ def test_tasks_take_turns_and_their_laps_add_up() -> None:
     tasks = {name: functools.partial(task, name=name) for name in "ab"}
     times = measure(2, tasks)
     assert order == ["a", "b"] * 3
-    assert {key: len(values) for key, values in times.items()} == dict.fromkeys(
-        itertools.product("ab", ("one", "two", TOTAL)), 2
-    )
+    assert set(times) == set(itertools.product("ab", ("one", "two", TOTAL)))
+    assert {len(values) for values in times.values()} == {2}
     for name in "ab":
         assert all(times[name, "one"] > 0)
         assert all(times[name, "one"] + times[name, "two"] <= times[name, TOTAL])
@@ -337,47 +327,37 @@ def test_limits_are_rates_and_stand_beside_the_rows_that_they_hold_for() -> None
 # --- sections
 
 
-def test_the_naive_renderer_draws_what_ours_draws() -> None:
+def test_the_renderers_section_has_all_stages_and_the_naive_renderer_draws_what_ours_draws() -> None:
+    section = stages.renderer_section(2, SIDE, PEAKS)
+    found, facts = rows_of(section), section[1]
+    whole, naive = "whole call: RGB, depth, alpha", "naive: whole call"
+    names = [*stages.RENDER_STAGES, *(f"naive: {stage}" for stage in stages.RENDER_STAGES), whole, naive]
+    assert all(len(found[name].values) == 2 and min(found[name].values) > 0 for name in names)
+    assert found["naive over ours"].values == pytest.approx(found[naive].values / found[whole].values)
     scene, camera = photo_scene(SIDE)
     difference = (CpuRenderer().render(scene, camera).rgb - naive_render(scene, camera)).abs()
     assert float(difference.mean()) < 1e-5
     assert float(difference.amax()) < 0.02
+    assert facts["gaussians"] == (count := len(scene)) == SIDE * SIDE // 2
+    assert found[whole].limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
 
 
-def test_the_renderers_section_has_all_stages() -> None:
-    section = stages.renderer_section(2, SIDE, PEAKS)
-    found, facts = rows_of(section), section[1]
-    names = [*stages.RENDER_STAGES, *(f"naive: {stage}" for stage in stages.RENDER_STAGES), stages.CALL]
-    assert all(len(found[name].values) == 2 and min(found[name].values) > 0 for name in names)
-    assert found[stages.NAIVE_RATIO].values == pytest.approx(
-        found["naive: whole call"].values / found[stages.CALL].values
-    )
-    count = SIDE * SIDE // 2
-    assert facts["gaussians"] == count
-    assert found[stages.CALL].limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
-
-
-def test_the_disparity_is_found_at_which_a_share_is_holes() -> None:
-    base, camera = holed_scene(96)
-    disparity, view = stages.find_view(base, camera, CpuRenderer())
-    assert hole_area_ratio(CpuRenderer().render(base, view).alpha) == pytest.approx(0.05, rel=0.05)
-    assert 0 < disparity < 0.5
-    assert hole_area_ratio(CpuRenderer().render(base, camera).alpha) == 0
-    with pytest.raises(InputError, match="no view"):
-        stages.find_view(base, camera, CpuRenderer(), 0.999)
-
-
-def test_what_completion_adds_is_the_sum_of_its_stages() -> None:
+def test_what_completion_adds_to_a_view_with_holes_is_the_sum_of_its_stages() -> None:
     torch.manual_seed(0)
     network = ResidualNet().eval().requires_grad_(False)
     base, camera = holed_scene(96)
+    assert hole_area_ratio(CpuRenderer().render(base, camera).alpha) == 0
+    disparity, view = stages.find_view(base, camera, CpuRenderer())
+    assert 0 < disparity < 0.5
+    assert hole_area_ratio(CpuRenderer().render(base, view).alpha) == pytest.approx(0.05, rel=0.05)
+    with pytest.raises(InputError, match="no view"):
+        stages.find_view(base, camera, CpuRenderer(), 0.999)
     section = stages.completion_section(2, base, camera, CpuRenderer(), network)
     found, facts = rows_of(section), section[1]
-    added = found[stages.ADDED].values
-    assert added == pytest.approx(found[stages.PLACE].values + found[stages.REDRAW].values)
-    assert found[stages.IN_RENDERS].values == pytest.approx(added / found[stages.RENDER].values)
-    assert facts["holes"] == pytest.approx(0.05, rel=0.05)
-    view = stages.find_view(base, camera, CpuRenderer())[1]
+    added = found["added time"].values
+    assert added == pytest.approx(found["mask, seeds, network, placing"].values + found["redraw"].values)
+    assert found["added time over base render"].values == pytest.approx(added / found["base render of the view"].values)
+    assert (facts["disparity"], facts["holes"]) == (disparity, pytest.approx(0.05, rel=0.05))
     completer = Completer(base, camera, CpuRenderer(), network)
     whole = completer.complete_view(view)
     assert same_bits(complete_in_laps(completer, view, lambda name: None), whole)
@@ -388,9 +368,11 @@ def test_a_video_in_one_scene_and_frame_by_frame() -> None:
     section = stages.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
     found = {name: float(row.values[0]) for name, row in rows_of(section).items()}
     same = found[stages.LIFT] + found[stages.ENCODE] + found[stages.EACH]
-    assert found[stages.SCRATCH] == pytest.approx(same + found[stages.SHIELDS])
-    assert found[stages.SCENE_RATIO] == pytest.approx(found[stages.SCRATCH] / found[stages.SCENE])
-    assert found[stages.KEPT_RATIO] == pytest.approx((same + found[stages.SHIELDS] / 4) / found[stages.SCENE])
+    anew, whole = found["frame by frame: photo to video"], found["one scene: photo to video"]
+    assert anew == pytest.approx(same + found[stages.SHIELDS])
+    assert found["frame by frame over one scene"] == pytest.approx(anew / whole)
+    once = (same + found[stages.SHIELDS] / 4) / whole
+    assert found["the same, the photo's shield made once"] == pytest.approx(once)
     assert section[1]["added"] > 0
 
 
@@ -400,7 +382,7 @@ def test_sharp_in_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     found, facts = rows_of(section), section[1]
     assert facts["gaussians"] == gaussians_of(MICRO)
     assert (found[stages.FORWARD].limit_ms or 0) > 1e3  # 1e9 operations at 1e6 a millisecond
-    assert found[stages.WHOLE].values[0] >= found[stages.FORWARD].values[0]
+    assert found["photo to scene"].values[0] >= found[stages.FORWARD].values[0]
 
     def no_compiler(*arguments: object) -> Any:
         raise RuntimeError("no compiler\nanywhere")
@@ -437,7 +419,7 @@ def test_sections_are_measured_once_and_gathered(tmp_path: Path) -> None:
     assert "no weights" in found["not_run"]["sharp"]
     assert found["not_run"]["video"] == "not asked for (--only)"
     assert {"commit", "hardware", "versions"} <= found["config"].keys()
-    row = next(row for row in found["sections"]["renderer"]["rows"] if row["name"] == stages.CALL)
+    row = next(row for row in found["sections"]["renderer"]["rows"] if row["name"] == "whole call: RGB, depth, alpha")
     assert row["limit_ms"] > 0
     assert row["median"] == pytest.approx(np.median(row["values"]))
     text = (output / "suite.md").read_text()

@@ -34,6 +34,7 @@ from spackle.signals import asked_to_stop
 
 RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
 SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
+TIMES = "{base_ms:,.0f} ms, with Spackle {spackle_ms:,.0f}, {added:,} Gaussians added"  # of a view
 MAX_RUNS = 1000
 
 
@@ -78,7 +79,8 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
                     else:
                         warm = True
                         save_part(path, inputs, image)
-                        _log_views(image, reporter)
+                        for view in image["views"]:
+                            reporter.detail(f"  {case.name}, {view['setting']}: {TIMES.format(**view['figures'])}")
                 images.append(image)
                 step(index + 1, len(tools.cases))
         _finish(Efficiency(config, images), options, output, reporter)
@@ -127,12 +129,6 @@ def time_view(
     none = np.zeros(runs)  # of a view without holes, which is not rendered again
     stages = {name: (times.get(("", name), none) / MS).tolist() for name in STAGES if name != "base"}
     return view_cost(setting, len(completer.base), added, {"base": base_s, **stages})
-
-
-def _log_views(image: Record, reporter: Reporter) -> None:
-    for view in image["views"]:
-        times = "{base_ms:,.0f} ms, with Spackle {spackle_ms:,.0f}, {added:,} Gaussians added".format(**view["figures"])
-        reporter.detail(f"  {image['name']}, {view['setting']}: {times}")
 
 
 def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter: Reporter) -> None:

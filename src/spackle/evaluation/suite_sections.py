@@ -34,17 +34,12 @@ LIMIT_RUNS = 7  # at least: the best run counts
 MATRIX_SIDE, COPY_MB = 2048, 256
 PRODUCT, COPY = "matrix product, {}", "copy of memory"
 RENDER_STAGES = ("project", "sort", "bin", "blend")
-CALL, NAIVE_RATIO = "whole call: RGB, depth, alpha", "naive over ours"
 GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
 HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of the completed view; of the search for it, and its relative tolerance
-RENDER, SHIELD, ADDED = "base render of the view", "photo's shield, once a photo", "added time"
-PLACE, REDRAW, IN_RENDERS = "mask, seeds, network, placing", "redraw", "added time over base render"
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
 LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
-SCENE, SCRATCH = "one scene: photo to video", "frame by frame: photo to video"
 EACH, SHIELDS = "frames rendered and completed, each by itself", "the photo's shield, for each of them"
-SCENE_RATIO, KEPT_RATIO = "frame by frame over one scene", "the same, the photo's shield made once"
-FORWARD, UNPROJECT, SAVE, WHOLE = "forward", "unprojection", "save as PLY", "photo to scene"
+FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
 
 SIDE = 1536  # pixels along SHARP's picture
 CELL = 2
@@ -104,9 +99,9 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     call, naive = times["call", TOTAL], times["naive", TOTAL]
     least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that are read once or written once
     rows = [Row(stage, times["ours", stage]) for stage in RENDER_STAGES]
-    rows.append(Row(CALL, call, limit_ms=least / peaks[COPY]))
+    rows.append(Row("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
     rows += [Row(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
-    rows += [Row("naive: whole call", naive), Row(NAIVE_RATIO, naive / call, "×")]
+    rows += [Row("naive: whole call", naive), Row("naive over ours", naive / call, "×")]
     return rows, {"gaussians": len(scene), "width": side, "height": side}
 
 
@@ -138,8 +133,10 @@ def completion_section(
     completer = Completer(base, photo_camera, renderer, network)
     times = measure(runs, {"": lambda lap: complete_in_laps(completer, camera, lap)}, device)
     render, shield, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
-    rows = [Row(RENDER, render), Row(SHIELD, shield), Row(PLACE, place), Row(REDRAW, redraw)]
-    rows += [Row(ADDED, place + redraw), Row(IN_RENDERS, (place + redraw) / render, "×")]
+    names = ("base render of the view", "photo's shield, once a photo", "mask, seeds, network, placing", "redraw")
+    rows = [Row(name, values) for name, values in zip(names, (render, shield, place, redraw), strict=True)]
+    rows.append(Row("added time", place + redraw))
+    rows.append(Row("added time over base render", (place + redraw) / render, "×"))
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
     holes = hole_area_ratio(renderer.render(base, camera).alpha)
     return rows, {**facts, "holes": holes, "added": len(completer.complete_view(camera))}
@@ -207,8 +204,10 @@ def video_section(
     anew = times["scene", LIFT] + each + shields + times["scene", ENCODE]
     kept = anew - shields * (frames - 1) / frames
     rows = [Row(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
-    rows += [Row(SCENE, whole), Row(EACH, each), Row(SHIELDS, shields), Row(SCRATCH, anew)]
-    rows += [Row(SCENE_RATIO, anew / whole, "×"), Row(KEPT_RATIO, kept / whole, "×")]
+    rows += [Row("one scene: photo to video", whole), Row(EACH, each), Row(SHIELDS, shields)]
+    rows.append(Row("frame by frame: photo to video", anew))
+    rows.append(Row("frame by frame over one scene", anew / whole, "×"))
+    rows.append(Row("the same, the photo's shield made once", kept / whole, "×"))
     facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
     return rows, {**facts, "width": path[0].width, "height": path[0].height}
 
@@ -233,7 +232,7 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
     times = measure(runs, {"": whole}, device, warm=flops > 0)
     least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
     rows = [Row(FORWARD, times["", FORWARD], limit_ms=least)]
-    rows += [Row(UNPROJECT, times["", UNPROJECT]), Row(SAVE, times["", SAVE]), Row(WHOLE, times["", TOTAL])]
+    rows += [Row(UNPROJECT, times["", UNPROJECT]), Row(SAVE, times["", SAVE]), Row("photo to scene", times["", TOTAL])]
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
     facts |= {"windows": base.windows, "compiled": base.compiled, "compile_problem": base.compile_problem or None}
     return rows, {**facts, "gaussians": count}
