@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from spackle.app.clip import ClipChoices, ClipCompleter, Drawn
+from spackle.app.clip import ClipCompleter, CompletedView
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
@@ -126,11 +126,11 @@ def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
 
 def play(
     world: World, clip: Clip, frames: int, disparity: float, noisy: bool, steady: bool
-) -> Iterator[tuple[Drawn, Truth]]:
+) -> Iterator[tuple[CompletedView, Truth]]:
     """Each frame's completed view, and the truth."""
     renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
-    choices = ClipChoices("rotate", disparity, PATH * frames, steady=steady, network=shipped_network())
-    completer = ClipCompleter(choices, renderer, OpenCV("this").flow)
+    path, flow, network = PATH * frames, OpenCV("this").flow, shipped_network()
+    completer = ClipCompleter("rotate", disparity, path, renderer, flow, align=steady, network=network)
     for index in range(frames):
         scene, camera = at(world, clip, index / max(1, frames - 1))
         taken = renderer.render(scene, camera)
@@ -160,7 +160,7 @@ def mean(parts: list[Tensor]) -> float:
 def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool) -> Sums:
     """Both ways through the same clip, side by side."""
     sums: Sums = collections.defaultdict(list)
-    past: dict[str, tuple[Drawn, Truth]] = {}
+    past: dict[str, tuple[CompletedView, Truth]] = {}
     # Where the depth is exact there is nothing to hold still, so the same run has both.
     steady = [noisy, False] if noisy else [False]
     for runs in zip(*(play(world, clip, frames, disparity, noisy, way) for way in steady), strict=True):
@@ -175,7 +175,7 @@ def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool) 
     return sums
 
 
-def compare(sums: Sums, name: str, now: tuple[Drawn, Truth], was: tuple[Drawn, Truth]) -> None:
+def compare(sums: Sums, name: str, now: tuple[CompletedView, Truth], was: tuple[CompletedView, Truth]) -> None:
     """Flicker of a view's holes, and of what is seen in it."""
     (drawn, truth), (earlier, before) = now, was
     flow, same = true_flow(truth, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import re
 from pathlib import Path
 
@@ -12,13 +13,12 @@ import torch
 from holes import CPU, random_network
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import away, box_before_wall, psnr, same_bits, shifted, slanted_plane, wall
+from scenes import away, box_before_wall, psnr, same_bits, shifted, slanted_plane
 
 import spackle
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.gaussians import Gaussians
-from spackle.render.reference import ReferenceRenderer
 from spackle.residual import Completer, Cues, hole_area_ratio, hole_mask
 from spackle.residual.complete import PASSES
 from spackle.residual.seeds import cell_centers
@@ -76,13 +76,8 @@ def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down
     assert bool(mask[row, column].all())
     assert int(torch.bincount(row * mask.shape[1] + column, minlength=1).max()) <= PASSES
     assert len(aux) >= int(mask.sum()) if not guarded else len(aux) <= PASSES * int(mask.sum())
-
-
-def test_even_a_wild_network_adds_no_more_gaussians_than_masked_cells_in_a_pass() -> None:
-    subject = dataclasses.replace(completer("box"), network=random_network(size=0.05))
-    camera = path_of(subject, "swipe")[0]
-    masked = int(Cues.of(CPU.render(subject.base, camera)).mask.sum())
-    assert masked <= len(subject.complete_view(camera)) <= PASSES * masked
+    wild = dataclasses.replace(subject, network=random_network(size=0.05))
+    assert int(mask.sum()) <= len(wild.complete_view(camera)) <= PASSES * int(mask.sum())
 
 
 # Rule 3: a view with an empty mask renders exactly as the base does.
@@ -95,49 +90,31 @@ def test_a_view_without_holes_gets_nothing_and_stays_bit_for_bit(name: str, netw
     assert not hole_mask(photo.alpha).any()
     aux = subject.complete_view(subject.photo_camera)
     assert len(aux) == 0
-    assert same_bits(CPU.render([subject.base, aux], subject.photo_camera), photo)
-    assert same_bits(CPU.render(Gaussians.cat([subject.base, aux]), subject.photo_camera), photo)
     assert len(subject.complete_scene([subject.photo_camera] * 2)) == 0
-
-
-def test_a_closer_look_at_the_photo_has_no_holes_to_fill() -> None:
-    subject = completer("box")
-    closer = dataclasses.replace(subject.photo_camera, K=subject.photo_camera.K.clone())
-    closer.K[:2, :2] *= 1.5
-    assert not hole_mask(CPU.render(subject.base, closer).alpha).any()
-    assert len(subject.complete_view(closer)) == 0
-
-
-def test_aux_gaussians_out_of_sight_leave_a_view_bit_for_bit() -> None:
-    subject = completer("box")
-    aux = subject.complete_view(away(subject.photo_camera))
-    assert len(aux) > 0
-    one = CPU.render(subject.base, subject.photo_camera)
-    assert same_bits(CPU.render([subject.base, aux], subject.photo_camera), one)
+    hidden = subject.complete_view(away(subject.photo_camera))
+    assert len(hidden) > 0  # out of sight
+    for more in (aux, hidden):
+        assert same_bits(CPU.render([subject.base, more], subject.photo_camera), photo)
+        assert same_bits(CPU.render(Gaussians.cat([subject.base, more]), subject.photo_camera), photo)
 
 
 # Rule 4: completion does not damage the photo.
 
 
-@pytest.mark.parametrize("disparity", [0.3, 0.5, 0.6])
-@pytest.mark.parametrize("kind", TRAJECTORIES)
-@pytest.mark.parametrize("name", SCENES)
-def test_a_completed_scene_shows_the_photo_as_the_base_does(name: str, kind: str, disparity: float) -> None:
-    subject = completer(name)
+@pytest.mark.parametrize(
+    ("name", "network", "kind", "disparity"),
+    [*itertools.product(SCENES, [False], TRAJECTORIES, [0.3, 0.5, 0.6]), ("box", True, "swipe", 0.3)],
+)
+def test_a_completed_scene_shows_the_photo_as_the_base_does(
+    name: str, network: bool, kind: str, disparity: float
+) -> None:
+    subject = completer(name, network)
     aux = subject.complete_scene(path_of(subject, kind, disparity, frames=8))
     assert len(aux) > 0
     before = CPU.render(subject.base, subject.photo_camera)
     after = CPU.render([subject.base, aux], subject.photo_camera)
     assert psnr(after.rgb, before.rgb) >= 45
     assert hole_area_ratio(after.alpha) == 0
-
-
-def test_even_an_untaught_network_leaves_the_photo_alone() -> None:
-    subject = completer("box", network=True)
-    aux = subject.complete_scene(path_of(subject, "swipe"))
-    assert len(aux) > 0
-    before = CPU.render(subject.base, subject.photo_camera)
-    assert psnr(CPU.render([subject.base, aux], subject.photo_camera).rgb, before.rgb) >= 45
 
 
 @pytest.mark.parametrize("right", [-1.5, -1.0, 0.5, 1.5])
@@ -175,32 +152,3 @@ def test_every_file_with_compiled_kernels_is_held_to_a_twin() -> None:
         if compiled.search(path.read_text(encoding="utf-8")):
             name = path.relative_to(SOURCES)
             assert {name.as_posix(), name.parts[0]} & set(TWINS), f"{name}: where is its twin, and the test?"
-
-
-def test_a_completed_scene_is_drawn_alike_by_the_plain_renderer_and_so_are_its_gradients() -> None:
-    scene = box_before_wall(width=32, height=24, focal=27)
-    subject = Completer(scene.base(), scene.camera, CPU)
-    camera = path_of(subject, "swipe", 0.2)[-1]
-    aux = subject.complete_view(camera, [subject.photo_guard()])
-    assert len(aux) > 10
-    renderers = (CPU, ReferenceRenderer())
-    fast, plain = (renderer.render([subject.base, aux], camera) for renderer in renderers)
-    # At the renderer's thresholds a difference of the last digit means one splat more or less.
-    same = ((fast.rgb - plain.rgb).abs().amax(-1) < 1e-4) & ((fast.alpha - plain.alpha).abs() < 1e-5)
-    assert float(same.float().mean()) > 0.9
-    torch.testing.assert_close(fast.depth[same], plain.depth[same], rtol=1e-2, atol=0)
-    weights = same * torch.rand(24, 32, generator=torch.Generator().manual_seed(0))
-    found = []
-    for renderer in renderers:
-        asking = Gaussians(*(t.clone().requires_grad_() for t in aux.tensors))
-        view = renderer.render([subject.base, asking], camera)
-        (view.rgb.mean(-1) * weights + 0.1 * view.depth * weights + view.alpha * weights).sum().backward()
-        found.append([t.grad for t in asking.tensors])
-    for one, other in zip(*found, strict=True):
-        assert float((one - other).norm()) < 0.01 * float(other.norm())
-
-
-def test_a_wall_that_is_seen_from_its_own_eye_needs_no_second_thought() -> None:
-    scene = wall(width=63, height=47)
-    subject = Completer(scene.base(), scene.camera, CPU)
-    assert len(subject.complete_view(scene.camera)) == 0

@@ -20,7 +20,6 @@ from spackle.viewer.work import Tell
 
 PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}
 QUICK = Limits(request=0.6, pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)
-SECRET = "root:"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,78 +10,53 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from spackle.bases.depth_map import DepthMap, load_depth
-    from spackle.bases.hf import HfBase
-    from spackle.bases.lite.base import LiteBase
-    from spackle.bases.protocol import Base, BasePrediction
-    from spackle.bases.sharp import SharpBase
-    from spackle.camera import Camera
-    from spackle.errors import InputError
-    from spackle.formats import load_cameras, load_ply, save_ply
-    from spackle.gaussians import Gaussians
-    from spackle.image import Photo, load_photo
-    from spackle.render import Renderer, get_renderer
-    from spackle.render.protocol import Rendering
-    from spackle.residual import Completer, hole_area_ratio, hole_mask
-    from spackle.scene import Scene, complete, predict
+if TYPE_CHECKING:  # for editors and type checkers
+    from spackle.bases.depth_map import DepthMap as DepthMap
+    from spackle.bases.depth_map import load_depth as load_depth
+    from spackle.bases.hf import HfBase as HfBase
+    from spackle.bases.lite.base import LiteBase as LiteBase
+    from spackle.bases.protocol import Base as Base
+    from spackle.bases.protocol import BasePrediction as BasePrediction
+    from spackle.bases.sharp import SharpBase as SharpBase
+    from spackle.camera import Camera as Camera
+    from spackle.errors import InputError as InputError
+    from spackle.formats import load_cameras as load_cameras
+    from spackle.formats import load_ply as load_ply
+    from spackle.formats import save_ply as save_ply
+    from spackle.gaussians import Gaussians as Gaussians
+    from spackle.image import Photo as Photo
+    from spackle.image import load_photo as load_photo
+    from spackle.render import Renderer as Renderer
+    from spackle.render import get_renderer as get_renderer
+    from spackle.render.protocol import Rendering as Rendering
+    from spackle.residual import Completer as Completer
+    from spackle.residual import hole_area_ratio as hole_area_ratio
+    from spackle.residual import hole_mask as hole_mask
+    from spackle.scene import Scene as Scene
+    from spackle.scene import complete as complete
+    from spackle.scene import predict as predict
 
 __version__ = "0.1.0"
 
-# Loaded at first use: `spackle --help` need not wait for torch.
-_HOMES = {
-    "Base": "spackle.bases.protocol",
-    "BasePrediction": "spackle.bases.protocol",
-    "Camera": "spackle.camera",
-    "Completer": "spackle.residual",
-    "DepthMap": "spackle.bases.depth_map",
-    "Gaussians": "spackle.gaussians",
-    "HfBase": "spackle.bases.hf",
-    "InputError": "spackle.errors",
-    "LiteBase": "spackle.bases.lite.base",
-    "Photo": "spackle.image",
-    "Renderer": "spackle.render",
-    "Rendering": "spackle.render.protocol",
-    "Scene": "spackle.scene",
-    "SharpBase": "spackle.bases.sharp",
-    "complete": "spackle.scene",
-    "get_renderer": "spackle.render",
-    "hole_area_ratio": "spackle.residual",
-    "hole_mask": "spackle.residual",
-    "load_cameras": "spackle.formats",
-    "load_depth": "spackle.bases.depth_map",
-    "load_photo": "spackle.image",
-    "load_ply": "spackle.formats",
-    "predict": "spackle.scene",
-    "save_ply": "spackle.formats",
+# A name is imported at its first use: `spackle --help` need not wait for torch.
+_NAMES = {
+    "spackle.bases.depth_map": ("DepthMap", "load_depth"),
+    "spackle.bases.hf": ("HfBase",),
+    "spackle.bases.lite.base": ("LiteBase",),
+    "spackle.bases.protocol": ("Base", "BasePrediction"),
+    "spackle.bases.sharp": ("SharpBase",),
+    "spackle.camera": ("Camera",),
+    "spackle.errors": ("InputError",),
+    "spackle.formats": ("load_cameras", "load_ply", "save_ply"),
+    "spackle.gaussians": ("Gaussians",),
+    "spackle.image": ("Photo", "load_photo"),
+    "spackle.render": ("Renderer", "get_renderer"),
+    "spackle.render.protocol": ("Rendering",),
+    "spackle.residual": ("Completer", "hole_area_ratio", "hole_mask"),
+    "spackle.scene": ("Scene", "complete", "predict"),
 }
-
-__all__ = [
-    "Base",
-    "BasePrediction",
-    "Camera",
-    "Completer",
-    "DepthMap",
-    "Gaussians",
-    "HfBase",
-    "InputError",
-    "LiteBase",
-    "Photo",
-    "Renderer",
-    "Rendering",
-    "Scene",
-    "SharpBase",
-    "complete",
-    "get_renderer",
-    "hole_area_ratio",
-    "hole_mask",
-    "load_cameras",
-    "load_depth",
-    "load_photo",
-    "load_ply",
-    "predict",
-    "save_ply",
-]
+_HOMES = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -6,15 +6,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import portraits
 import pytest
-from command import names_in, refuses, report_of
+from command import refuses, report_of
 from photos import write_depth, write_photo
 from safetensors.torch import load_file, save_file
 from sharp_weights import write_tiny
 from stand_in import StandIn, base_of, predict, write_lite
 
-from spackle.bases.lite.base import LiteBase
 from spackle.bases.sharp import SharpBase
 from spackle.device import MemoryShort
 from spackle.errors import InputError
@@ -66,27 +64,6 @@ def test_a_photo_alone_gets_lite_and_advice(tmp_path: Path) -> None:
     assert (base["name"], base["chosen"], len(result.lines)) == ("rgbd", "--depth", 2)
 
 
-def test_a_folder_hears_it_once_and_the_photos_lines_name_the_difference(tmp_path: Path, photos: Path) -> None:
-    write_photo(photos / "d.png")
-    portraits.write(photos / "c.jpg", portraits.apple_jpeg(portraits.codes()))
-    result = predict(tmp_path, "-i", photos)
-    assert sum("rough geometry" in line for line in result.lines) == 1
-    assert sum(": base rgbd (" in line for line in result.lines) == 1
-    assert len(result.lines) == 2 * 4 + 2
-    from_ = [line.split(" Gaussians from ")[1].split(",")[0] for line in result.lines if " Gaussians from " in line]
-    assert from_ == ["lite", "lite", "rgbd", "lite"]
-    result = predict(tmp_path, "-i", photos, "--base", "rgbd")
-    assert (result.code, result.lines[0].startswith(f"error: {photos / 'a.png'}: ")) == (1, True)
-    assert report_of(tmp_path / "out" / "c")["base"]["chosen"] == "--base rgbd"
-
-
-def test_depth_for_one_photo_of_two(tmp_path: Path, photos: Path) -> None:
-    write_depth(tmp_path / "depths" / "b.npy")
-    result = predict(tmp_path, "-i", photos, "--depth", tmp_path / "depths")
-    assert (result.code, sum("no depth map in" in line for line in result.lines)) == (1, 1)
-    assert names_in(tmp_path / "out") == {"b"}
-
-
 def test_a_folder_is_done_again_when_better_weights_come(
     tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path
 ) -> None:
@@ -105,11 +82,30 @@ def test_a_folder_is_done_again_when_better_weights_come(
     assert [base(), base()] == ["lite", "done already"]
 
 
-def test_with_depth_no_network_counts(tmp_path: Path, made: dict[str, Path], photos: Path) -> None:
+def test_results_of_sharp_that_give_way_to_lite_are_named(
+    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def bad(path: Path, **options: Any) -> None:
+        raise InputError(f"{path}: cut off")
+
+    def warned() -> list[str]:
+        return [line for line in predict(tmp_path, "-i", photos).lines if "was made by sharp" in line]
+
+    sharp = install(made, tmp_path)
+    assert warned() == []
+    sharp.write_bytes(b"cut")
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase, "load", bad)
+        first, second = warned()
+        assert str(tmp_path / "out" / "a") in first
+        assert second.endswith(f"by lite: {NO_DEPTH}, SHARP cannot be used ({sharp})")
+        assert warned() == []  # done already
+    install(made, tmp_path)
+    assert warned() == []
+    # With depth no network counts.
     words = ("-i", photos, "--depth", write_depth(tmp_path / "d.npy"))
     assert predict(tmp_path, *words).code == 0
-    install(made, tmp_path)
-    assert "done already" in predict(tmp_path, *words).err
+    sharp.unlink()
     assert "done already" in predict(tmp_path, *words, "--base", "rgbd").err
 
 
@@ -132,34 +128,6 @@ def test_results_for_want_of_memory_are_tried_again_the_next_time(
     assert report_of(tmp_path / "out" / "b")["base"]["name"] == "sharp"
 
 
-def test_results_of_sharp_that_give_way_to_lite_are_named(
-    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def warned() -> list[str]:
-        result = predict(tmp_path, "-i", photos)
-        assert result.code == 0, result.err
-        return [line for line in result.lines if "warning" in line]
-
-    def bad(path: Path, **options: Any) -> None:
-        raise InputError(f"{path}: cut off")
-
-    sharp = install(made, tmp_path)
-    assert warned() == []
-    sharp.write_bytes(b"cut")
-    with monkeypatch.context() as patch:
-        patch.setattr(SharpBase, "load", bad)
-        assert warned() == [
-            f"{name}.png: warning: {tmp_path / 'out' / name} was made by sharp and is made again by lite: "
-            f"{NO_DEPTH}, SHARP cannot be used ({sharp})"
-            for name in "ab"
-        ]
-        assert warned() == []  # done already
-    install(made, tmp_path)
-    assert warned() == []
-    sharp.unlink()
-    assert [line.endswith(f"by lite: {NO_DEPTH}, {NO_SHARP}") for line in warned()] == [True, True]
-
-
 def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,11 +141,3 @@ def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     monkeypatch.setattr(SharpBase, "load", change)
     refuses(predict(tmp_path, "-i", photos), "changed while this was running")
     assert not (tmp_path / "out").exists()
-
-
-def test_networks_are_not_loaded_for_what_is_done(
-    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert predict(tmp_path, "-i", photos).code == 0
-    monkeypatch.setattr(LiteBase, "load", lambda *args, **options: pytest.fail("loaded"))
-    assert predict(tmp_path, "-i", photos).err.count("done already") == 2

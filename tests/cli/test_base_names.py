@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import Run, names_in, refuses, run
+from command import Run, refuses, run
 from evaluation_data import write_boxes
 from photos import write_photo
 from stand_in import StandIn, write_lite
@@ -47,17 +47,6 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return asked
 
 
-def write_model(folder: Path) -> Path:
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_text("{}")
-    (folder / "model.safetensors").write_bytes(b"weights")
-    (folder / "README.md").write_text("about it")
-    return folder
-
-
-# Elsewhere: results must say what they are of, so a base is named.
-
-
 @pytest.fixture(scope="module")
 def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("middlebury")
@@ -77,7 +66,11 @@ def sha256(path: Path) -> str:
 
 
 def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, lite: Path, hub: list[dict[str, Any]]) -> None:
-    model = write_model(tmp_path / "models" / "small")
+    model = tmp_path / "models" / "small"
+    model.mkdir(parents=True)
+    (model / "config.json").write_text("{}")
+    (model / "model.safetensors").write_bytes(b"weights")
+    (model / "README.md").write_text("about it")
     digests = {name: sha256(model / name) for name in ("config.json", "model.safetensors")}
     for base, name, weights in (("lite", "lite", sha256(lite)), (f"hf:{model}", "hf:small", digests)):
         result = build(tmp_path / name, "--base", base)
@@ -128,19 +121,6 @@ def test_an_evaluation_of_lite_and_of_a_model(
         assert "not SHARP, so not the paper's base" in said["says"]
         assert f"| {title} alone |" in (folder / "out" / "tables.md").read_text()
     assert hub == [{"model": "me/small", "precision": "fp32", "device": None}]
-
-
-def test_a_benchmark_of_a_model_times_it_each_run_in_a_folder_of_a_plain_name(
-    tmp_path: Path, stereo: Path, hub: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ("--runs", 2, "--disparity", "0.3", "--residual", "seeds", "--base", "hf:me/small")
-    result = run("bench", "--dataset", "middlebury", "--root", stereo, *words)
-    assert result.code == 0, result.err
-    assert names_in(tmp_path) == {"bench-middlebury-hf-me-small"}
-    found = json.loads((tmp_path / "bench-middlebury-hf-me-small" / "bench.json").read_text())
-    assert found["config"]["base"]["title"] == "hf:me/small"
-    assert len(found["images"][0]["views"][0]["seconds"]["base"]) == 2
 
 
 def test_where_results_must_say_what_they_are_of_auto_is_refused_and_sharp_the_default(

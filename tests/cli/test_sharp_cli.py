@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from command import FILES, names_in, report_of, run
+from command import FILES, SHORT, names_in, report_of, run
 from photos import picture, read_ply, write_photo
 from PIL import Image
 from sharp_weights import gaussians_of, tiny_weights, write_tiny
 
-from spackle.app import predict
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import load_network
 from spackle.bases.sharp.layers import TINY
@@ -31,21 +29,23 @@ def _no_weights_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
 
 
-def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(tmp_path: Path, weights: Path) -> None:
-    photo = write_photo(tmp_path / "photo.jpg")
-    result = run("predict", "-i", photo, "-o", tmp_path / "out", "--base", "sharp", "-c", weights, "--frames", 3)
+@pytest.mark.parametrize("size", [(64, 48), (1, 1), (3000, 3), (10, 2000)])
+def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(
+    tmp_path: Path, weights: Path, size: tuple[int, int]
+) -> None:
+    Image.fromarray(picture()).resize(size).save(tmp_path / "photo.png")
+    result = run(
+        "predict", "-i", tmp_path / "photo.png", "-o", tmp_path / "out", *SHORT, "--base", "sharp", "-c", weights
+    )
     assert result.code == 0, result.err
     assert names_in(tmp_path / "out" / "photo") == FILES
+    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == gaussians_of(TINY)
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
-    precision = "bf16" if native else "fp32"
     expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(TINY)}
-    assert report["base"] == expected | {"precision": precision, "weights": "tiny.pt"}
-    assert report["photo"] == {"file": "photo.jpg", "width": 64, "height": 48}
-    assert report["focal_source"] == "default 30 mm"
-    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == gaussians_of(TINY)
-    for row in report["hole_area_ratio"]:
-        assert row["after"] < 0.01 < row["before"]
+    assert report["base"] == expected | {"precision": "bf16" if native else "fp32", "weights": "tiny.pt"}
+    if size == (64, 48):
+        assert all(row["after"] < 0.01 < row["before"] for row in report["hole_area_ratio"])
 
 
 def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not(tmp_path: Path) -> None:
@@ -65,24 +65,6 @@ def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not
     assert report_of(tmp_path / "out" / "a")["base"]["precision"] == "fp32"
 
 
-def test_weights_that_go_while_a_folder_is_worked_on_are_not_missed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("a.png", "b.png"):
-        write_photo(tmp_path / "photos" / name)
-    weights = write_tiny(tmp_path / "w.pt")
-    write_report = predict.write_report
-
-    def remove_weights(*args: Any) -> None:
-        weights.unlink(missing_ok=True)
-        write_report(*args)
-
-    monkeypatch.setattr("spackle.app.predict.write_report", remove_weights)
-    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
-    assert run(*arguments).code == 0
-    assert names_in(tmp_path / "out") == {"a", "b"}
-
-
 @pytest.mark.parametrize("problem", ["photo", "focal", "output", "done"])
 def test_the_network_is_not_loaded_for_a_photo_that_does_not_need_it(
     tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, problem: str
@@ -100,15 +82,6 @@ def test_the_network_is_not_loaded_for_a_photo_that_does_not_need_it(
         "done": ("-i", photo.parent, "-o", tmp_path / "out"),
     }
     assert run("predict", *wrong[problem], *base).code == (0 if problem == "done" else 2)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3000, 3), (10, 2000)])
-def test_photos_of_odd_shapes_go_all_the_way(tmp_path: Path, weights: Path, size: tuple[int, int]) -> None:
-    Image.fromarray(picture()).resize(size).save(tmp_path / "odd.png")
-    options = ("--base", "sharp", "-c", weights, "--frames", 2)
-    result = run("predict", "-i", tmp_path / "odd.png", "-o", tmp_path / "out", *options)
-    assert result.code == 0, result.err
-    assert names_in(tmp_path / "out" / "odd") == FILES
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])

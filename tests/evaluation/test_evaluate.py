@@ -579,7 +579,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--residual", "none"), "--residual none"),
         (("--residual", "gone.safetensors"), "not found"),
         (("-c", "x.pt"), "no checkpoint"),
-        (("--precision", "fp8"), "--precision fp8"),
+        (("--precision", "fp8"), "--precision"),
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
         (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
         (("--root", "nowhere"), "nowhere"),

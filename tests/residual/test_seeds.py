@@ -7,10 +7,10 @@ import math
 
 import pytest
 import torch
-from holes import CPU, box_view, random_view
+from holes import CPU, random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import box_mask, cast, shifted, slanted_plane, wall
+from scenes import slanted_plane
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
@@ -60,16 +60,10 @@ def test_seeds_match_their_plain_twin(seed: int, size: tuple[int, int], solid: f
     for name in ("uv", "inverse_depth", "slope", "rgb"):
         assert torch.equal(getattr(chosen, name), getattr(found, name)[cues.mask])
     assert chosen.unit == found.unit
-
-
-@settings(deadline=None, max_examples=40)
-@given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 7), st.integers(1, 7)))
-def test_seeds_of_any_view_are_finite_and_in_front_of_the_camera(seed: int, size: tuple[int, int]) -> None:
-    camera = Camera.from_focal(20, size[1], size[0])
-    seeds = make_seeds(Cues.of(random_view(seed, *size)), camera, camera)
-    assert all(bool(image.isfinite().all()) for image in (seeds.uv, seeds.inverse_depth, seeds.slope, seeds.rgb))
-    assert float(seeds.inverse_depth.min()) > 0
-    assert 0 <= float(seeds.rgb.min()) <= float(seeds.rgb.max()) <= 1
+    any_view = make_seeds(Cues.of(view), photo_camera, photo_camera)  # it may show nothing at all
+    assert all(bool(t.isfinite().all()) for t in (any_view.uv, any_view.inverse_depth, any_view.slope, any_view.rgb))
+    assert float(any_view.inverse_depth.min()) > 0
+    assert 0 <= float(any_view.rgb.min()) <= float(any_view.rgb.max()) <= 1
 
 
 def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
@@ -80,31 +74,6 @@ def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
     seeds = make_seeds(Cues.of(empty), camera, camera)
     assert torch.equal(seeds.inverse_depth, torch.full((2, 3), 0.1))
     assert torch.equal(seeds.rgb, torch.full((2, 3, 3), 0.5))
-
-
-@pytest.mark.parametrize("side", [0, 1])
-def test_behind_a_box_seeds_continue_the_wall_in_depth_and_colour(side: int) -> None:
-    completer, camera = box_view(side=side)
-    cues = Cues.of(CPU.render(completer.base, camera))
-    seeds = make_seeds(cues, camera, completer.photo_camera)
-    uv, _ = completer.photo_camera.project(cast(camera, 6.0)[1::2, 1::2])
-    x, y = uv.long().unbind(-1)
-    inside = (x >= 0) & (x < 96) & (y >= 0) & (y < 72)
-    behind = cues.mask & inside & box_mask(96, 72)[y.clamp(0, 71), x.clamp(0, 95)]
-    assert int(behind.sum()) > 20
-    assert float((1 / seeds.inverse_depth[behind] > 4).float().mean()) > 0.75  # the box stands at 2, the wall at 6
-    bluish = seeds.rgb[..., 2] > seeds.rgb[..., 0]
-    assert float(bluish[behind].float().mean()) > 0.8
-
-
-def test_beyond_the_photos_border_a_plane_goes_on() -> None:
-    scene = wall()
-    camera = shifted(scene.camera, 1.0)
-    cues = Cues.of(CPU.render(scene.base(), camera))
-    assert 0.05 < float(cues.mask.float().mean()) < 0.5
-    seeds = make_seeds(cues, camera, scene.camera)
-    z = camera.unproject(seeds.uv, 1 / seeds.inverse_depth)[..., 2]
-    assert float((z[cues.mask] / 4 - 1).abs().max()) < 0.15
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -150,20 +119,17 @@ def rim_of(mask: Tensor, inverse_depth: Tensor, camera: Camera, rgb: Tensor) -> 
     return Rim.of(cues, seeds, camera, CAMERA)
 
 
-def ramp(axis: int = 1) -> Tensor:
-    """A colour that tells the row or the column: [h, w, 3]."""
-    line = torch.arange((HEIGHT, WIDTH)[axis]).float()
-    return (line if axis else line[:, None]).expand(HEIGHT, WIDTH)[..., None].repeat(1, 1, 3) / 100
-
-
 def strip(first: int, last: int) -> Tensor:
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, first : last + 1] = True
     return mask
 
 
+# A colour that tells the column, and what columns such colours tell.
+RAMP = (torch.arange(WIDTH).float() / 100).expand(HEIGHT, WIDTH)[..., None].repeat(1, 1, 3)
+
+
 def told(colors: Tensor) -> list[int]:
-    """The rows or columns that `ramp`'s colours tell."""
     return [round(100 * value) for value in colors[..., 0].tolist()]
 
 
@@ -171,37 +137,27 @@ def told(colors: Tensor) -> list[int]:
 def test_after_a_sideways_move_a_row_goes_on_from_its_farther_side(far_left: bool) -> None:
     depth = torch.full((HEIGHT, WIDTH), 0.5)
     depth[:, :8] = 0.1 if far_left else 1.0
-    rim = rim_of(strip(8, 11), depth, moved(*SIDEWAYS), ramp())
+    rim = rim_of(strip(8, 11), depth, moved(*SIDEWAYS), RAMP)
     assert told(rim.rgb[5, 8:12]) == ([7] * 4 if far_left else [12] * 4)
     assert told(rim.mirrored[5, 8:12]) == ([6, 5, 4, 3] if far_left else [16, 15, 14, 13])
     assert rim.distance[5, 8:12].tolist() == ([1, 2, 3, 4] if far_left else [4, 3, 2, 1])
-    assert torch.equal(rim.rgb[:, :8], ramp()[:, :8])
+    assert torch.equal(rim.rgb[:, :8], RAMP[:, :8])
     assert not rim.distance[:, 12:].any()
 
 
-def test_beyond_the_border_the_only_rim_counts_and_without_one_the_seed_stays() -> None:
-    rim = rim_of(strip(15, WIDTH - 1), torch.full((HEIGHT, WIDTH), 1.0), moved(*SIDEWAYS), ramp())
+def test_at_the_border_one_rim_counts_without_any_the_seed_stays_and_another_surface_is_not_mirrored() -> None:
+    rim = rim_of(strip(15, WIDTH - 1), torch.full((HEIGHT, WIDTH), 1.0), moved(*SIDEWAYS), RAMP)
     assert told(rim.rgb[3, 15:]) == [14] * 5
     assert told(rim.mirrored[3, 15:]) == [13, 12, 11, 10, 9]
-    rim = rim_of(strip(0, WIDTH - 1), torch.ones(HEIGHT, WIDTH), moved(*SIDEWAYS), ramp())
-    assert torch.equal(rim.rgb, ramp())
-    assert torch.equal(rim.mirrored, ramp())
+    rim = rim_of(strip(0, WIDTH - 1), torch.ones(HEIGHT, WIDTH), moved(*SIDEWAYS), RAMP)
+    assert torch.equal(rim.rgb, RAMP)
+    assert torch.equal(rim.mirrored, RAMP)
     assert not rim.distance.any()
-
-
-def test_another_surface_is_not_mirrored() -> None:
     depth = torch.full((HEIGHT, WIDTH), 0.2)
     depth[:, :6] = 0.2 * SAME_DEPTH * 1.01
-    rim = rim_of(strip(8, 11), depth, moved(*SIDEWAYS), ramp())
+    rim = rim_of(strip(8, 11), depth, moved(*SIDEWAYS), RAMP)
     # The right side is as far: of two equal sides the first, in the direction of the line, counts.
     assert told(rim.mirrored[4, 8:12]) in ([6, 7, 7, 7], [16, 15, 14, 13])
-
-
-def test_after_a_move_up_columns_count() -> None:
-    depth, mask = torch.full((HEIGHT, WIDTH), 0.5), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    depth[:4], mask[4:7] = 0.1, True
-    rim = rim_of(mask, depth, moved(0, 0.3, 0), ramp(0))
-    assert told(rim.rgb[4:7, 9]) == [3] * 3
 
 
 def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

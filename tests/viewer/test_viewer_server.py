@@ -13,11 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from photos import write_photo
 from viewer_client import PAGES, QUICK, a_scene, answer_of, ask, complete, dial, eventually, get, raw, send, serving
 
 from spackle.errors import InputError
-from spackle.viewer.handler import TimeoutReader
 from spackle.viewer.page import PageScene
 from spackle.viewer.server import ViewerServer
 from spackle.viewer.work import Tell
@@ -31,15 +29,15 @@ def server() -> Iterator[ViewerServer]:
         yield server
 
 
-@pytest.fixture(scope="module")
-def photo(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return write_photo(tmp_path_factory.mktemp("photo") / "photo.png").read_bytes()
-
-
-# What a page asks for
-
-
 def test_the_page_and_the_scene_are_there(server: ViewerServer) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
+    with contextlib.closing(connection):  # one connection serves many requests
+        connection.connect()
+        first = connection.sock
+        for path in ("/", "/none", "/scene.json"):
+            connection.request("GET", path)
+            connection.getresponse().read()
+            assert connection.sock is first
     page = ask(server)
     assert (page.status, page.body, page.headers["Content-Type"]) == (200, b"<p>page", "text/html; charset=utf-8")
     state = ask(server, "/scene.json").json
@@ -54,6 +52,10 @@ def test_the_page_and_the_scene_are_there(server: ViewerServer) -> None:
         head, whole = ask(server, path, "HEAD"), ask(server, path)
         assert head.body == b""
         assert (head.status, head.headers["Content-Length"]) == (whole.status, whole.headers["Content-Length"])
+    with serving() as other:  # old scenes make room
+        paths = [other.show(a_scene(str(k))) for k in range(3)]
+        assert [ask(other, path).status for path in (*paths, "/scenes/1/base.bin")] == [404, 200, 200, 404]
+        assert ask(other, "/scene.json").json["scene"] == paths[-1]
 
 
 def test_every_answer_says_what_a_browser_may_do_with_it(server: ViewerServer) -> None:
@@ -73,17 +75,6 @@ def test_every_answer_says_what_a_browser_may_do_with_it(server: ViewerServer) -
         assert "Access-Control-Allow-Origin" not in reply.headers
 
 
-def test_one_connection_serves_many_requests(server: ViewerServer) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
-    with contextlib.closing(connection):
-        connection.connect()
-        first = connection.sock
-        for path in ("/", "/none", "/scene.json"):
-            connection.request("GET", path)
-            connection.getresponse().read()
-            assert connection.sock is first
-
-
 def test_a_silent_connection_is_closed(server: ViewerServer) -> None:
     with dial(server) as silent, dial(server, b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ") as dripping:
         start = time.monotonic()
@@ -93,16 +84,6 @@ def test_a_silent_connection_is_closed(server: ViewerServer) -> None:
                 time.sleep(0.05)
         assert answer_of(silent) == answer_of(dripping) == b""
         assert time.monotonic() - start < 3
-
-
-def test_old_scenes_make_room() -> None:
-    with serving() as server:
-        paths = [server.show(a_scene(str(k))) for k in range(3)]
-        assert [ask(server, path).status for path in (*paths, "/scenes/1/base.bin")] == [404, 200, 200, 404]
-        assert ask(server, "/scene.json").json["scene"] == paths[-1]
-
-
-# What nobody gets
 
 
 @pytest.mark.parametrize(
@@ -134,10 +115,9 @@ def test_other_methods_are_refused_and_posts_go_to_one_place(server: ViewerServe
 @pytest.mark.parametrize(
     ("header", "value"),
     [
-        *(("Host", name) for name in ("evil.example", "evil.example:80", "localhost.evil.example", "10.0.0.7", "")),
+        *(("Host", name) for name in ("evil.example", "localhost.evil.example", "10.0.0.7", "", "0.0.0.0")),
         *(("Host", name) for name in ("127.0.0.1.evil.example", "localhost:x", "localhost@evil.example", "[::1")),
-        *(("Host", name) for name in ("0.0.0.0", "localhost evil.example")),
-        *(("Origin", page) for page in ("http://evil.example", "null", "http://localhost:1", "http://127.0.0.1", "")),
+        *(("Origin", page) for page in ("http://evil.example", "null", "http://localhost:1", "")),
         *(("Sec_Fetch_Site", site) for site in ("cross-site", "same-site")),
     ],
 )
@@ -150,20 +130,13 @@ def test_a_foreign_host_page_or_site_is_refused(server: ViewerServer, header: st
         assert raw(server, b"GET / HTTP/1.1\r\nConnection: close\r\n\r\n").split()[1] == b"403"
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST:9", "localhost:9000", "[::1]:9000", "127.0.0.2"])
-def test_names_of_this_machine_are_ours_at_any_port(server: ViewerServer, host: str) -> None:
-    assert raw(server, get("/", host=host)).split()[1] == b"200"
-
-
-def test_open_to_the_network_its_names_are_more_but_not_all() -> None:
-    with serving(host="0.0.0.0") as server:
-        assert not server.local
-        assert server.url == f"http://127.0.0.1:{server.port}/"
+def test_names_of_this_machine_are_ours_at_any_port_and_open_to_the_network_more(server: ViewerServer) -> None:
+    for host in ("127.0.0.1", "localhost", "LOCALHOST:9", "[::1]:9000", "127.0.0.2"):
+        assert raw(server, get("/", host=host)).split()[1] == b"200"
+    with serving(host="0.0.0.0") as wide:
+        assert (wide.local, wide.url) == (False, f"http://127.0.0.1:{wide.port}/")
         for host, status in {"10.0.0.7:80": b"200", socket.gethostname(): b"200", "evil.example": b"403"}.items():
-            assert raw(server, get("/", host=host)).split()[1] == status
-
-
-# Clients that do not know how
+            assert raw(wide, get("/", host=host)).split()[1] == status
 
 
 @pytest.mark.parametrize(
@@ -172,14 +145,11 @@ def test_open_to_the_network_its_names_are_more_but_not_all() -> None:
         (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", b"400"),  # TLS
         (b"GET\r\n\r\n", b"400"),
         (b"GET / HTTP/1.1 and more\r\n\r\n", b"400"),
-        (b"GET / HTTP/x.y\r\n\r\n", b"400"),
         (b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n", b"505"),
         (b"GET /\r\n\r\n", b"505"),
-        (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"505"),
         (b"GET /" + 70_000 * b"a" + b" HTTP/1.1\r\n\r\n", b"414"),
         (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + 70_000 * b"a" + b"\r\n\r\n", b"431"),
         (b"GET / HTTP/1.1\r\nHost: localhost\r\n" + 200 * b"X: a\r\n" + b"\r\n", b"431"),
-        (b"\x00\xff\xfe\x1b[31m\r\n\r\n", b"400"),
         (b"GET / HTTP/1.1\r\nHost: localhost\r\nno colon\r\nOrigin: http://evil\r\n\r\n", b"400"),
     ],
 )
@@ -190,46 +160,24 @@ def test_malformed_requests_get_a_plain_answer(server: ViewerServer, data: bytes
     assert ask(server).status == 200
 
 
-@pytest.mark.parametrize(
-    ("headers", "more"),
-    [
-        *(
-            (f"Upgrade: websocket\r\nConnection: Upgrade\r\n{key}", b"\x81\x85\x37\xfa\x21\x3d\x7f\x9f\x4d\x51\x58")
-            for key in ("", "Sec-WebSocket-Key: dGhl\r\nSec-WebSocket-Version: 13\r\n", "Sec-WebSocket-Key: \r\n")
-        ),
-        (f"Content-Length: {len(get('/none'))}\r\n", get("/none")),
-    ],
-)
-def test_there_is_no_websocket_and_the_body_of_a_get_is_no_request(
-    server: ViewerServer, headers: str, more: bytes
-) -> None:
-    answer = raw(server, f"GET / HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n".encode() + more)
-    assert answer.split()[1] == b"200"
-    assert answer.count(b"HTTP/1.1") == 1
-    assert ask(server).status == 200
+def test_there_is_no_websocket_and_the_body_of_a_get_is_no_request(server: ViewerServer) -> None:
+    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: dGhl\r\nSec-WebSocket-Version: 13\r\n"
+    body = f"Content-Length: {len(get('/none'))}\r\n"
+    for headers, more in ((upgrade, b"\x81\x85\x37\xfa\x21\x3d\x7f\x9f\x4d\x51\x58"), (body, get("/none"))):
+        answer = raw(server, f"GET / HTTP/1.1\r\nHost: localhost\r\n{headers}\r\n".encode() + more)
+        assert (answer.split()[1], answer.count(b"HTTP/1.1")) == (b"200", 1)
 
 
-def test_a_client_that_never_reads_is_left() -> None:
+def test_connections_are_counted_and_a_client_that_never_reads_is_left() -> None:
     content = bytes(30_000_000)  # more than the socket's buffers hold
     with serving(limits=dataclasses.replace(QUICK, connections=1)) as server:
         server.show(a_scene(content=content))
         with dial(server, get("/scenes/1/base.bin")) as silent:  # it has the only place
             silent.recv(12)
+            assert raw(server, get("/"))[9:12] == b"503"
             eventually(lambda: raw(server, get("/"))[9:12] == b"200")
             assert len(answer_of(silent)) < len(content)
         eventually(lambda: len(ask(server, "/scenes/1/base.bin").body) == len(content))
-
-
-def test_connections_are_counted() -> None:
-    with serving(limits=dataclasses.replace(QUICK, connections=3, request=5)) as server:
-        waiting = [dial(server) for _ in range(3)]
-        eventually(lambda: raw(server, get("/"))[9:12] == b"503")
-        for connection in waiting:
-            connection.close()
-        eventually(lambda: raw(server, get("/"))[9:12] == b"200")
-
-
-# The end
 
 
 def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: bytes) -> None:
@@ -255,19 +203,23 @@ def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: b
             dial(server)
 
 
-def test_a_job_that_cannot_be_interrupted_does_not_hold_up_the_end() -> None:
+def test_a_job_that_cannot_be_interrupted_does_not_hold_up_the_end_and_the_log_is_printable() -> None:
     go_on = threading.Event()
+    lines: list[str] = []
 
     def deaf(tell: Tell) -> PageScene:
         go_on.wait(10)
         return a_scene()
 
-    server = ViewerServer(PAGES, complete, limits=QUICK)
+    server = ViewerServer(PAGES, complete, limits=QUICK, log=lines.append)
     server.start()
     server.work(deaf)
+    raw(server, get("/\x1b[31m\x07", host="localhost"))
     start = time.monotonic()
     assert not server.close()
     assert time.monotonic() - start < 1.5
+    assert lines
+    assert all(line.isprintable() for line in lines), lines
     go_on.set()
 
 
@@ -282,27 +234,3 @@ def test_where_nothing_can_listen_the_option_is_named(server: ViewerServer) -> N
         with pytest.raises(InputError) as caught:
             ViewerServer(PAGES, complete, **where)  # type: ignore[arg-type]
         assert str(caught.value).startswith(option)
-
-
-def test_the_log_cannot_play_with_a_terminal() -> None:
-    lines: list[str] = []
-    with serving(log=lines.append) as server:
-        raw(server, get("/\x1b[31m\x07", host="localhost"))
-        eventually(lambda: lines)
-    assert all(line.isprintable() for line in lines), lines
-
-
-def test_the_time_limit_is_for_the_whole_too() -> None:
-    one, other = socket.socketpair()
-    with one, other:
-        reader = TimeoutReader(one)
-        reader.allow(60, 0.1)
-        with pytest.raises(TimeoutError):
-            reader.read(1)
-        reader.allow(1, 1)
-        other.sendall(b"a")
-        assert reader.read(1) == b"a"
-        reader.allow(1, 0)
-        other.sendall(b"b")
-        with pytest.raises(TimeoutError):
-            reader.read(1)

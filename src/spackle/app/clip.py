@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,14 @@ def predict_clip(
             run.write(folder / "video.mp4", step)
         report = run.report(seconds)
         write_report(report, folder / "report.json")
-    reporter.say(f"{path.name}: {_summary(report)} -> {folder}")
+    holes, figures = report["hole_area_ratio"], report["flicker"]
+    calm = ""
+    if figures["carried"] is not None:
+        calm = f", flicker in holes {figures['alone']:.1f} -> {figures['carried']:.1f}"
+    reporter.say(
+        f"{path.name}: {report['clip']['frames']} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}{calm}, "
+        f"{report['seconds']['total']:.1f} s -> {folder}"
+    )
     reporter.result({"folder": folder, **report})
 
 
@@ -106,16 +113,17 @@ class _Run:
 
     def __init__(self, clip: Clip, focal: tuple[float, str], completer: PhotoCompleter, reporter: Reporter) -> None:
         self._clip, self._focal, self._setting, self._reporter = clip, focal, completer, reporter
-        choices = ClipChoices(
+        self._completer = ClipCompleter(
             completer.path.trajectory,
             completer.path.disparity,
             len(clip),
-            steady=completer.settings.depth is None,  # what was measured is not bent
+            completer.renderer,
+            OpenCV("a clip").flow,
+            align=completer.settings.depth is None,  # measured depth stays as it is
             fill=completer.residual.weights != "none",
             network=completer.network,
             precision=completer.settings.precision,
         )
-        self._completer = ClipCompleter(choices, completer.renderer, OpenCV("a clip").flow)
         self._base = completer.base
         self._first: tuple[Photo, BasePrediction, Choice] | None = None
         self._notes: list[dict[str, Any]] = []
@@ -131,7 +139,9 @@ class _Run:
                 drawn = self._draw(Photo(rgb, *self._focal, self._clip.path / NAME.format(index)))
                 with self._completer.timed("encode"):
                     writer.add(drawn.view.rgb)
-                self._notes.append(_note(drawn))
+                holes = (hole_area_ratio(drawn.before.alpha), hole_area_ratio(drawn.view.alpha))
+                aux = len(drawn.gaussians[1])
+                self._notes.append({"holes": holes, "aux": aux, "cut": drawn.cut, **drawn.flicker})
                 step(index + 1, len(self._clip))
         self._sound = writer.sound
         if self._clip.audio and not self._sound:
@@ -139,7 +149,7 @@ class _Run:
                 f"{self._clip.path.name}: its sound ({self._clip.audio}) does not go into an mp4: left out"
             )
 
-    def _draw(self, photo: Photo) -> Drawn:
+    def _draw(self, photo: Photo) -> CompletedView:
         """A frame's completed view."""
         with self._completer.timed("base"):
             prediction = self._predict(photo)
@@ -172,6 +182,7 @@ class _Run:
         (photo, prediction, choice), clip, notes = self._first, self._clip, self._notes
         stages = {name: round(value, 3) for name, value in self._completer.seconds.items()}
         before, after = ([note["holes"][side] for note in notes] for side in (0, 1))
+        found = {name: [note[name] for note in notes if name in note] for name in FIGURES}
         camera = prediction.camera
         report: dict[str, Any] = {
             "spackle": spackle.__version__,
@@ -190,11 +201,12 @@ class _Run:
             "focal_source": prediction.lens_source or photo.focal_source,
             "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
             "residual": {"weights": self._setting.residual.weights},
-            "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # for each frame, on the mean
+            "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # the mean over the frames
             "views": spelled(self._setting.path.trajectory),
             "disparity": self._setting.path.disparity,
             "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
-            "flicker": _flicker(notes),
+            # In units of 1/255; None where no frame has the figure.
+            "flicker": {name: round(255 * _mean(values), 3) if values else None for name, values in found.items()},
             "seconds": {**seconds, "by_stage": stages, "total": round(sum(seconds.values()), 3)},
         }
         if choice.failures:
@@ -202,50 +214,13 @@ class _Run:
         return report
 
 
-def _note(drawn: Drawn) -> dict[str, Any]:
-    """What is remembered of a frame."""
-    holes = (hole_area_ratio(drawn.before.alpha), hole_area_ratio(drawn.view.alpha))
-    return {"holes": holes, "aux": len(drawn.gaussians[1]), "cut": drawn.cut, **drawn.flicker}
-
-
-def _flicker(notes: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Means over the frames, in units of 1/255; None where no frame has any."""
-    found = {name: [note[name] for note in notes if name in note] for name in FIGURES}
-    return {name: round(255 * _mean(values), 3) if values else None for name, values in found.items()}
-
-
-def _mean(values: Sequence[float]) -> float:
+def _mean(values: list[float]) -> float:
     return sum(values) / len(values)
 
 
-def _summary(report: dict[str, Any]) -> str:
-    """A report in one line."""
-    holes, figures, clip = report["hole_area_ratio"], report["flicker"], report["clip"]
-    calm = ""
-    if figures["carried"] is not None:
-        calm = f", flicker in holes {figures['alone']:.1f} -> {figures['carried']:.1f}"
-    return (
-        f"{clip['frames']} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}{calm}, "
-        f"{report['seconds']['total']:.1f} s"
-    )
-
-
 @dataclasses.dataclass(frozen=True)
-class ClipChoices:
-    """What stays the same for all frames."""
-
-    trajectory: TrajectoryKind
-    disparity: float
-    frames: int  # of the clip, and so of the path
-    steady: bool = True  # hold the base's depth to that of the frame before
-    fill: bool = True  # fill holes
-    network: ResidualNet | None = None
-    precision: Precision = "auto"
-
-
-@dataclasses.dataclass(frozen=True)
-class Drawn:
-    """A frame that is done."""
+class CompletedView:
+    """The completed view of a frame."""
 
     camera: Camera
     gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
@@ -272,23 +247,31 @@ class _Past:
 
     rgb: Tensor  # [H, W, 3] the input
     inverse_depth: Tensor  # [H, W] as the base said it, 0 where unknown
-    stretch: DepthAlignment
+    alignment: DepthAlignment
     depths: DepthRange  # of the path
     memory: FrameMemory | None = None
-    drawn: Drawn | None = None
+    drawn: CompletedView | None = None
 
 
+@dataclasses.dataclass
 class ClipCompleter:
     """Takes the frames in their order and completes the view of each; one frame is kept in memory."""
 
-    def __init__(self, choices: ClipChoices, renderer: Renderer, flow: Flow) -> None:
-        self.seconds: dict[str, float] = {}
-        self._choices, self._renderer, self._flow = choices, renderer, flow
-        self._past: _Past | None = None
-        self._count = 0
+    trajectory: TrajectoryKind
+    disparity: float
+    frames: int  # of the clip, and so of the path
+    renderer: Renderer
+    flow: Flow
+    align: bool = True  # align the base's depth with that of the frame before
+    fill: bool = True  # fill holes
+    network: ResidualNet | None = None
+    precision: Precision = "auto"
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # spent on each stage
+    _past: _Past | None = None
+    _count: int = 0
 
     @torch.no_grad()
-    def add(self, rgb: Tensor, prediction: BasePrediction) -> Drawn:
+    def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
         """The next frame.
 
         Args:
@@ -299,21 +282,20 @@ class ClipCompleter:
             ValueError: depths and focal length allow no path.
         """
         with self.timed("depth"):
-            base, shield, now, past = self._steadied(rgb, prediction)
-        choices, even = self._choices, prediction.camera.even()
-        camera = view_at(choices.trajectory, even, choices.disparity, now.depths, self._count, choices.frames)
+            base, guard, now, past = self._aligned(rgb, prediction)
+        even = prediction.camera.even()
+        camera = view_at(self.trajectory, even, self.disparity, now.depths, self._count, self.frames)
         with self.timed("complete"):
-            before, aux = self._renderer.render(base, camera), Gaussians.empty()
+            before, aux = self.renderer.render(base, camera), Gaussians.empty()
             alone = before
-            if choices.fill:
-                network, precision = choices.network, choices.precision
-                completer = Completer(base, prediction.camera, self._renderer, network, precision=precision)
-                aux, alone = completer.completed_view(camera, [shield], rendering=before)
-        drawn, memory = Drawn(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
-        if choices.fill:
+            if self.fill:
+                completer = Completer(base, prediction.camera, self.renderer, self.network, precision=self.precision)
+                aux, alone = completer.completed_view(camera, [guard], rendering=before)
+        drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
+        if self.fill:
             with self.timed("carry"):
                 memory_before = None if past is None else past.memory
-                frame = propagate_colors(base, aux, camera, self._renderer, (before, alone), memory_before, self._flow)
+                frame = propagate_colors(base, aux, camera, self.renderer, (before, alone), memory_before, self.flow)
                 drawn, memory = _carried(drawn, frame, past), frame.memory
         self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
         self._count += 1
@@ -326,29 +308,29 @@ class ClipCompleter:
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def _steadied(
+    def _aligned(
         self, rgb: Tensor, prediction: BasePrediction
     ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
-        """The base with its depth held to the past, what the photo shows of it, what to keep, and the shot's past."""
-        seen = self._renderer.render(prediction.gaussians, prediction.camera)
+        """The base with its depth aligned to the past, the frame's occlusion guard, what to keep, the shot's past."""
+        seen = self.renderer.render(prediction.gaussians, prediction.camera)
         known = ~hole_mask(seen.alpha) & (seen.depth > 0)
         inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
-        past, stretch = self._past, DepthAlignment()
+        past, alignment = self._past, DepthAlignment()
         if past is not None:
-            found = track(rgb, past.rgb, self._flow)
+            found = track(rgb, past.rgb, self.flow)
             if not found.same_shot():
                 past = None
-            elif self._choices.steady:
-                stretch = past.stretch.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
-        base = stretch.of_gaussians(prediction.gaussians)
-        shield = OcclusionGuard.of(dataclasses.replace(seen, depth=stretch.of_depth(seen.depth)), prediction.camera)
+            elif self.align:
+                alignment = past.alignment.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
+        base = alignment.of_gaussians(prediction.gaussians)
+        guard = OcclusionGuard.of(dataclasses.replace(seen, depth=alignment.of_depth(seen.depth)), prediction.camera)
         depths = DepthRange.of(base)
         if past is not None:
             depths = past.depths.towards(depths, FOLLOW)
-        return base, shield, _Past(rgb, inverse_depth, stretch, depths), past
+        return base, guard, _Past(rgb, inverse_depth, alignment, depths), past
 
 
-def _carried(drawn: Drawn, frame: CompletedFrame, past: _Past | None) -> Drawn:
+def _carried(drawn: CompletedView, frame: CompletedFrame, past: _Past | None) -> CompletedView:
     """What was drawn, with the colours of the past."""
     drawn = dataclasses.replace(drawn, gaussians=(drawn.gaussians[0], frame.aux), view=frame.view)
     if past is None or past.drawn is None or frame.flow is None:

@@ -24,8 +24,6 @@ from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.scene import Mode, ResidualChoice, Scene, complete
 
-MOST_CHECKED = 16  # views at keyframes whose holes are measured
-
 
 @dataclasses.dataclass(frozen=True)
 class PlannedViews:
@@ -48,14 +46,6 @@ class PlannedViews:
         last = len(cameras) - len(others)
         checked = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(path))}
         return PlannedViews(cameras, checked, frames, len(path) if stills else 0, maker)
-
-    def widest_checked(self, photo_camera: Camera) -> tuple[str, int]:
-        """Name and index of the checked view that is farthest from the photo's."""
-
-        def distance(item: tuple[str, int]) -> float:
-            return float((self.cameras[item[1]].position.double() - photo_camera.position.double()).norm())
-
-        return max(self.checked.items(), key=distance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +87,7 @@ class PhotoCompleter:
         with reporter.stage("base", seconds) as step:
             prediction, choice = base.predict(step)
         photo = resize_photo(photo)
-        self._tell(photo, prediction, choice, reporter)
+        self._say_base(photo, prediction, choice, reporter)
         views = self._plan(photo.path, prediction)
         with reporter.stage("complete", seconds) as step:
             scene, saved_view = self._fill(prediction, views, step)
@@ -105,8 +95,8 @@ class PhotoCompleter:
                 raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
         return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
 
-    def _tell(self, photo: Photo, prediction: BasePrediction, choice: Choice, reporter: Reporter) -> None:
-        """Which base it was, and what it took."""
+    def _say_base(self, photo: Photo, prediction: BasePrediction, choice: Choice, reporter: Reporter) -> None:
+        """Say which base predicted, the focal length, and how much depth was filled."""
         name = photo.path.name
         if choice.note:
             reporter.say(f"{name}: {choice.note}")
@@ -142,7 +132,7 @@ class PhotoCompleter:
         if self.keyframes is None:
             return dict(zip((f"{-far:g}", f"+{far:g}"), extremes(camera, far, depths), strict=True))
         keys = self.keyframes.key_cameras(camera, depths)
-        step = math.ceil(len(keys) / MOST_CHECKED)
+        step = math.ceil(len(keys) / 16)  # at most 16 views are measured
         return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}
 
     def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, str | None]:
@@ -161,9 +151,11 @@ class PhotoCompleter:
         )
         if scene.by_view is None:
             return scene, None
-        # One file holds one view's Gaussians: those of the widest view that the report names.
-        name, widest = views.widest_checked(prediction.camera)
-        return dataclasses.replace(scene, aux=scene.by_view[widest]), name
+        # One file holds one view's Gaussians: those of the checked view that is farthest from the photo's.
+        eye = prediction.camera.position.double()
+        far = {name: float((views.cameras[k].position.double() - eye).norm()) for name, k in views.checked.items()}
+        name = max(far, key=lambda name: far[name])
+        return dataclasses.replace(scene, aux=scene.by_view[views.checked[name]]), name
 
 
 def save_views_video(path: Path, views: PlannedViews, scene: Scene, renderer: Renderer, step: Step) -> None:

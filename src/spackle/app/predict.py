@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import spackle
 from spackle.app.clip import check_clip_options, predict_clip
@@ -18,12 +21,12 @@ from spackle.app.complete import (
     save_pictures,
     save_views_video,
 )
-from spackle.app.report import base_before, is_done, make_report, summary
 from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.lite.base import LiteBase
 from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
 from spackle.bases.sharp import SharpBase
+from spackle.camera_path import spelled
 from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError
 from spackle.formats import save_ply
@@ -32,9 +35,6 @@ from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter
 from spackle.scene import Mode, ResidualChoice
-
-FILES = ("base.ply", "scene.ply", "report.json")  # and the video
-IRRELEVANT = ("name", "low_memory", "windows", "compiled")  # change only last bits, or stand in other words there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,12 +53,9 @@ class PredictOptions:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """What a photo's folder gets, besides views/."""
-        return (*FILES, self.video_file) if self.render else FILES
-
-    @property
-    def video_file(self) -> str:
-        return f"video{self.path.video.suffix}"
+        """What a photo's folder gets, besides views/: the video is the last."""
+        files = ("base.ply", "scene.ply", "report.json")
+        return (*files, f"video{self.path.video.suffix}") if self.render else files
 
     @property
     def lens(self) -> dict[str, float | None]:
@@ -131,9 +128,9 @@ def predict_one(
                 save_ply(part, folder / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)
         video = None
         if options.render:
-            video = views.maker.note(options.video_file, views.cameras[views.frames[0][0]], len(views.frames))
+            video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video", seconds) as step:
-                save_views_video(folder / options.video_file, views, scene, renderer, step)
+                save_views_video(folder / options.files[-1], views, scene, renderer, step)
         if completer.given_views:
             with reporter.stage("views", seconds) as step:
                 save_pictures(folder / "views", views, scene, renderer, step)
@@ -141,31 +138,25 @@ def predict_one(
             holes = measure_holes(views, scene, renderer)
         report = make_report(done, completer, holes, video, request, seconds)
         write_report(report, folder / "report.json")
-    reporter.say(f"{path.name}: {summary(report)} -> {folder}")
+    before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))
+    aux, weights, total = report["aux"], completer.residual.weights, report["seconds"]["total"]
+    reporter.say(
+        f"{path.name}: {aux['gaussians']:,} aux Gaussians ({aux['share']:.1%}, {weights}), "
+        f"holes {before:.2%} -> {after:.3%}, {total:.1f} s -> {folder}"
+    )
     reporter.result({"folder": folder, **report})
 
 
 def open_completer(options: PredictOptions) -> PhotoCompleter:
     """What all photos share; InputError for an option that cannot be used, whatever the photo."""
     completer = PhotoCompleter(options.base, options.residual, options.path, options.mode)
-    video = options.path.video
+    video, views = options.path.video, completer.given_views
     for option, value in {"--format": video.format, "--fps": video.fps, "--loop": video.loop}.items():
         if value is not None and not options.render:
             raise InputError(f"{option} {value}: is for the video, and --no-render writes none: leave one of them out")
-    views = completer.given_views if options.render else None
-    if views and (problem := video_problem(views)):
+    if options.render and views and (problem := video_problem(views)):
         raise InputError(f"{options.path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
     return completer
-
-
-def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
-    """A line where SHARP's results are about to give way to rough ones, because its weights are damaged or gone."""
-    if base.named == AUTO and done.choice.base == LiteBase.name and base_before(folder) == SharpBase.name:
-        file = base.files.get("checkpoint")
-        reporter.say(
-            f"{done.photo.path.name}: warning: {folder} was made by sharp and is made again by lite: "
-            f"{done.choice.why}{'' if file is None else f' ({file})'}"
-        )
 
 
 def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
@@ -179,7 +170,9 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
     own: dict[str, object] = {"spackle": spackle.__version__, "base": named, "residual": residual.weights}
     own |= {"render": options.render, "mode": options.mode, **options.lens}
     fields = {**dataclasses.asdict(settings), **dataclasses.asdict(path)}
-    choices = {name: value for name, value in fields.items() if not isinstance(value, Path) and name not in IRRELEVANT}
+    for name in ("name", "low_memory", "windows", "compiled"):  # recorded as `base`, or change last bits alone
+        del fields[name]
+    choices = {name: value for name, value in fields.items() if not isinstance(value, Path)}
     files = {"calibration": settings.calib, "camera file": path.cameras, "path file": path.path}
     files["weights"] = residual.file
     prints = [file and fingerprint(file, kind) for kind, file in files.items()]
@@ -220,3 +213,67 @@ def find_photos(path: Path) -> list[tuple[Path, str]]:
     names = {photo.name.casefold() for photo in photos}
     taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
     return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
+
+
+def make_report(
+    done: CompletedPhoto,
+    completer: PhotoCompleter,
+    holes: list[dict[str, float | str]],
+    video: dict[str, object] | None,
+    request: str,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """Counts, holes, times and sources of one photo, ready for JSON."""
+    photo, prediction, choice, path = done.photo, done.prediction, done.choice, completer.path
+    base, aux, weights = len(done.scene.base), len(done.scene.aux), completer.residual.weights
+    given = path.cameras or path.path
+    report: dict[str, Any] = {
+        "spackle": spackle.__version__,
+        "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
+        "focal_px": round(prediction.camera.focal[0], 3),
+        "focal_source": prediction.lens_source or photo.focal_source,
+        "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
+        "residual": {"weights": weights},
+        "aux": {"gaussians": aux, "share": aux / base},
+        "merged": base + aux,
+        "mode": completer.mode,
+        "views": given.name if given else spelled(path.trajectory),
+        "disparity": None if given else path.disparity,
+        "video": video,
+        "hole_area_ratio": holes,
+        "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
+        "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
+    }
+    if choice.failures:
+        report["base"]["passed_over"] = list(choice.failures)
+    if weights == "seeds":
+        report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
+    if done.saved_view is not None:
+        report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
+    return report
+
+
+def is_done(folder: Path, results: Sequence[str], request: str) -> bool:
+    """Whether an earlier run with the same files and options has finished, and its results still exist."""
+    return all((folder / name).is_file() for name in results) and _earlier(folder).get("request") == request
+
+
+def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
+    """Warn before rough results replace SHARP's, because its weights are damaged or gone."""
+    before = _earlier(folder).get("base")
+    by_sharp = isinstance(before, dict) and before.get("name") == SharpBase.name
+    if by_sharp and base.named == AUTO and done.choice.base == LiteBase.name:
+        file = base.files.get("checkpoint")
+        reporter.say(
+            f"{done.photo.path.name}: warning: {folder} was made by sharp and is made again by lite: "
+            f"{done.choice.why}{'' if file is None else f' ({file})'}"
+        )
+
+
+def _earlier(folder: Path) -> dict[str, Any]:
+    """An earlier run's report; empty without a whole one."""
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}

@@ -1,4 +1,4 @@
-"""`spackle weights`: fetch what others publish, and say what is here."""
+"""`spackle weights`: download published weights, and list those on this machine."""
 
 from __future__ import annotations
 
@@ -45,7 +45,12 @@ def get_weights(
         InputError: an unknown name, a file that cannot be had or not be written, or one that is there and damaged.
     """
     known = known_weights(name)
-    path = _place(known, output)
+    if output is None:
+        path = weights_folder() / known.file
+    elif output.suffix.lower() == Path(known.file).suffix and not os.path.isdir(output):
+        path = output
+    else:
+        path = output / known.file
     record: DownloadRecord | None
     new = force or not os.path.isfile(path)
     if new:
@@ -54,8 +59,14 @@ def get_weights(
         hint = "" if output is None else "; --checkpoint names it to predict"
         reporter.say(f"{_summary(known, record)} -> {path}{hint}")
     else:
-        record = _say_present(known, path, reporter)
-    sha256 = None if record is None else record.sha256  # no digest where there is no record of the download
+        with reporter.stage("check", {}):
+            record = check_recorded(path)
+        if record is None:
+            unchecked = "there already, unchecked for want of a record; --force downloads it again"
+            reporter.say(f"{known.name}: {unchecked}: {path}")
+        else:
+            reporter.say(f"{_summary(known, record)}, there already and intact: {path}")
+    sha256 = None if record is None else record.sha256
     size = os.path.getsize(path)
     reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
     return path
@@ -95,24 +106,6 @@ def list_weights(reporter: Reporter, console: Console) -> None:
         return
     console.print(table)
     console.print(f"in {folder} (SPACKLE_WEIGHTS names another)", markup=False, soft_wrap=True)
-
-
-def _place(known: KnownWeights, output: Path | None) -> Path:
-    if output is None:
-        return weights_folder() / known.file
-    named = output.suffix.lower() == Path(known.file).suffix and not os.path.isdir(output)
-    return output if named else output / known.file
-
-
-def _say_present(known: KnownWeights, path: Path, reporter: Reporter) -> DownloadRecord | None:
-    """What is said of a file that is there; its record, if any."""
-    with reporter.stage("check", {}):
-        record = check_recorded(path)
-    if record is None:
-        reporter.say(f"{known.name}: there already, unchecked for want of a record; --force downloads it again: {path}")
-    else:
-        reporter.say(f"{_summary(known, record)}, there already and intact: {path}")
-    return record
 
 
 def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> DownloadRecord:

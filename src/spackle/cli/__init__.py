@@ -63,9 +63,17 @@ app.command(short_help="A saved scene to a video")(render.render)
 app.command(short_help="Look at a scene, or at a photo that becomes one")(view.view)
 app.command(short_help="A scene for other viewers, or as one page to send")(render.export)
 app.command(short_help="The Middlebury Motorcycle, against its true second photo")(predict.demo)
-train.register(app)
-evaluate.register(app)
-dataset.register(app)
+app.command(short_help="Train the residual or SHARP's decoder")(train.train)
+app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure on a dataset, in the paper's protocols")(
+    evaluate.evaluate
+)
+app.command(short_help="Several evaluations in the same tables")(evaluate.tables)
+app.command(context_settings=evaluate.EXTRA_WORDS, short_help="What Spackle costs, in Gaussians and in time")(
+    evaluate.bench
+)
+app.add_typer(
+    dataset.dataset, name="dataset", short_help="Photos to views with holes and completed targets, to train on"
+)
 app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 
 

@@ -10,7 +10,7 @@ import typer
 from spackle.cli.options import (
     INTERRUPTED,
     DeviceOption,
-    PrecisionName,
+    PrecisionOption,
     VerboseOption,
     trajectory_option,
 )
@@ -39,7 +39,7 @@ def dataset_build(
         Path | None, typer.Option(metavar="FOLDER", help="Depth maps named as the photos, for --base rgbd.")
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
-    precision: Annotated[PrecisionName, typer.Option(help="Of the base's network.")] = "auto",
+    precision: PrecisionOption = "auto",
     views: Annotated[int, typer.Option(help="Views of a photo, its own among them.")] = 20,
     trajectory: Annotated[str | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
     disparity: Annotated[
@@ -121,8 +121,3 @@ def dataset_preview(
     from spackle.progress import Reporter
 
     preview_dataset(location, output, photos, views, Reporter())
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(dataset, name="dataset", short_help="Photos to views with holes and completed targets, to train on")

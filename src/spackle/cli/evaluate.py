@@ -1,25 +1,27 @@
-"""`spackle evaluate`, `spackle tables` and `spackle bench`, as the command line has them."""
+"""`spackle evaluate`, `spackle tables` and `spackle bench`."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, JsonOption
+from spackle.cli.options import INTERRUPTED, DeviceOption, JsonOption, PrecisionName, PrecisionOption, VerboseOption
 from spackle.errors import InputError
 
 if TYPE_CHECKING:
     from spackle.bases.open import BaseSettings
 
-WORDS = {"allow_extra_args": True}  # of `--disparity 0.3 0.4 0.5` only the first belongs to the option, see _with_words
+# Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_with_words`.
+EXTRA_WORDS = {"allow_extra_args": True}
 NUMBER = re.compile(r"[\d.,]+")
 UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
 
 # Options that both commands have.
+Limit = Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")]
 _DATASET = typer.Option(
     metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
 )
@@ -33,9 +35,6 @@ Residual = Annotated[
     str | None,
     typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
 ]
-Limit = Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")]
-Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
-Precision = Annotated[str, typer.Option(help="Of the base's network: auto, fp32 or bf16.")]
 Disparity = Annotated[
     str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
 ]
@@ -44,7 +43,6 @@ Output = Annotated[
     typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on. Default: named by the choices."),
 ]
 Html = Annotated[bool, typer.Option("--html", help="Write report.html there too: one page with all of it.")]
-Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each image or view takes.")]
 
 
 def evaluate(
@@ -68,7 +66,7 @@ def evaluate(
     ] = None,
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
-    precision: Precision = "auto",
+    precision: PrecisionOption = "auto",
     low_memory: LowMemory = False,
     residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
@@ -77,11 +75,11 @@ def evaluate(
     download_metrics: Annotated[
         bool, typer.Option("--download-metrics", help="Let pyiqa fetch weights (some are not for commercial use).")
     ] = False,
-    device: Device = "auto",
+    device: DeviceOption = "auto",
     output: Output = None,
     html: Html = False,
     as_json: JsonOption = False,
-    verbose: Verbose = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
     from spackle.evaluation.run import evaluate as run
@@ -146,7 +144,7 @@ def bench(
     disparity: Disparity = "0.3,0.4,0.5",
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
-    precision: Precision = "auto",
+    precision: PrecisionOption = "auto",
     low_memory: LowMemory = False,
     residual: Residual = None,
     limit: Limit = None,
@@ -154,10 +152,10 @@ def bench(
     base_runs: Annotated[
         int | None, typer.Option(help="How often the base is timed. [default: 1 for sharp, else as --runs]")
     ] = None,
-    device: Device = "auto",
+    device: DeviceOption = "auto",
     output: Output = None,
     as_json: JsonOption = False,
-    verbose: Verbose = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex.
 
@@ -220,11 +218,12 @@ def _given(context: typer.Context) -> set[str]:
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
-def _settings(base: str, checkpoint: Path | None, precision: str, low_memory: bool, device: str) -> BaseSettings:
+def _settings(
+    base: str, checkpoint: Path | None, precision: PrecisionName, low_memory: bool, device: str
+) -> BaseSettings:
     from spackle.bases.open import BaseSettings
 
-    named: Any = precision  # checked with the other options
-    return BaseSettings(base, checkpoint=checkpoint, precision=named, low_memory=low_memory, device=device)
+    return BaseSettings(base, checkpoint=checkpoint, precision=precision, low_memory=low_memory, device=device)
 
 
 def _with_words(context: typer.Context, disparity: str) -> str:
@@ -237,10 +236,3 @@ def _with_words(context: typer.Context, disparity: str) -> str:
     if strange or source is None or source.name != "COMMANDLINE":
         raise InputError(f"{(strange or words)[0]}: a word of no option: lists are given with commas: --methods A,B")
     return ",".join((disparity, *words))
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command(context_settings=WORDS, short_help="Measure on a dataset, in the paper's protocols")(evaluate)
-    app.command(short_help="Several evaluations in the same tables")(tables)
-    app.command(context_settings=WORDS, short_help="What Spackle costs, in Gaussians and in time")(bench)

@@ -21,6 +21,7 @@ SPELLINGS = ["swipe", "shake", "rotate", "rotate-forward"]  # of trajectories
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
+PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[DeviceName, typer.Option(help="Where to compute.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="For scripts: print each result, and an error, as a line of JSON.")

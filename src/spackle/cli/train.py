@@ -1,21 +1,13 @@
-"""`spackle train`, as the command line has it."""
+"""`spackle train`."""
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from spackle.cli.options import INTERRUPTED, VerboseOption
-
-
-class MethodChoice(str, Enum):
-    """What learns."""
-
-    residual = "residual"
-    direct_ft = "direct-ft"
 
 
 def train(
@@ -32,9 +24,9 @@ def train(
         list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="In place of the recipe's: optim.steps=100.")
     ] = None,
     method: Annotated[
-        MethodChoice,
+        Literal["residual", "direct-ft"],
         typer.Option(help="What learns: the residual, or (direct-ft) SHARP's decoder, for comparison."),
-    ] = MethodChoice.residual,
+    ] = "residual",
     checkpoint: Annotated[
         Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of SHARP, for direct-ft.")
     ] = None,
@@ -45,14 +37,9 @@ def train(
     from spackle.progress import Reporter
     from spackle.training.run import train_recipe
 
-    speaker, choices = Reporter(verbose), overrides or []
+    choices = overrides or []
     ended = train_recipe(
-        recipe, choices, output, speaker, method=method.value, checkpoint=checkpoint, overwrite=overwrite
+        recipe, choices, output, Reporter(verbose), method=method, checkpoint=checkpoint, overwrite=overwrite
     )
     if ended == "stopped":
         raise typer.Exit(INTERRUPTED)
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command(short_help="Train the residual or SHARP's decoder")(train)

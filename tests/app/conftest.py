@@ -1,0 +1,22 @@
+"""One ordinary prediction, which the tests of the commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from command import Run, predicted
+from photos import write_pair
+
+
+@pytest.fixture(scope="session")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """The folder of the prediction, which no test may change, and what the command printed."""
+    folder = tmp_path_factory.mktemp("plain")
+    result = predicted(*write_pair(folder), folder / "out")
+    return folder / "out" / "photo", result
+
+
+@pytest.fixture(scope="session")
+def scene(plain: tuple[Path, Run]) -> Path:
+    return plain[0] / "scene.ply"
