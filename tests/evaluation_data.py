@@ -25,28 +25,8 @@ def write_pfm(path: Path, values: NDArray[np.float32]) -> None:
     path.write_bytes(head + values[::-1].astype("<f4").tobytes())
 
 
-def write_scene(
-    folder: Path,
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    disparity: NDArray[np.float32],
-    focal: float,
-    cx: float,
-    cy: float,
-    doffs: float,
-) -> None:
-    """A stereo pair with its scene.json; inf in the disparity is unknown."""
-    folder.mkdir(parents=True)
-    Image.fromarray(left).save(folder / "left.png")
-    Image.fromarray(right).save(folder / "right.png")
-    write_pfm(folder / "disp.pfm", disparity)
-    names = {"left": "left.png", "right": "right.png", "disparity": "disp.pfm", "disparity_scale": 1, "invalid": "inf"}
-    lens = {"focal_px": focal, "cx": cx, "cy": cy, "doffs_px": doffs, "baseline_m": BASELINE}
-    (folder / "scene.json").write_text(json.dumps(names | lens))
-
-
 def write_boxes(folder: Path, seed: int) -> None:
-    """A box before a wall, seen from both sides."""
+    """A box before a wall, seen from both sides, with a scene.json."""
     rng = np.random.default_rng(seed)
     hue, phase = rng.uniform(0.3, 0.7, 3), rng.uniform(0, 6, 3)
     left, top = int(rng.integers(20, 30)), int(rng.integers(8, 16))
@@ -63,22 +43,13 @@ def write_boxes(folder: Path, seed: int) -> None:
     photos = [np.where(box[..., None], front(x), wall(x))]
     photos += [np.where(beside[..., None], front(x + NEAR_PX), wall(x + FAR_PX))]
     first, second = (np.round(255 * photo.clip(0, 1)).astype(np.uint8) for photo in photos)
-    disparity = np.where(box, NEAR_PX, FAR_PX).astype(np.float32)
-    write_scene(folder, first, second, disparity, FOCAL, WIDTH / 2, HEIGHT / 2, 0.0)
-
-
-def write_motorcycle(folder: Path, shrink: int = 4) -> None:
-    """Middlebury's Motorcycle as scikit-image has it, smaller."""
-    left, right, disparity = pytest.importorskip("skimage.data").stereo_motorcycle()
-    height, width = (size // shrink * shrink for size in disparity.shape)
-
-    def small(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return np.asarray(Image.fromarray(image[:height, :width]).reduce(shrink))
-
-    values = disparity[:height:shrink, :width:shrink] / shrink
-    values = np.where(np.isfinite(values), values, np.inf).astype(np.float32)
-    lens = [value / shrink for value in (994.978, 311.193, 254.877, 31.086)]
-    write_scene(folder, small(left), small(right), values, *lens)
+    folder.mkdir(parents=True)
+    Image.fromarray(first).save(folder / "left.png")
+    Image.fromarray(second).save(folder / "right.png")
+    write_pfm(folder / "disp.pfm", np.where(box, NEAR_PX, FAR_PX).astype(np.float32))
+    names = {"left": "left.png", "right": "right.png", "disparity": "disp.pfm"}
+    lens = {"focal_px": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "doffs_px": 0, "baseline_m": BASELINE}
+    (folder / "scene.json").write_text(json.dumps(names | lens))
 
 
 def run_config(title: str, near: bool, methods: Sequence[str]) -> dict[str, Any]:
@@ -98,7 +69,7 @@ def run_config(title: str, near: bool, methods: Sequence[str]) -> dict[str, Any]
 def fake_pyiqa(
     patch: pytest.MonkeyPatch, create: Callable[..., object] | None = None, error: Exception | None = None
 ) -> types.ModuleType:
-    """Put a module in pyiqa's place: with `create_metric`, or one that cannot be imported."""
+    """Put a module in pyiqa's place: with `create_metric`, or one whose import raises `error`."""
     module = types.ModuleType("pyiqa")
     module.__dict__.update(__version__="9.9", create_metric=create)
     if error is None:

@@ -20,7 +20,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation import paper
-from spackle.evaluation.alignment import SAME, align, to_base
+from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, Points, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, get_dataset
 from spackle.evaluation.datasets.multiview import spread
@@ -579,7 +579,7 @@ def test_a_known_factor_comes_back_under_outliers() -> None:
     assert found.source == "depth"
     assert 0.6 * 60 * 70 < found.pixels < 0.8 * 60 * 70
     assert 0 < found.spread < 0.05
-    assert align(case_with(depth=lambda: depth), z_base, seen, base_is_truth=True) == SAME
+    assert align(case_with(depth=lambda: depth), z_base, seen, base_is_truth=True) == Alignment(1.0, 0, 0.0, "same")
 
 
 def test_points_give_the_scale_too() -> None:

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command import Run, names_in, run
-from evaluation_data import fake_pyiqa, run_config, write_boxes, write_motorcycle
+from command import Run, names_in, refuses, run
+from evaluation_data import fake_pyiqa, run_config, write_boxes
 from PIL import Image
 from scenes import box_before_wall, shifted
 from torch import Tensor
@@ -31,7 +31,7 @@ from spackle.camera_path import DepthRange, max_offset
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import paper
-from spackle.evaluation.case import Case, LoadedCase, load_case
+from spackle.evaluation.case import Case, load_case
 from spackle.evaluation.methods import Shot, make_method
 from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim_average, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure
@@ -53,17 +53,16 @@ Figures = dict[str, dict[str, float | None]]
 # --- metrics
 
 
-def noisy(seed: int = 0) -> tuple[Tensor, Tensor]:
+def noisy() -> tuple[Tensor, Tensor]:
     """A random image and a disturbed copy, float64."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     image = torch.rand(57, 83, 3, generator=generator, dtype=torch.float64)
     return image, (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_psnr_and_ssim_are_scikit_images(seed: int) -> None:
+def test_psnr_and_ssim_are_scikit_images() -> None:
     theirs = pytest.importorskip("skimage.metrics")
-    image, truth = noisy(seed)
+    image, truth = noisy()
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
     mean, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
     assert ssim_average(ssim_map(image, truth)) == pytest.approx(mean, abs=1e-6)
@@ -116,8 +115,7 @@ def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: py
     seen: list[tuple[Tensor, ...]] = []
 
     def create(name: str, device: torch.device, **options: Any) -> Any:
-        print("loading", name)
-        asked[name] = (device, options)
+        asked[name] = options
 
         def metric(*images: Tensor) -> Tensor:
             seen.append(images)
@@ -128,10 +126,8 @@ def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: py
     fake_pyiqa(monkeypatch, create)
     metrics, states = open_metrics(list(DEFINITIONS), "cpu", download=False)
     assert states == dict.fromkeys(DEFINITIONS, "pyiqa 9.9")
-    assert asked["lpips"] == (torch.device("cpu"), {"net": "alex", "version": "0.1"})
-    assert asked["musiq"][1] == {"pretrained": "koniq10k"}
-    assert asked["clipiqa"][1] == {"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False}
-    assert (asked["niqe"][1], asked["dists"][1]) == ({"test_y_channel": True}, {})
+    assert asked == {name: figure.options for name, figure in DEFINITIONS.items()}
+    assert (asked["lpips"], asked["musiq"]) == ({"net": "alex", "version": "0.1"}, {"pretrained": "koniq10k"})
     picture, truth = torch.full((5, 7, 3), 1.5), torch.full((5, 7, 3), 0.25)
     picture[0, 1, 2] = 0.0
     assert metrics["lpips"](picture, truth) == pytest.approx(104 / 105)
@@ -202,10 +198,7 @@ def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
     assert cells(gaussians, "LLFF")[1][-3:] == ("23,397", "1.98", "1,203,045")
     assert cells(quality, "Tanks")[0] == ("not run", *[""] * 10)
     assert len(cells(holes, "Booster")) == 2
-    for word in ("CLIPIQA not run: pyiqa is not installed", "1 of 3 images gave no figures: c.", "Noncommercial"):
-        assert any(word in note for note in quality.notes)
-    for word in ("swipe", "shipped weights 01234567", "rgbd: the dataset's own depth"):
-        assert word in quality.caption
+    assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
 
 
 def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
@@ -225,15 +218,12 @@ def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
     assert "LLFF 2/305" in near.caption
 
 
-def test_results_that_do_not_go_together_are_refused() -> None:
+def test_results_that_do_not_go_together_and_means_of_what_is_not_finite() -> None:
     one = results("LLFF", "large-view", ["base"], LARGE)
     other = Results({**one.config, "title": "Tanks", "disparities": [0.3]}, one.records)
     for second, why in ((one, "two results for LLFF"), (other, "different disparities")):
         with pytest.raises(InputError, match=why):
             make_tables([one, second])
-
-
-def test_a_mean_leaves_out_what_is_not_finite_and_counts_it() -> None:
     rows = tuple(Row("near", str(k), "base", {"psnr": value}) for k, value in enumerate((10.0, None, 20.0)))
     assert Results({}, (ImageResult("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
     assert Results({}, ()).mean("psnr", "base", "near") == Mean(None, 0, 0)
@@ -265,21 +255,9 @@ def test_a_table_as_markdown_and_as_latex() -> None:
     assert tex("100%_↑") == r"100\%\_$\uparrow$"
     with pytest.raises(ValueError, match="different lengths"):
         Table("t", "", ("A",), (("", 1),), (Line(("1", "2")),))
-
-
-@pytest.mark.parametrize(
-    ("values", "texts", "lower", "marked"),
-    [
-        ([1.0, None, 2.0], ["1", "", "2"], True, ["**1**", "", "2"]),
-        ([1.0, 1.0001], ["1.0", "1.0"], False, ["1.0", "1.0"]),
-        ([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], False, ["1.0", "**1.1**", "**1.1**"]),
-        ([1.0], ["1"], False, ["1"]),
-    ],
-)
-def test_the_best_of_a_column_is_set_off(
-    values: list[float | None], texts: list[str], lower: bool, marked: list[str]
-) -> None:
-    assert mark_best(values, texts, lower) == marked
+    assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
+    assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
+    assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
 
 
 # --- methods and views
@@ -330,8 +308,6 @@ def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
     other = next(make_method("direct-ft", None, lambda: (double, 2.0))(shot))
     assert torch.equal(same.rgb, shot.before[0].rgb)
     assert float((other.rgb - shot.before[0].rgb).abs().max()) < 1e-3
-    with pytest.raises(ValueError, match="a base of its own"):
-        make_method("direct-ft", None)
 
 
 def test_a_metric_that_fails_is_a_remark_and_no_number() -> None:
@@ -398,19 +374,16 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
         dark, filled = (mean_of(found, setting, method, "niqe") for method in ("base", "spackle"))
         assert filled > dark  # black holes are filled
     assert mean_of(found, "0.5", "base", "har") > mean_of(found, "0.3", "base", "har")
-    assert {image["name"] for image in found["images"]} == {"Ball", "Chair", "Door"}
-    assert found["config"]["metrics"] == {"niqe": "pyiqa 9.9", "musiq": "pyiqa 9.9"}
     text = (tmp_path / "tables.md").read_text()
     assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
     with Image.open(tmp_path / "worst.png") as sheet:
         assert sheet.width >= 4 * 72
 
 
-def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
-    write_motorcycle(tmp_path / "data" / "Motorcycle")
+def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None:
     methods = f"base,{FLAT}spackle,dense"
     words = ("--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim")
-    done = evaluate(tmp_path / "data", tmp_path / "out", *words)
+    done = evaluate(scenes, tmp_path / "out", *words)
     assert done.code == 0, done.err
     found = read(tmp_path / "out")
     hole, outside = (
@@ -426,33 +399,31 @@ def test_near_views_against_the_true_photo(tmp_path: Path) -> None:
     assert "tab:mask_guided_init" in (tmp_path / "out" / "tables.tex").read_text()
 
 
-@pytest.mark.parametrize("images", [1, 2])
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path, tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: Path) -> None:
     choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.4")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert evaluate(scenes, whole, *choices).code == 0
     place = ("--root", str(scenes), "--base", "rgbd", "-o", str(killed))
     code = (
-        "import os, sys\n"
+        "import os\n"
         "from spackle.evaluation import run as job\n"
         "save = job.save_part\n"
         "def once(*rest):\n"
         "    save(*rest)\n"
-        "    if rest[0].name.startswith(last):\n"
+        "    if rest[0].name.startswith('00001'):\n"
         "        os.kill(os.getpid(), 9)\n"
         "job.save_part = once\n"
         "from spackle.cli import main\n"
-        "last = sys.argv.pop()\n"
         "main()\n"
     )
-    words = [sys.executable, "-c", code, "evaluate", "--dataset", "middlebury", *place, *choices, f"{images - 1:05d}"]
+    words = [sys.executable, "-c", code, "evaluate", "--dataset", "middlebury", *place, *choices]
     ended = subprocess.run(words, capture_output=True, check=False, env=dict(os.environ))
     assert ended.returncode == -9, ended.stderr
-    assert len(list((killed / "images").glob("*.json"))) == images
+    assert len(list((killed / "images").glob("*.json"))) == 2
     assert not (killed / "results.json").exists()
     again = evaluate(scenes, killed, *choices)
     assert again.code == 0
-    assert f"going on, {images} of 3" in again.err
+    assert "going on, 2 of 3" in again.err
     same_files(whole, killed)
     before = {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
     assert evaluate(scenes, killed, *choices).code == 0
@@ -462,13 +433,15 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(images: int, scenes: Path
     assert (refused.code, "disparities: [0.4] -> [0.5]" in refused.err) == (2, True)
 
 
-def test_a_broken_image_is_named_and_the_others_go_on(scenes: Path, tmp_path: Path) -> None:
+def test_a_broken_image_is_named_and_the_others_go_on(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     root, output = tmp_path / "data", tmp_path / "out"
     shutil.copytree(scenes, root)
     photo = root / "Chair" / "left.png"
     whole = photo.read_bytes()
     choices = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
-    for content in (whole[: len(whole) // 2], b"", b"no picture"):  # the last two have not even a header
+    for content in (whole[: len(whole) // 2], b""):  # the second has not even a header
         photo.write_bytes(content)
         for where, more in ((output, choices), (tmp_path / "near", (*choices[:4], "--protocol", "near-view"))):
             done = evaluate(root, where, *more)
@@ -487,28 +460,15 @@ def test_a_broken_image_is_named_and_the_others_go_on(scenes: Path, tmp_path: Pa
     done = evaluate(root, tmp_path / "none", *choices)
     assert (done.code, len(done.lines), "none of 3 images gave figures" in done.err) == (2, 4, True)
 
-
-def test_a_second_photo_that_is_broken_is_a_remark(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    load = load_case
-
-    def lacking(case: Case) -> LoadedCase:
-        lack = f"{scenes}/Chair/third.png: not\nan image"
-        return dataclasses.replace(load(case), lacks=(lack,) if case.name == "Chair" else ())
-
-    monkeypatch.setattr("spackle.evaluation.run.load_case", lacking)
-    done = evaluate(scenes, tmp_path, "--protocol", "near-view", "--methods", "base", "--metrics", "none")
-    assert done.code == 0, done.err
-    remark = "without one of its second photos: Chair/third.png: not an image"
-    assert f"Chair: {remark}" in done.lines
-    assert {record["name"]: record["remarks"] for record in read(tmp_path)["images"] if record["remarks"]} == {
-        "Chair": [remark]
-    }
     case = Case("fern/003", tmp_path / "fern/images/003.jpg")
     error = InputError(f"{tmp_path}/fern/images/007.jpg: not\nan image")
     assert problem_of(case, error, tmp_path) == "fern/003: fern/images/007.jpg: not an image"
-    assert problem_of(case, InputError("fern/003: has no second photo"), tmp_path) == "fern/003: has no second photo"
+    load, lack = load_case, f"{scenes}/Chair/third.png: not\nan image"
+    monkeypatch.setattr("spackle.evaluation.run.load_case", lambda case: dataclasses.replace(load(case), lacks=(lack,)))
+    done = evaluate(scenes, tmp_path / "lacks", *choices[:4], "--protocol", "near-view", "--limit", 1)
+    remark = "without one of its second photos: Chair/third.png: not an image"
+    assert f"Chair: {remark}" in done.lines
+    assert [record["remarks"] for record in read(tmp_path / "lacks")["images"]] == [[remark]]
 
 
 def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
@@ -518,9 +478,8 @@ def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
 
     def too_large(*arguments: Any) -> BasePrediction:
         found = predict(*arguments)
-        return dataclasses.replace(
-            found, gaussians=dataclasses.replace(found.gaussians, means=found.gaussians.means / 0)
-        )
+        g = found.gaussians
+        return dataclasses.replace(found, gaussians=dataclasses.replace(g, means=g.means / 0))
 
     def too_little(*arguments: Any) -> BasePrediction:
         raise MemoryShort("not enough memory for the network")
@@ -548,30 +507,21 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     assert "tab:near_view" in text
     assert run("tables", one, "-o", tmp_path / "again").code == 0
     same_files(one, tmp_path / "again", TABLES)
-    for folders, why in (((one, one), "two results"), ((scenes,), "results.json is missing")):
-        refused = run("tables", *folders, "-o", both)
-        assert (refused.code, why in refused.err) == (2, True)
+    refuses(run("tables", one, one, "-o", both), "two results")
+    refuses(run("tables", scenes, "-o", both), "results.json is missing")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("--methods", "spakle"), "did you mean spackle?"),
-        (("--metrics", "nique"), "did you mean niqe?"),
-        (("--protocol", "near"), "did you mean near-view?"),
-        (("--dataset", "midlebury"), "did you mean middlebury?"),
-        (("--base", "shrap"), "did you mean sharp?"),
         (("--base", "auto"), "--base auto"),
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),
         (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view"),
-        (("--disparity", "0.3,3"), "up to 2"),
-        (("--disparity=-0.3",), "--disparity -0.3"),
         (("--disparity", "0.3,0.30"), "the same number twice"),
         (("--disparity", "0.3", "3"), "up to 2"),
-        (("--disparity", "0.3", "x"), "x: a word of no option"),
         (("0.4",), "0.4: a word of no option"),
-        (("--methods", "base", "spackle"), "lists are given with commas"),
         (("--methods", "direct-ft"), "add --base sharp"),
         (("--methods", ","), "none is given"),
         (("--limit", "0"), "--limit must be between"),
@@ -583,15 +533,12 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
         (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
         (("--root", "nowhere"), "nowhere"),
+        (("--methods", "inpaint2d", "--metrics", "none"), "pip install 'spackle-nvs[opencv]'"),
     ],
 )
-def test_bad_input_is_one_line(words: tuple[str, ...], message: str, scenes: Path, tmp_path: Path) -> None:
-    done = evaluate(scenes, tmp_path / "out", *words)
-    assert (done.code, len(done.lines), message in done.err) == (2, 1, True), done.err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_missing_opencv_is_one_line(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_input_is_one_line(
+    words: tuple[str, ...], message: str, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    done = evaluate(scenes, tmp_path / "out", "--methods", "inpaint2d", "--metrics", "none")
-    assert (done.code, len(done.lines), "pip install 'spackle-nvs[opencv]'" in done.err) == (2, 1, True)
+    refuses(evaluate(scenes, tmp_path / "out", *words), message)
+    assert not (tmp_path / "out").exists()

@@ -29,9 +29,6 @@ class Alignment:
     source: Literal["depth", "points", "bounds", "same"]
 
 
-SAME = Alignment(1.0, 0, 0.0, "same")
-
-
 def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = False) -> Alignment:
     """The median of z_dataset / z_base over the pixels where both are known.
 
@@ -49,7 +46,7 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
         InputError: nothing is known about the case's depth, or too little of it where the base sees something.
     """
     if base_is_truth:
-        return SAME
+        return Alignment(1.0, 0, 0.0, "same")
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
     found = None
     if case.depth is not None:
@@ -69,10 +66,9 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
 def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     """A second view's camera, as the base's world has it.
 
-    A base that takes the photo's principal point to be in its middle, or has another focal length, puts what it sees
-    beside where the dataset has it, by a shear: the same pixel at the same depth is another point. The camera that
-    comes back sees the base's points where `view` sees the dataset's. Where the two look the same way, as in rectified
-    pairs, that is exact; else a skew of the pixel grid is left out, which is nothing where the two lenses agree.
+    A base with another principal point or focal length than the dataset's shears the scene: the same pixel at the same
+    depth is another point. The returned camera sees the base's points where `view` sees the dataset's: exactly where
+    the two look the same way, as in rectified pairs, or their lenses agree; else up to a skew of the pixel grid.
 
     Args:
         view: in the input photo's frame and the dataset's lengths.
@@ -86,7 +82,12 @@ def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
     K, pose = view.K.double(), view.world_to_camera.double()
     # The base's point of a pixel, times this and the scale, is the dataset's.
     shear = torch.linalg.solve(photo.K.double(), base.resized(photo.width, photo.height).K.double())
-    lens, rotation = _upper_times_rotation(K @ pose[:3, :3] @ shear)
+    # Into an upper triangle with a positive diagonal times a rotation.
+    flip = torch.eye(3, dtype=torch.float64).flip(0)
+    rotation, lens = torch.linalg.qr((flip @ (K @ pose[:3, :3] @ shear)).T)
+    lens, rotation = flip @ lens.T @ flip, flip @ rotation.T
+    signs = torch.diag(lens.diagonal().sign())
+    lens, rotation = lens @ signs, signs @ rotation
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = torch.linalg.solve(lens, K @ pose[:3, 3]) / scale
@@ -106,8 +107,7 @@ def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
 
 def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
     """By the base's pixel that each point falls into."""
-    if case.camera is None:
-        raise ValueError(f"{case.name} has points but no camera whose pixels they are in")
+    assert case.camera is not None  # whose pixels the points are in
     height, width = z_base.shape
     cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
     inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)
@@ -117,7 +117,6 @@ def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> T
 
 
 def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
-    """None where there are too few."""
     ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
     if len(ratios) < MIN_PIXELS:
         return None
@@ -130,12 +129,3 @@ def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
     near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
     low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
     return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
-
-
-def _upper_times_rotation(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """A 3×3 matrix with a positive determinant as an upper triangle with a positive diagonal times a rotation."""
-    flip = torch.eye(3, dtype=matrix.dtype).flip(0)
-    rotation, upper = torch.linalg.qr((flip @ matrix).T)
-    upper, rotation = flip @ upper.T @ flip, flip @ rotation.T
-    signs = torch.diag(upper.diagonal().sign())
-    return upper @ signs, signs @ rotation

@@ -103,10 +103,7 @@ def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], warm: b
     predict: dict[str, Task] = {"": lambda _: latest.update(base=opened.predict()[0])}
     seconds = (measure(config["base_runs"], predict, device, warm=counts)["", TOTAL] / MS).tolist()
     found = latest["base"]
-    try:
-        views = large_views(found, tools.options.disparities)
-    except ValueError as error:
-        raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
+    views = large_views(found, tools.options.disparities)
     precision = tools.options.base.precision
     completer = Completer(found.gaussians, found.camera, tools.renderer, tools.network, precision=precision)
     wanted = [view for view in views if view.name == SIDE]

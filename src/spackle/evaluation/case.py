@@ -56,7 +56,6 @@ class EvalDataset(Protocol):
     name: str  # as it is typed
     title: str  # as the paper's tables have it
     terms: str  # of use, in a few words
-    paper_images: int  # how many the paper evaluates on
 
     def cases(self, root: Path) -> Sequence[Case]:
         """All inputs, in an order that depends on names alone.
@@ -91,12 +90,10 @@ class LoadedCase:
 def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     """Read the photos of a case and bring them, and their cameras, to `working_size`.
 
-    The last row or column of a second photo with an odd side is cut off: views have even sides, and there are no true
-    pixels to add. A second photo that cannot be used is left out: the others are as true without it.
+    Views have even sides, so a second photo with an odd side loses its last row or column.
 
     Raises:
-        InputError: a file that is missing or no image, or one of another shape than its camera; of second photos,
-            where that is so of all.
+        InputError: the photo, or each of the second photos, is missing, no image, or of another shape than its camera.
     """
     if case.problem is not None:
         raise InputError(case.problem)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -119,15 +120,14 @@ def _direct_ft(shot: Shot, prediction: BasePrediction, unit: float) -> Iterator[
         yield View(drawn.rgb, drawn.alpha, None)
 
 
-@dataclasses.dataclass(frozen=True)
-class MethodNames:
+class MethodNames(NamedTuple):
     """A method's names."""
 
     title: str  # in tables
     description: str  # in captions
 
 
-METHODS: dict[str, MethodNames] = {
+METHODS = {
     "base": MethodNames("base alone", "the base's render, holes black"),
     "spackle": MethodNames("Spackle", "aux Gaussians for each view by itself, as in the paper"),
     "spackle-scene": MethodNames("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
@@ -156,16 +156,16 @@ def make_method(
         InputError: OpenCV is not installed, for inpaint2d.
     """
     if name == "direct-ft":
-        if direct_ft is None:
-            raise ValueError("direct-ft needs a base of its own")
+        assert direct_ft is not None
         prediction, unit = direct_ft()
         return partial(_direct_ft, prediction=prediction, unit=unit)
-    methods: dict[str, Callable[[], Method]] = {
-        "base": lambda: lambda shot: (View(before.rgb, before.alpha, 0) for before in shot.before),
-        "spackle": lambda: partial(_per_view, network=network, precision=precision),
-        "spackle-scene": lambda: partial(_one_scene, network=network, precision=precision),
-        "seeds": lambda: partial(_per_view, network=None),
-        "dense": lambda: partial(_dense, network=network, precision=precision),
-        "inpaint2d": lambda: partial(_inpaint_2d, inpainter=get_inpainter("opencv", InpainterOptions())),
+    if name == "inpaint2d":
+        return partial(_inpaint_2d, inpainter=get_inpainter("opencv", InpainterOptions()))
+    methods: dict[str, Method] = {
+        "base": lambda shot: (View(before.rgb, before.alpha, 0) for before in shot.before),
+        "spackle": partial(_per_view, network=network, precision=precision),
+        "spackle-scene": partial(_one_scene, network=network, precision=precision),
+        "seeds": partial(_per_view, network=None),
+        "dense": partial(_dense, network=network, precision=precision),
     }
-    return methods[name]()
+    return methods[name]

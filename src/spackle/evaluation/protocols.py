@@ -12,8 +12,8 @@ from torch import Tensor
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.errors import reason_in_a_line
-from spackle.evaluation.methods import Method, Shot, View
+from spackle.errors import InputError, reason_in_a_line
+from spackle.evaluation.methods import Method, Shot
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.results import Row
 from spackle.render import Renderer
@@ -62,14 +62,17 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
     of the picture are even, as the paper's dense counts have it.
 
     Raises:
-        ValueError: no Gaussian stands in front of the camera, or a disparity that no path has.
+        InputError: no Gaussian stands in front of the camera, or a disparity that no path has.
     """
-    even, reach = prediction.camera.even(), DepthRange.of(prediction.gaussians)
-    return [
-        Wanted(f"{disparity:g}", name, camera)
-        for disparity in disparities
-        for name, camera in zip(("left", "right"), extremes(even, disparity, reach), strict=True)
-    ]
+    try:
+        even, reach = prediction.camera.even(), DepthRange.of(prediction.gaussians)
+        return [
+            Wanted(f"{disparity:g}", name, camera)
+            for disparity in disparities
+            for name, camera in zip(("left", "right"), extremes(even, disparity, reach), strict=True)
+        ]
+    except ValueError as error:
+        raise InputError(f"no camera path: {error}: check depth and focal length") from error
 
 
 @torch.no_grad()
@@ -83,7 +86,7 @@ def measure(
     """Every method on every view; views of one setting are a method's to see together."""
     before = [renderer.render(prediction.gaussians, view.camera) for view in wanted]
     holes = [hole_area_ratio(view.alpha) for view in before]
-    shown = max(range(len(wanted)), key=holes.__getitem__)
+    shown, base = max(range(len(wanted)), key=holes.__getitem__), len(prediction.gaussians)
     rows: list[Row] = []
     remarks: list[str] = []
     pictures: dict[str, Tensor] = {}
@@ -92,23 +95,18 @@ def measure(
         shot = Shot(prediction, [wanted[i].camera for i in own], [before[i] for i in own], renderer)
         for name, method in methods.items():
             for index, view in zip(own, method(shot), strict=True):
-                figures = {"har_before": holes[index], **_counts(view, len(prediction.gaussians))}
+                figures = {"har_before": holes[index]}
+                if view.alpha is not None:  # of what is left open (paper, eq. 11 and 10)
+                    open_share = hole_area_ratio(view.alpha)
+                    figures |= {"har": open_share, "coverage": 1 - open_share}
+                if view.aux is not None:
+                    figures |= {"aux": view.aux, "aux_share": view.aux / base, "merged": base + view.aux}
                 figures |= _quality(view.rgb, wanted[index].truth, before[index], gauges, remarks)
                 finite = {key: value if math.isfinite(value) else None for key, value in figures.items()}
                 rows.append(Row(setting, wanted[index].name, name, finite))
                 if index == shown:
                     pictures[name] = view.rgb
     return Measured(rows, list(dict.fromkeys(remarks)), wanted[shown], pictures)
-
-
-def _counts(view: View, base: int) -> dict[str, float]:
-    """HAR and coverage of what is left open (paper, eq. 11 and 10), and Gaussians that were added."""
-    figures: dict[str, float] = {}
-    if view.alpha is not None:
-        figures |= {"har": hole_area_ratio(view.alpha), "coverage": 1 - hole_area_ratio(view.alpha)}
-    if view.aux is not None:
-        figures |= {"aux": view.aux, "aux_share": view.aux / base, "merged": base + view.aux}
-    return figures
 
 
 def _quality(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 
 
 def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
-    """A line for each reason why metrics are not run, and pyiqa's terms where it is at work."""
+    """Log why metrics are not run, and pyiqa's terms where it measures."""
     reasons: dict[str, list[str]] = {}
     for name, state in evaluation.config["metrics"].items():
         if state.startswith(NOT_RUN):
@@ -149,13 +149,10 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, 
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, not options.base.kind.network) if options.near else None
     if alignment:
-        at, scale = (loaded.camera, prediction.camera), alignment.scale
-        wanted = [Wanted(NEAR, view.name, to_base(view.camera, *at, scale), view.rgb) for view in loaded.seconds]
+        cameras = [to_base(v.camera, loaded.camera, prediction.camera, alignment.scale) for v in loaded.seconds]
+        wanted = [Wanted(NEAR, v.name, c, v.rgb) for v, c in zip(loaded.seconds, cameras, strict=True)]
     else:
-        try:
-            wanted = large_views(prediction, options.disparities)
-        except ValueError as error:
-            raise InputError(f"{case.name}: no camera path: {error}: check depth and focal length") from error
+        wanted = large_views(prediction, options.disparities)
 
     def direct_ft() -> tuple[BasePrediction, float]:
         """The other base, and what its cameras' paths are to be multiplied by."""
@@ -165,8 +162,8 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, 
             return other, 1.0
         return other, alignment.scale / _align(loaded, other, evaluation, False).scale
 
-    more = evaluation.network, direct_ft, options.base.precision
-    methods = {name: make_method(name, *more) for name in options.methods}
+    network, precision = evaluation.network, options.base.precision
+    methods = {name: make_method(name, network, direct_ft, precision) for name in options.methods}
     measured = measure(prediction, wanted, methods, evaluation.gauges, evaluation.renderer)
     facts: dict[str, Any] = {
         "width": loaded.photo.width,
@@ -231,8 +228,8 @@ def _finish(
     if html:
         page = report.make_report([report.source_of(run, output, versions(), machine)], report.find_bench([output]))
         write_text(page, output / report.REPORT)
-    about: Mapping[str, Any] = {"versions": versions(), "definitions": definitions(options.wanted_metrics)}
-    write_json({**about, **run.plain()}, output / results.RESULTS)
+    about = {"versions": versions(), "definitions": definitions(options.wanted_metrics)}
+    write_json(about | run.plain(), output / results.RESULTS)
     count, passed = len(run.measured), len(found) - len(run.measured)
     more = f", {passed} passed over" if passed else ""
     reporter.say(f"{run.title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")

@@ -31,7 +31,7 @@ MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 
 POINT_2D = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])  # id -1: matched with nothing
 
 CameraRecord = tuple[int, int | str, int, int, list[float]]  # id, model, width, height, parameters
-ImageRecord = tuple[list[float], int, str, NDArray[Any]]  # wxyz and translation, camera id, name, POINT_2D [n]
+ImageRecord = tuple[list[float], int, str, Array]  # wxyz and translation, camera id, name, POINT_2D [n]
 PointRecord = tuple[float, float, float, float, float]  # id, x, y, z, error in pixels
 
 

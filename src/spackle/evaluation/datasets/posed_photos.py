@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
+from spackle.evaluation import paper
 from spackle.evaluation.case import Case
 from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
 from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
@@ -43,7 +44,6 @@ class Eth3d:
     name = "eth3d"
     title = "ETH3D"
     terms = "CC BY-NC-SA 4.0"
-    paper_images = 454
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo, or each pair; see `EvalDataset`."""
@@ -95,13 +95,12 @@ class Tanks:
     name = "tanks"
     title = "Tanks"
     terms = "see its page; research, cite"
-    paper_images = 512
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo that is taken; see `EvalDataset`."""
         scenes = by_name(scene_folders(root, self.name))
         read = {name: _read_tanks(scene) for name, scene in scenes.items()}
-        picked = spread(list(scenes), lambda name: range(len(read[name][1])), self.paper_images)
+        picked = spread(list(scenes), lambda name: range(len(read[name][1])), paper.IMAGES[self.title])
         return [
             case
             for name, (model, views) in read.items()
@@ -134,7 +133,6 @@ class Llff:
     name = "llff"
     title = "LLFF"
     terms = "research, cite"
-    paper_images = 305
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo; see `EvalDataset`."""
@@ -219,7 +217,6 @@ class WildRgbd:
     name = "wildrgbd"
     title = "WildRGBD"
     terms = "MIT"
-    paper_images = 512
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each frame that is taken; see `EvalDataset`."""
@@ -230,7 +227,7 @@ class WildRgbd:
             read[name] = _views(name, scenes[name])
             return range(len(read[name]))
 
-        picked = spread(sorted(scenes), frames, self.paper_images)
+        picked = spread(sorted(scenes), frames, paper.IMAGES[self.title])
         return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
 
 

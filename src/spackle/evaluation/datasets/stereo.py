@@ -129,7 +129,6 @@ class Middlebury:
     name = "middlebury"
     title = "Middlebury"
     terms = "free to use, cite"
-    paper_images = 23
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each scene; see `EvalDataset`."""
@@ -224,7 +223,6 @@ class Booster:
     name = "booster"
     title = "Booster"
     terms = "research, cite; see its page"
-    paper_images = 228
 
     def cases(self, root: Path) -> Sequence[Case]:
         """One case for each photo of a left camera; see `EvalDataset`."""
