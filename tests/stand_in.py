@@ -40,6 +40,14 @@ def write_lite(path: Path) -> Path:
     return path
 
 
+def write_model(folder: Path) -> Path:
+    """A folder that looks like a model of transformers."""
+    folder.mkdir(parents=True)
+    for name, text in (("config.json", "{}"), ("model.safetensors", "weights"), ("README.md", "about it")):
+        (folder / name).write_text(text)
+    return folder
+
+
 def predict(tmp_path: Path, *options: object) -> Run:
     """`spackle predict` into `out`, without completion."""
     return run("predict", "-o", tmp_path / "out", *QUICK, *options)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from spackle._numba import kernel
 from spackle.camera import Camera
@@ -115,25 +114,3 @@ def _slope(here: Any, backward: Any, forward: Any, crease: Any, edge: Any, ragge
     flatter = backward if abs(backward) < abs(forward) else forward
     slope = (forward + backward) / 2 if smooth else flatter
     return slope if abs(slope) <= (edge if smooth else ragged) * here else 0 * here
-
-
-def neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """The previous and the next pixel along an axis of [H, W]; borders repeat mirrored slopes.
-
-    At a border the missing neighbour of a number image is extrapolated linearly, so that the slope there
-    is the one-sided one; a boolean image has no neighbour there.
-    """
-    size = image.shape[axis]
-    if image.dtype == torch.bool:
-        margins = (1, 1, 0, 0) if axis == 1 else (0, 0, 1, 1)
-        wide = pad(image, margins, value=0.0)
-        return wide.narrow(axis, 0, size), wide.narrow(axis, 2, size)
-    if size == 1:
-        return image, image
-    first, last = image.narrow(axis, 0, 1), image.narrow(axis, size - 1, 1)
-    start = 2 * first - image.narrow(axis, 1, 1)
-    end = 2 * last - image.narrow(axis, size - 2, 1)
-    return (
-        torch.cat([start, image.narrow(axis, 0, size - 1)], dim=axis),
-        torch.cat([image.narrow(axis, 1, size - 1), end], dim=axis),
-    )

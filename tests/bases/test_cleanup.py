@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from plain_cleanup import plain_edges, plain_planes, plain_sample, plain_settle
-from scenes import Scene, box_before_wall, box_mask, motorcycle, motorcycle_base, slanted_plane, texture, wall
+from scenes import Scene, box_before_wall, box_mask, motorcycle, slanted_plane, texture, wall
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
@@ -24,7 +24,7 @@ from spackle.bases.cleanup import (
     smooth_noise,
 )
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.edges import HOLE, OPEN, SETTLED, Sampled, find_edges, sample, settle
+from spackle.bases.edges import OPEN, SETTLED, find_edges, sample, settle
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
@@ -48,11 +48,6 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
 def map_of(inverse: Tensor, known: Tensor | None = None) -> DepthMap:
     known = inverse > 0 if known is None else known
     return DepthMap(torch.where(known, 1 / inverse, 0.0), known, None, None, "depth", Path("network"))
-
-
-def as_networks_do(scene: Scene, sigma: float = 3.0, factor: int = 4) -> DepthMap:
-    """A scene's depth as a network predicts it: small, and smeared at the outlines."""
-    return map_of(avg_pool2d(blurred(1 / scene.depth, sigma)[None, None], factor)[0, 0])
 
 
 def front(scene: Scene, depth: DepthMap) -> Tensor:
@@ -131,14 +126,6 @@ def test_planes_creases_and_round_things_are_not_smeared(inverse: Tensor, smooth
     assert not smooth or not (found.across.any() or found.down.any())
 
 
-def test_a_sharp_box_has_its_outline_and_nothing_is_smeared() -> None:
-    found = find_edges((1 / box_before_wall().depth).numpy(), np.ones((72, 96), bool), (80.0, 80.0))
-    mask = box_mask(96, 72)
-    assert not found.step.any()
-    assert np.array_equal(found.across[:, :-1], (mask[:, 1:] ^ mask[:, :-1]).numpy())
-    assert np.array_equal(found.down[:-1], (mask[1:] ^ mask[:-1]).numpy())
-
-
 @pytest.mark.parametrize("radius", [5, 10, 30, 50])
 @pytest.mark.parametrize("behind", [0.0, 0.2, 1.0])
 def test_a_ball_keeps_its_roundness_even_where_it_touches_the_wall(radius: float, behind: float) -> None:
@@ -153,28 +140,13 @@ def test_a_ball_keeps_its_roundness_even_where_it_touches_the_wall(radius: float
     assert (error > 0).sum() < 3 * 2 * math.pi * radius
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("sigma", [0.7, 1.5, 3.0])
-@pytest.mark.parametrize("slope", [0.0, 0.002])
-def test_a_smeared_edge_is_found_from_foot_to_foot(sigma: float, slope: float, turned: bool) -> None:
-    exact = (torch.where(torch.arange(60) < 30, 1.0, 0.4) + slope * torch.arange(60)).expand(9, 60)
-    image = blurred(exact, sigma)
-    inverse = (image.T if turned else image).contiguous().numpy()
-    step = torch.from_numpy(find_edges(inverse, np.ones(inverse.shape, bool), FOCAL).step)
-    hangs = (step.T if turned else step) > 0
-    assert bool(hangs[(image - exact).abs() > 0.1 * 0.6].all())
-    assert bool((hangs[4] == hangs).all())
-    assert int(hangs[4].sum()) <= 6 * sigma + 2
-    assert float(step.max()) == pytest.approx(0.6, rel=0.15)
-
-
 # Upsampling.
 
 
 @pytest.mark.parametrize("size", [(13, 17), (30, 35), (40, 55), (9, 12), (100, 7), (1, 1)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(5))
 def test_resampling_matches_the_plain_twin(seed: int, size: tuple[int, int]) -> None:
-    inverse, known = random_map(seed, 14, 18)
+    inverse, known = random_map(seed, *((14, 18), (14, 18), (14, 18), (1, 6), (2, 2))[seed])
     edges = find_edges(inverse, known, FOCAL)
     found, plain = sample(inverse, known, edges, *size), plain_sample(inverse, known, edges, *size)
     assert np.array_equal(found.state, plain.state)
@@ -182,16 +154,6 @@ def test_resampling_matches_the_plain_twin(seed: int, size: tuple[int, int]) -> 
         (found.inverse_depth, found.step, *found.slope), (plain.inverse_depth, plain.step, *plain.slope), strict=True
     ):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (6, 1), (2, 2)])
-def test_tiny_maps_are_resampled(shape: tuple[int, int]) -> None:
-    inverse = np.linspace(0.2, 0.3, shape[0] * shape[1], dtype=np.float32).reshape(shape)
-    known = np.ones(shape, bool)
-    found = sample(inverse, known, find_edges(inverse, known, FOCAL), 8, 9)
-    assert (found.state != HOLE).all()
-    assert found.inverse_depth.min() > 0.1
-    assert found.inverse_depth.max() < 0.4
 
 
 @pytest.mark.parametrize("factor", FACTORS)
@@ -232,14 +194,6 @@ def test_what_is_unknown_never_leaks(nonsense: float) -> None:
     assert bool(((z - 2).abs() < 1e-4).logical_or((z - 6).abs() < 1e-4).all())
 
 
-def test_a_larger_map_is_reduced_without_mixing() -> None:
-    scene = box_before_wall(width=193, height=145)  # edges between the photo's pixels
-    small = dataclasses.replace(box_before_wall(width=77, height=58), depth=scene.depth)
-    z = 1 / front(small, map_of(1 / scene.depth))
-    assert bool(((z - 2).abs() < 1e-4).logical_or((z - 6).abs() < 1e-4).all())
-    assert int(((z < 3) ^ box_mask(77, 58)).sum()) <= 20
-
-
 # Sharpening.
 
 
@@ -259,18 +213,6 @@ def test_settling_matches_the_plain_twin(seed: int) -> None:
     assert np.array_equal(found[sampled.state == SETTLED], sampled.inverse_depth[sampled.state == SETTLED])
 
 
-def test_pixels_that_nothing_settled_can_reach_are_unknown() -> None:
-    state = np.full((3, 5), HOLE, np.uint8)
-    state[1, 1:3] = OPEN
-    nothing = np.zeros((3, 5), np.float32)
-    _, seen = settle(Sampled(nothing + 0.5, state, nothing + 0.1, (nothing, nothing)), np.zeros((3, 5, 3), np.float32))
-    assert not seen.any()
-
-
-def soft(scene: Scene, sigma: float, factor: int) -> DepthMap:
-    return as_networks_do(scene, sigma, factor) if factor > 1 else map_of(blurred(1 / scene.depth, sigma))
-
-
 def between(inverse: Tensor) -> Tensor:
     """Which pixels of `box_before_wall` hang between its box and its wall, 5 % of the way or more from both."""
     way = (inverse - 1 / 6) / (1 / 2 - 1 / 6)
@@ -281,7 +223,7 @@ def between(inverse: Tensor) -> Tensor:
 def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> None:
     """Maps of the photo's size, as phones store them, and small ones, as networks give them."""
     scene = box_before_wall(width=192, height=144, focal=200)
-    depth = soft(scene, sigma, factor)
+    depth = map_of(avg_pool2d(blurred(1 / scene.depth, sigma)[None, None], factor)[0, 0])
     inverse = torch.where(depth.valid, 1 / depth.depth, 0.0)[None, None]
     before = interpolate(inverse, size=(144, 192), mode="bilinear")[0, 0]
     found = front(scene, depth)
@@ -291,42 +233,13 @@ def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> Non
     assert float((found * scene.depth - 1).abs().median()) < 1e-3
 
 
-def test_where_the_photo_shows_no_edge_it_is_in_the_middle_of_what_was_smeared() -> None:
-    scene = dataclasses.replace(box_before_wall(width=192, height=144, focal=200), rgb=texture(144, 192))
-    found = front(scene, as_networks_do(scene))
-    assert int(between(found).sum()) <= 60
-    outline = max_pool2d(box_mask(192, 144).float()[None, None], 9, 1, 4)[0, 0] > 0
-    outline &= max_pool2d((~box_mask(192, 144)).float()[None, None], 9, 1, 4)[0, 0] > 0
-    assert not bool(((found > 1 / 3) ^ box_mask(192, 144))[~outline].any())
-
-
-def test_a_slanted_side_goes_on_as_a_plane_up_to_the_outline() -> None:
-    """A box before ground that recedes, smeared: the ground behind it has neither a lip nor a step."""
-    ground = 1 / slanted_plane(1.5, 6, 0, width=192, height=144, focal=160).depth
-    mask = box_mask(192, 144)
-    scene = box_before_wall(width=192, height=144, focal=200)
-    scene = dataclasses.replace(scene, depth=1 / torch.where(mask, 0.9, ground))
-    error = (front(scene, as_networks_do(scene)) * scene.depth - 1).abs()
-    near = max_pool2d(mask.float()[None, None], 17, 1, 8)[0, 0] > 0
-    assert float(error[near & ~mask].quantile(0.9)) < 0.06
-    assert float(error[~near].max()) < 0.02
-
-
 def test_a_sharp_map_of_the_photos_size_is_lifted_as_it_is() -> None:
-    """Bit for bit what it was before there was any sharpening; the real one apart from a few pixels in between."""
     for scene in (box_before_wall(), slanted_plane(1.5, 1000, 0), wall()):
         clean = attach_mixed_pixels(attach_flying_pixels(1 / scene.depth), scene.rgb)
         torch.testing.assert_close(front(scene, scene.depth_map), clean, rtol=1e-6, atol=0)
         edges = find_edges((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), scene.camera.focal)
         sampled = sample((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), edges, *scene.depth.shape)
         assert np.array_equal(settle(sampled, scene.rgb.numpy())[0], (1 / scene.depth).numpy())
-    scene = motorcycle().left
-    known = scene.depth > 0
-    inverse = torch.where(known, 1 / scene.depth, 0.0)
-    clean = attach_mixed_pixels(attach_flying_pixels(fill_missing(inverse, scene.rgb, known)), scene.rgb)
-    z = motorcycle_base().gaussians.means[: clean.numel(), 2].reshape(clean.shape)
-    changed = (1 / (z * clean) - 1).abs() > 1e-4
-    assert 0 < float(changed.float().mean()) < 0.02
 
 
 @pytest.mark.parametrize("sigma", [0.5, 3.0])
@@ -384,15 +297,6 @@ def test_a_clean_map_is_not_smoothed_however_fine_its_structure() -> None:
         assert np.array_equal(smooth_noise(clean, np.ones(clean.shape, bool)), clean)
 
 
-def test_noise_leaves_edges_alone() -> None:
-    scene = box_before_wall(width=192, height=144, focal=200)
-    inverse = (1 / scene.depth).numpy() * (1 + 0.003 * np.random.default_rng(0).standard_normal((144, 192)))
-    found = smooth_noise(inverse.astype(np.float32), np.ones((144, 192), bool))
-    error = np.abs(found * scene.depth.numpy() - 1)
-    assert error.max() < 0.015  # five times the noise: single pixels far off stay where they are
-    assert error.std() < 0.001
-
-
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_noisy_slanted_plane_is_not_perforated(axis: int) -> None:
     """0.3 % of noise makes thousands of specks at disparity 0.5 where it is left in."""
@@ -421,11 +325,3 @@ def test_a_map_without_any_depth_is_refused() -> None:
     scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
     with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):
         lift(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)
-
-
-def test_a_sparse_map_keeps_what_a_smaller_photo_covers() -> None:
-    known = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) < 0.05
-    found = find_edges(np.ones((48, 64), np.float32), known.numpy(), FOCAL)
-    sampled = sample(np.ones((48, 64), np.float32), known.numpy(), found, 24, 32)
-    kept = int((sampled.state != HOLE).sum())
-    assert kept > 0.9 * int((max_pool2d(known[None, None].float(), 2) > 0).sum())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import struct
 import time
@@ -20,12 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from photos import picture, write_photo
+from PIL import Image
 from portraits import Range, apple_xmp, codes, depth_information, png, upright
 
 import spackle.bases.photo_depth.coded as coded
-from spackle.bases.depth_map import DepthMap, load_depth
-from spackle.bases.lift import RgbdBase
-from spackle.bases.photo_depth import load_photo_depth
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.errors import InputError
 from spackle.image import film_to_pixels, load_photo
 
@@ -111,13 +110,6 @@ def test_heic_with_hevcs_words(
     same(found(tmp_path, apple), disparity(codes()))  # Apple's words beat them
 
 
-def test_heic_with_steps_of_uneven_size_is_refused(tmp_path: Path) -> None:
-    uneven = depth_information(3, d_min=0.25, d_max=3.0)
-    refused(tmp_path, portraits.heic(codes(), information=uneven), "uneven size")
-    same(found(tmp_path, portraits.heic(codes(), apple_xmp(), information=uneven)), disparity(codes()))
-    refused(tmp_path, portraits.heic(codes(), information=depth_information(0, z_near=3, z_far=2)), "near 3 and far 2")
-
-
 def test_heic_with_ten_bits(tmp_path: Path) -> None:
     fine = (codes().astype(np.uint16) * 4 + np.arange(32, dtype=np.uint16) % 4) << 6
     depth = found(tmp_path, portraits.heic(fine, information=depth_information(1, d_min=0.5, d_max=3.0)))
@@ -159,12 +151,11 @@ ANDROID: dict[str, Callable[..., bytes]] = {
 def test_android(tmp_path: Path, make: Callable[..., bytes]) -> None:
     share = codes().astype(np.float64) / 255
     inverse, linear = 1 / (2 + share * (1 / 8 - 2)), 0.5 + share * 7.5
-    for unit in ("m", "Meters"):
-        depth = found(tmp_path, make(png(codes()), Range(unit=unit)))
-        same(depth, inverse)
-        assert (depth.quantity, depth.K) == ("disparity", None)
-        assert depth.quantum == pytest.approx((2 - 1 / 8) / 255)
-        assert depth.note.endswith(f"Depth, in {unit.lower()})")
+    depth = found(tmp_path, make(png(codes()), Range(unit="Meters")))
+    same(depth, inverse)
+    assert (depth.quantity, depth.K) == ("disparity", None)
+    assert depth.quantum == pytest.approx((2 - 1 / 8) / 255)
+    assert depth.note.endswith("Depth, in meters)")
     depth = found(tmp_path, make(png(codes()), Range(style="RangeLinear")))
     same(depth, linear)
     assert depth.quantity == "depth"
@@ -176,10 +167,9 @@ def test_android(tmp_path: Path, make: Callable[..., bytes]) -> None:
     depth = found(tmp_path, make(png(fine)))
     same(depth, 1 / (2 + fine / 65535 * (1 / 8 - 2)))
     assert depth.quantum == pytest.approx((2 - 1 / 8) / 65535)
-    lossy = portraits.jpeg(codes())
-    same(found(tmp_path, make(lossy)), 1 / (2 + portraits.decoded(lossy) / 255 * (1 / 8 - 2)))
-    colored = np.repeat(codes()[..., None], 3, axis=-1)
-    same(found(tmp_path, make(png(colored))), inverse)
+    lossy = portraits.jpeg(np.repeat(codes()[..., None], 3, axis=-1))
+    gray = np.asarray(Image.open(io.BytesIO(lossy)).convert("L")) / 255
+    same(found(tmp_path, make(lossy)), 1 / (2 + gray * (1 / 8 - 2)))
 
 
 @pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
@@ -187,10 +177,9 @@ def test_a_map_without_a_unit_keeps_a_plausible_scale_and_gets_one_otherwise(
     tmp_path: Path, make: Callable[..., bytes]
 ) -> None:
     share = codes().astype(np.float64) / 255
-    for unit in (None, "None", "parsec"):
-        depth = found(tmp_path, make(png(codes()), Range(0.5, 8, unit=unit)))
-        same(depth, 1 / (2 + share * (1 / 8 - 2)))
-        assert depth.note.endswith("Depth, unit unknown)")
+    depth = found(tmp_path, make(png(codes()), Range(0.5, 8, unit="parsec")))
+    same(depth, 1 / (2 + share * (1 / 8 - 2)))
+    assert depth.note.endswith("Depth, unit unknown)")
     for said in (Range(50, 800, unit=None), Range(0.005, 0.08, unit="Diopters")):  # the latter is a Pixel's habit
         depth = found(tmp_path, make(png(codes()), said))
         shape = 1 / (2 + share * (1 / 8 - 2))
@@ -203,35 +192,25 @@ def test_a_map_without_a_unit_keeps_a_plausible_scale_and_gets_one_otherwise(
     same(found(tmp_path, make(png(codes()), Range(50, 800))), 100 / (2 + share * (1 / 8 - 2)))
 
 
-@pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
-def test_distances_along_the_ray_become_depth(tmp_path: Path, make: Callable[..., bytes]) -> None:
-    along = found(tmp_path, make(png(codes()), Range(measure="OpticRay")))
-    plain = found(tmp_path, make(png(codes())))
-    focal = film_to_pixels(30, 64, 48) / 2
-    y, x = np.mgrid[:24, :32] + 0.5
-    length = np.sqrt(1 + ((x - 16) / focal) ** 2 + ((y - 12) / focal) ** 2)
-    same(along, plain.depth.numpy() / length)
-    assert along.quantum is None
-
-
-def test_distances_along_the_ray_by_the_maps_own_lens(tmp_path: Path) -> None:
-    along = found(tmp_path, portraits.dynamic_jpeg(png(codes()), Range(measure="OpticRay"), model=MODEL, orientation=6))
+def test_distances_along_the_ray_become_depth_by_the_maps_lens_or_the_photos(tmp_path: Path) -> None:
     plain = found(tmp_path, portraits.dynamic_jpeg(png(codes()), orientation=6))
     y, x = np.mgrid[:24, :32] + 0.5
-    length = np.sqrt(1 + ((x - 10) / 35) ** 2 + ((y - 15) / 25) ** 2)
-    same(along, plain.depth.numpy() / np.rot90(length, -1))
+    default = film_to_pixels(30, 48, 64) / 2
+    for model, fx, fy, cx, cy in ((MODEL, 35, 25, 10, 15), (None, default, default, 16, 12)):
+        data = portraits.dynamic_jpeg(png(codes()), Range(measure="OpticRay"), model=model, orientation=6)
+        along = found(tmp_path, data)
+        length = np.sqrt(1 + ((x - cx) / fx) ** 2 + ((y - cy) / fy) ** 2)
+        same(along, plain.depth.numpy() / np.rot90(length, -1))
+        assert along.quantum is None
 
 
-def test_dynamic_depths_lens(tmp_path: Path) -> None:
+def test_dynamic_depths_lens_has_its_centre_in_pixels_in_shares_or_in_the_middle(tmp_path: Path) -> None:
     shares = MODEL | {"ImagingModel:PrincipalPointX": 20 / 64, "ImagingModel:PrincipalPointY": 30 / 48}
-    for model in (MODEL, shares):
+    without = {name: value for name, value in MODEL.items() if "Point" not in name}
+    for model, center in ((MODEL, (10, 15)), (shares, (10, 15)), (without, (16, 12))):
         K = found(tmp_path, portraits.dynamic_jpeg(png(codes()), model=model)).K
         assert K is not None
-        np.testing.assert_allclose(K, [[35, 0, 10], [0, 25, 15], [0, 0, 1]], rtol=1e-6)
-    without = {name: value for name, value in MODEL.items() if "Point" not in name}
-    K = found(tmp_path, portraits.dynamic_jpeg(png(codes()), model=without)).K
-    assert K is not None
-    np.testing.assert_allclose(K, [[35, 0, 16], [0, 25, 12], [0, 0, 1]], rtol=1e-6)
+        np.testing.assert_allclose(K, [[35, 0, center[0]], [0, 25, center[1]], [0, 0, 1]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("change", [("FocalLengthX", 0.1), ("FocalLengthY", "nan"), ("ImageWidth", 0)])
@@ -256,17 +235,6 @@ def test_dynamic_depth_finds_its_item_however_the_lengths_are_meant(tmp_path: Pa
         portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99, primary=5000),
     ):
         assert torch.equal(found(tmp_path, data).depth, expected)
-
-
-def test_of_several_dynamic_depth_maps_the_first_that_is_depth_counts(tmp_path: Path) -> None:
-    data = portraits.dynamic_jpeg(png(codes()))
-    begin = data.index(b"<Camera:DepthMap")
-    other = data[begin : data.index(b"/>", begin) + 2].replace(b'"Depth"', b'"Segmentation"')
-    assert b"Segmentation" in other
-    packet = data[data.index(b"<?xpacket") : data.index(b'<?xpacket end="w"?>') + 19]
-    longer = packet.replace(b"<Camera:DepthMap", other.replace(b"depthmap", b"segments") + b"<Camera:DepthMap")
-    data = data.replace(portraits.xmp_segment(packet), portraits.xmp_segment(longer))
-    assert torch.equal(found(tmp_path, data).depth, found(tmp_path, portraits.dynamic_jpeg(png(codes()))).depth)
 
 
 def test_disparity_beyond_the_horizon_is_far_not_unknown(tmp_path: Path) -> None:
@@ -335,18 +303,6 @@ def _check_lens(depth: DepthMap, orientation: int) -> None:
 # The same scene as from a map beside the photo.
 
 
-def test_depth_in_a_heic_lifts_as_the_same_depth_beside_it(tmp_path: Path) -> None:
-    path = portraits.write(tmp_path / "portrait.heic", portraits.heic(codes(), apple_xmp("hdep", (0.5, 8.0)), 6))
-    inside, photo = load_photo_depth(path), load_photo(path)
-    assert inside is not None
-    metres = np.rot90(0.5 + 7.5 * codes().astype(np.float64) / 255, -1)
-    np.save(tmp_path / "depth.npy", metres.astype(np.float32))
-    one, other = (RgbdBase(depth).predict(photo) for depth in (inside, load_depth(tmp_path / "depth.npy")))
-    for a, b in zip(one.gaussians.tensors, other.gaussians.tensors, strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
-    assert one.notes == other.notes
-
-
 # Photos without depth.
 
 
@@ -360,17 +316,13 @@ def test_photos_without_depth(tmp_path: Path) -> None:
     tail += 2 + struct.unpack(">H", gone[tail + 2 : tail + 4])[0]
     files = {
         "plain.jpg": portraits.jpeg(picture()),
-        "several.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, other),
         "beyond.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, shift=1 << 30),
-        "misplaced.jpg": portraits.multi_picture(portraits.jpeg(picture()), other, shift=1),
         "motion.jpg": portraits.with_segments(portraits.jpeg(picture()), movie) + b"\0\0\0\x18ftypmp42" + bytes(99),
         "gone.jpg": gone[:head] + gone[tail:],
         "plain.heic": portraits.heic(None),
         "gain.heic": portraits.heic(codes(), kind=gain_map),
         "gain.xmp.heic": portraits.heic(codes(), apple_xmp(), kind=gain_map),
-        "short.jpg": b"\xff\xd8\xff",
         "start.jpg": b"\xff\xd8\xff\xe1\xff\xff" + bytes(20),
-        "start.heic": b"\0\0\0\x18ftypheic" + bytes(20),
         "other.txt": b"neither a photo nor anything else",
     }
     odd = portraits.with_segments(portraits.jpeg(codes()), portraits.xmp_segment(b"<<<not XML"))
@@ -381,11 +333,7 @@ def test_photos_without_depth(tmp_path: Path) -> None:
     files["other.heic"] = other_picture.replace(link, link[:-1] + b"\3")  # a map, but of another picture
     for name, data in files.items():
         assert load_photo_depth(portraits.write(tmp_path / name, data)) is None, name
-    for name in ("photo.png", "photo.webp", "photo.tif"):
-        assert load_photo_depth(write_photo(tmp_path / name)) is None, name
-
-
-def test_missing_and_empty_files(tmp_path: Path) -> None:
+    assert load_photo_depth(write_photo(tmp_path / "photo.png")) is None
     for name in ("nowhere.jpg", "empty.jpg"):
         (tmp_path / "empty.jpg").write_bytes(b"")
         with pytest.raises(InputError, match=name):
@@ -395,12 +343,42 @@ def test_missing_and_empty_files(tmp_path: Path) -> None:
 # Depth maps that are broken.
 
 
+def test_maps_that_are_cut_off_damaged_or_do_not_say_what_they_mean(tmp_path: Path) -> None:
+    image, apple, dynamic = png(codes()), portraits.apple_jpeg(codes()), portraits.dynamic_jpeg(png(codes()))
+    broken, heic = image[:60] + bytes(30) + image[90:], portraits.heic(codes(), apple_xmp())
+    uneven, turned = depth_information(3, d_min=0.25, d_max=3.0), depth_information(0, z_near=3, z_far=2)
+    unsaid = apple_xmp().replace(b"apdi:FloatMaxValue", b"apdi:FloatMiddle")
+    empty = apple_xmp().replace(b"<apdi:IntMaxValue>255<", b"<apdi:IntMaxValue>-1<")
+    for data, why in (
+        (portraits.heic(codes(), information=uneven), "uneven size"),
+        (portraits.heic(codes(), information=turned), "near 3 and far 2"),
+        (portraits.heic(codes(), apple_xmp(ends=("nan", 3))), "'nan' for FloatMinValue, which is no number"),
+        (portraits.apple_jpeg(codes(), apple_xmp(ends=(2, 2))), "announces a disparity from 2 to 2"),
+        (portraits.heic(codes(), apple_xmp(ends=(-1e308, 1.1e308))), "no pixel with a depth|makes no sense"),
+        (portraits.apple_jpeg(codes(), apple_xmp(ends=(1e-320, 1e-310))), "no pixel with a depth"),
+        (portraits.apple_jpeg(codes(), unsaid), "does not say its range"),
+        (portraits.apple_jpeg(codes(), empty), "a number of its range makes no sense"),
+        (portraits.gdepth_jpeg(b"", text="****"), "not readable as base64"),
+        (portraits.gdepth_jpeg(broken), "cannot be decoded"),
+        (portraits.dynamic_jpeg(broken), "cannot be decoded"),
+        (portraits.gdepth_jpeg(b"GIF89a" + image), "cannot be decoded"),
+        (apple[:-20], "is cut off: the file ends before it does"),
+        (heic[: heic.rindex(b"mdat") + 40], "cannot be decoded|cannot be read"),
+        (dynamic[:-20], "is cut off, or not where"),
+        (portraits.dynamic_jpeg(image, length=-5), "negative length"),
+        (dynamic.replace(b'DepthURI="android/depthmap"', b'DepthURI="android/deepmap1"'), "photo's directory"),
+        (dynamic.replace(b'Item:Length="0"', b'Item:Length="x"'), "'x' for Length"),
+    ):
+        refused(tmp_path, data, why)
+    same(found(tmp_path, portraits.heic(codes(), apple_xmp(), information=uneven)), disparity(codes()))
+    assert "assumed" in found(tmp_path, portraits.heic(codes(), unsaid)).note
+
+
 @pytest.mark.parametrize(
     ("image", "why"),
     [
         *((np.full((24, 32), flat, np.uint8), "the same value everywhere") for flat in (0, 7, 255)),
         (codes(32, 32), "has 32×32 pixels but the photo 64×48, another crop"),
-        (codes(24, 32), "has 24×32 pixels"),
     ],
 )
 def test_a_map_with_one_value_or_of_another_crop_is_refused(tmp_path: Path, image: NDArray[Any], why: str) -> None:
@@ -410,46 +388,16 @@ def test_a_map_with_one_value_or_of_another_crop_is_refused(tmp_path: Path, imag
     found(tmp_path, portraits.gdepth_jpeg(png(codes(133, 100))))  # within 1 %
 
 
-@pytest.mark.parametrize(
-    ("ends", "why"),
-    [
-        (("nan", 3), "'nan' for FloatMinValue, which is no number"),
-        ((0.5, "inf"), "'inf' for FloatMaxValue"),
-        ((0.5, "three"), "'three' for FloatMaxValue"),
-        ((2, 2), "announces a disparity from 2 to 2"),
-        ((-2, -1), "announces a disparity from -2 to -1"),
-        ((-1e308, 1.1e308), "no pixel with a depth|makes no sense"),
-        ((1e-320, 1e-310), "no pixel with a depth"),
-    ],
-)
-def test_apples_ranges_that_mean_nothing(tmp_path: Path, ends: tuple[object, object], why: str) -> None:
-    refused(tmp_path, portraits.heic(codes(), apple_xmp(ends=ends)), why)
-    refused(tmp_path, portraits.apple_jpeg(codes(), apple_xmp(ends=ends)), why)
-
-
-def test_apples_range_that_is_missing(tmp_path: Path) -> None:
-    packet = apple_xmp().replace(b"apdi:FloatMaxValue", b"apdi:FloatMiddle")
-    refused(tmp_path, portraits.apple_jpeg(codes(), packet), "does not say its range")
-    assert "assumed" in found(tmp_path, portraits.heic(codes(), packet)).note
-    empty = apple_xmp().replace(b"<apdi:IntMaxValue>255<", b"<apdi:IntMaxValue>-1<")
-    refused(tmp_path, portraits.apple_jpeg(codes(), empty), "a number of its range makes no sense")
-
-
 @pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
 @pytest.mark.parametrize(
     ("said", "why"),
     [
         (Range(8, 0.5), "near 8 and far 0.5"),
-        (Range(3, 3), "near 3 and far 3"),
         (Range(0, 3), "near 0 and far 3"),
-        (Range(-1, 3), "near -1 and far 3"),
         (Range("nan", 3), "'nan' for Near"),
-        (Range(1, "inf"), "'inf' for Far"),
         (Range(1, ""), "'' for Far"),
         (Range(5e-324, 3), "makes no sense"),
-        (Range(1e-323, 3, unit="mm"), "near 0 and far"),
         (Range(1e300, 1e305), "no pixel with a depth"),
-        (Range(1e-41, 1e-40, "RangeLinear"), "no pixel with a depth"),
         (Range(style="RangeSquared"), "the format 'rangesquared'"),
     ],
 )
@@ -458,30 +406,6 @@ def test_androids_ranges_that_mean_nothing(tmp_path: Path, make: Callable[..., b
     data = make(png(codes()), Range(near=0.123))
     for missing in (b":Near", b":Format"):
         refused(tmp_path, data.replace(missing, missing[:2] + b"x" * (len(missing) - 2)), "missing|the format ''")
-
-
-def test_maps_that_cannot_be_decoded(tmp_path: Path) -> None:
-    image = png(codes())
-    broken = image[:60] + bytes(30) + image[90:]
-    for data in (portraits.gdepth_jpeg(broken), portraits.dynamic_jpeg(broken)):
-        refused(tmp_path, data, "cannot be decoded")
-    refused(tmp_path, portraits.gdepth_jpeg(b"GIF89a" + image), "cannot be decoded")
-    refused(tmp_path, portraits.apple_jpeg(codes())[:-20], "is cut off: the file ends before it does")
-    heic = portraits.heic(codes(), apple_xmp())
-    at = heic.rindex(b"mdat")
-    refused(tmp_path, heic[: at + 40], "cannot be decoded|cannot be read")
-    half = portraits.heic(codes())
-    refused(tmp_path, half[:-30], "cannot be decoded")
-
-
-def test_base64_that_is_none(tmp_path: Path) -> None:
-    for text in ("****", "AAAAA", "é" * 8):
-        refused(tmp_path, portraits.gdepth_jpeg(b"", text=text), "not readable as base64")
-    refused(tmp_path, portraits.gdepth_jpeg(b"", text=""), "cannot be decoded")
-    whole = base64.b64encode(png(codes())).decode().rstrip("=")
-    wrapped = "\n ".join(whole[at : at + 76] for at in range(0, len(whole), 76))
-    expected = found(tmp_path, portraits.gdepth_jpeg(png(codes()))).depth
-    assert torch.equal(found(tmp_path, portraits.gdepth_jpeg(b"", text=wrapped, part=None)).depth, expected)
 
 
 def test_extended_xmp_with_missing_mixed_and_foreign_parts(tmp_path: Path) -> None:
@@ -501,27 +425,13 @@ def test_extended_xmp_with_missing_mixed_and_foreign_parts(tmp_path: Path) -> No
     refused(tmp_path, head + b"".join(longer) + tail, "extended XMP is missing")
 
 
-def test_dynamic_depth_items_that_are_not_there(tmp_path: Path) -> None:
-    data = portraits.dynamic_jpeg(png(codes()))
-    refused(tmp_path, data[:-20], "is cut off, or not where")
-    refused(tmp_path, portraits.dynamic_jpeg(png(codes()), length=10**30), "is cut off, or not where")
-    refused(tmp_path, portraits.dynamic_jpeg(png(codes()), length=-5), "negative length")
-    elsewhere = data.replace(b'DepthURI="android/depthmap"', b'DepthURI="android/deepmap1"')
-    refused(tmp_path, elsewhere, "missing from the photo's directory")
-    refused(tmp_path, data.replace(b'Item:Length="0"', b'Item:Length="x"'), "'x' for Length")
-
-
 @pytest.mark.parametrize(
     ("hostile", "why"),
     [
         (b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "document type"),
-        (b'<!DOCTYPE a SYSTEM "file:///etc/hostname"><a/>', "document type"),
         ('<?xml version="1.0" encoding="utf-16"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'.encode("utf-16"), "XMP"),
-        (b"<a>" * 100 + b"</a>" * 100, "too large or too deep"),
         (b"<a>" + b"<b/>" * 30_000 + b"</a>", "too large or too deep"),
         (b"<a><b></a>", "cannot be read"),
-        (b'<?xml version="1.0" encoding="klingon"?><a/>', "cannot be read"),
-        (b"<a>\xff</a>", "cannot be read"),
         (b"", "cannot be read"),
     ],
 )
@@ -594,17 +504,10 @@ def test_damaged_files_are_read_or_refused(
 ) -> None:
     damaged = bytearray(WHOLE[name])
     for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(damaged) - 1))
-        kind = data.draw(st.sampled_from(("flip", "set", "cut", "drop", "double")))
-        if kind == "flip":
-            damaged[at] ^= 1 << data.draw(st.integers(0, 7))
-        elif kind == "set":
-            damaged[at] = data.draw(st.sampled_from((0, 1, 0x7F, 0x80, 0xFF)))
-        elif kind == "cut":
-            del damaged[max(at, 1) :]
-        else:
-            piece = damaged[at : at + data.draw(st.integers(1, 64))]
-            damaged[at : at + len(piece)] = b"" if kind == "drop" else piece * 2
+        at, long = data.draw(st.integers(0, len(damaged) - 1)), data.draw(st.sampled_from((1, 1, 8, 64, 1 << 20)))
+        piece = bytes(damaged[at : at + long])
+        changes = (b"", b"\0", b"\xff", piece * 2, bytes([piece[0] ^ 1]) + piece[1:])
+        damaged[at : at + long] = data.draw(st.sampled_from(changes))
         damaged = damaged or bytearray(b"\0")
     path = portraits.write(tmp_path_factory.getbasetemp() / "damaged.xyz", bytes(damaged))
     try:

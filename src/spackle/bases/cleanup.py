@@ -12,16 +12,16 @@ from torch.nn.functional import pad
 from spackle._numba import kernel
 from spackle.bases.edges import Bools, Floats
 from spackle.fill import far_fill
-from spackle.surface import EDGE, neighbours
+from spackle.surface import EDGE
 
 SWEEPS = 200  # enough for steps about 30 pixels apart
 
 
-def attach_flying_pixels(inverse_depth: Tensor, edge: float = EDGE) -> Tensor:
+def attach_flying_pixels(inverse_depth: Tensor) -> Tensor:
     """Move pixels of inverse depth [H, W] > 0 that hang between two surfaces to the one they are closer to.
 
     A pixel hangs when it lies strictly between its left and right (or upper and lower) neighbours with a depth edge (a
-    relative jump of `edge`) to both, while the depth beyond goes on much more smoothly: on a steep plane it does not.
+    relative jump of `EDGE`) to both, while the depth beyond goes on much more smoothly: on a steep plane it does not.
     """
     for axis in (1, 0):
         before, after = _shifted(inverse_depth, axis, -1), _shifted(inverse_depth, axis, 1)
@@ -31,7 +31,7 @@ def attach_flying_pixels(inverse_depth: Tensor, edge: float = EDGE) -> Tensor:
         beyond = torch.maximum(
             (before - _shifted(inverse_depth, axis, -2)).abs(), (after - _shifted(inverse_depth, axis, 2)).abs()
         )
-        hangs = between & (gap > edge * inverse_depth) & (beyond < 0.5 * gap)
+        hangs = between & (gap > EDGE * inverse_depth) & (beyond < 0.5 * gap)
         inverse_depth = torch.where(hangs, torch.where(to_before < to_after, before, after), inverse_depth)
     return inverse_depth
 
@@ -42,7 +42,23 @@ def _shifted(image: Tensor, axis: int, by: int) -> Tensor:
     return image.index_select(axis, index)
 
 
-def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) -> Tensor:
+def _neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """The previous and the next pixel along an axis of [H, W].
+
+    Beyond the border numbers continue linearly, so that the slope there is the one-sided one; booleans are false.
+    """
+    size = image.shape[axis]
+    start, end = image.narrow(axis, 0, 1), image.narrow(axis, size - 1, 1)
+    if image.dtype == torch.bool:
+        start = end = torch.zeros_like(start)
+    else:
+        start = 2 * start - image.narrow(axis, min(1, size - 1), 1)
+        end = 2 * end - image.narrow(axis, max(size - 2, 0), 1)
+    wide = torch.cat([start, image, end], dim=axis)
+    return wide.narrow(axis, 0, size), wide.narrow(axis, 2, size)
+
+
+def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor) -> Tensor:
     """Give a background pixel that a depth edge touches to the foreground, where its colour says so.
 
     A lens blurs a silhouette over a pixel or two, so the first background pixel often has the foreground's colour, and
@@ -50,11 +66,11 @@ def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor, edge: float = EDGE) 
     """
     result = inverse_depth
     for axis in (1, 0):
-        depths = neighbours(inverse_depth, axis)
-        colors = [torch.stack(c, dim=-1) for c in zip(*(neighbours(c, axis) for c in rgb.unbind(-1)), strict=True)]
+        depths = _neighbours(inverse_depth, axis)
+        colors = [torch.stack(c, dim=-1) for c in zip(*(_neighbours(c, axis) for c in rgb.unbind(-1)), strict=True)]
         for near, far in ((0, 1), (1, 0)):
-            silhouette = depths[near] - inverse_depth > edge * inverse_depth
-            silhouette &= (depths[far] - inverse_depth).abs() < edge * inverse_depth
+            silhouette = depths[near] - inverse_depth > EDGE * inverse_depth
+            silhouette &= (depths[far] - inverse_depth).abs() < EDGE * inverse_depth
             to_near, to_far = ((rgb - colors[side]).abs().sum(-1) for side in (near, far))
             result = torch.where(silhouette & (to_near < to_far), torch.maximum(result, depths[near]), result)
     return result
@@ -70,12 +86,12 @@ def undo_quantisation(inverse_depth: Tensor, valid: Tensor, quantum: float, swee
     low, high = inverse_depth - quantum / 2, inverse_depth + quantum / 2
     weights = []
     for axis in (1, 0):
-        for neighbour, present in zip(neighbours(inverse_depth, axis), neighbours(valid, axis), strict=True):
+        for neighbour, present in zip(_neighbours(inverse_depth, axis), _neighbours(valid, axis), strict=True):
             weights.append((present & ((neighbour - inverse_depth).abs() < 1.5 * quantum)).float())
     mass = sum(weights, torch.full_like(inverse_depth, 1e-6))
     smooth = inverse_depth
     for _ in range(sweeps):
-        around = [n for axis in (1, 0) for n in neighbours(smooth, axis)]
+        around = [n for axis in (1, 0) for n in _neighbours(smooth, axis)]
         total = sum((w * n for w, n in zip(weights, around, strict=True)), 1e-6 * smooth)
         smooth = torch.minimum(torch.maximum(total / mass, low), high)
     return torch.where(valid, smooth, inverse_depth)

@@ -113,14 +113,18 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     depth, valid, unit = _as_disparity(stored, is_png, lens, path) if lens else _as_depth(stored, is_png, path)
     with np.errstate(over="ignore"):  # too far for float32 becomes inf, hence unknown
         metres = torch.from_numpy(depth.astype(np.float32))
-    # A depth without a finite inverse is none (a file with its bytes swapped is full of them).
-    known = torch.from_numpy(valid) & torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
+    known = torch.from_numpy(valid) & is_depth(metres)
     if not known.any():
         raise InputError(f"{path}: all-invalid: not one of {values.size} pixels has a {quantity}")
     integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
     step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
     return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, Path(path))
+
+
+def is_depth(metres: Tensor) -> Tensor:
+    """Where values are depths: positive with a finite inverse (a file with its bytes swapped is full of others)."""
+    return torch.isfinite(metres) & (metres > 0) & torch.isfinite(1 / metres)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -244,22 +244,16 @@ def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
     reached = source >= 0
     known.reshape(-1)[open_pixels[~reached]] = False
     open_pixels, source = open_pixels[reached], source[reached]
-    depth = _continued(sampled, open_pixels, source)
+    width = sampled.state.shape[1]
+    at_source = sampled.inverse_depth.reshape(-1)[source]
+    across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
+    lean = across * (open_pixels % width - source % width) + down * (open_pixels // width - source // width)
+    depth = sampled.inverse_depth.copy()
+    depth.reshape(-1)[open_pixels] = at_source + np.clip(lean, -LEAN * at_source, LEAN * at_source)
     for _ in range(VOTES):
         depth = _vote(depth, known, rgb, open_pixels)
     _relax(depth, known, open_pixels)
     return depth, known
-
-
-def _continued(sampled: Sampled, pixels: NDArray[np.int64], source: NDArray[np.int64]) -> Floats:
-    """Each pixel on the plane of its source."""
-    width = sampled.state.shape[1]
-    at_source = sampled.inverse_depth.reshape(-1)[source]
-    across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
-    lean = across * (pixels % width - source % width) + down * (pixels // width - source // width)
-    depth = sampled.inverse_depth.copy()
-    depth.reshape(-1)[pixels] = at_source + np.clip(lean, -LEAN * at_source, LEAN * at_source)
-    return depth
 
 
 @kernel

@@ -51,18 +51,15 @@ class RgbdBase:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
         self.depth.check_shape(photo.height, photo.width, photo.path)
         photo = resize_photo(photo)
-        prediction = lift(photo.rgb, self.depth, self._camera(photo))
+        camera = photo.camera
+        if self.depth.K is not None:
+            height, width = self.depth.depth.shape
+            camera = Camera(self.depth.K, torch.eye(4), width, height).resized(photo.width, photo.height)
+        prediction = lift(photo.rgb, self.depth, camera)
         notes = prediction.notes | ({"depth": self.depth.note} if self.depth.note else {})
         return dataclasses.replace(
             prediction, notes=notes, lens_source="" if self.depth.K is None else self.lens_source
         )
-
-    def _camera(self, photo: Photo) -> Camera:
-        """The calibration's lens where there is one, on the photo's pixels; else the photo's."""
-        if self.depth.K is None:
-            return photo.camera
-        height, width = self.depth.depth.shape
-        return Camera(self.depth.K, torch.eye(4), width, height).resized(photo.width, photo.height)
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
@@ -77,12 +74,15 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         InputError: not one pixel has a depth.
     """
     rgb = rgb.detach().float()
-    inverse_depth, known = _inverse_depth(_sound(depth), rgb, camera)
-    sky = push_sky(inverse_depth, rgb, known)
-    missing = 1.0 - float(sky.known.float().mean())
-    if not sky.known.any():
+    values = depth.depth.detach().float()
+    valid = depth.valid & torch.isfinite(values) & (values > 0)
+    sound = dataclasses.replace(depth, depth=values.where(valid, 0.0), valid=valid)
+    inverse_depth, known = _inverse_depth(sound, rgb, camera)
+    inverse_depth, known, sky = push_sky(inverse_depth, rgb, known)
+    missing = 1.0 - float(known.float().mean())
+    if not known.any():
         raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
-    inverse_depth = fill_missing(sky.inverse_depth, rgb, sky.known)
+    inverse_depth = fill_missing(inverse_depth, rgb, known)
     inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
     slope = surface_slope(inverse_depth)
     colors = srgb_to_linear(rgb)
@@ -91,18 +91,11 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     front = surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
     gaussians = Gaussians.cat([front, _backing(colors, inverse_depth, slope, camera)])
     notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
-    if sky.share:
-        notes["sky"] = round(sky.share, 4)
+    if sky:
+        notes["sky"] = round(sky, 4)
     if depth.depth.shape != inverse_depth.shape:
         notes["depth_resampled_from"] = f"{depth.depth.shape[1]}×{depth.depth.shape[0]}"
     return BasePrediction(gaussians, camera, notes)
-
-
-def _sound(depth: DepthMap) -> DepthMap:
-    """The same map; what is no depth is not valid, whatever the map says."""
-    values = depth.depth.detach().float()
-    valid = depth.valid & torch.isfinite(values) & (values > 0)
-    return dataclasses.replace(depth, depth=values.where(valid, 0.0), valid=valid)
 
 
 def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

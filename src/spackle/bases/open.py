@@ -18,7 +18,7 @@ from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import SETTINGS, WEIGHTS, HfBase
 from spackle.bases.lift import RgbdBase
 from spackle.bases.lite import base as lite
-from spackle.bases.photo_depth import load_photo_depth
+from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
 from spackle.bases.sharp.base import SharpBase, check_windows
 from spackle.device import PRECISIONS, MemoryShort, Precision

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -31,39 +30,36 @@ BEYOND = 0.1  # the sky's inverse depth, in units of the far side of all else
 CLEAR = 1.1  # and all else is at least by this factor nearer
 
 
-@dataclasses.dataclass(frozen=True)
-class Sky:
-    """A photo's inverse depth with the sky in its place."""
-
-    inverse_depth: Tensor  # [H, W]
-    known: Tensor  # [H, W] bool
-    share: float  # of the photo
-
-
-def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> Sky:
-    """Find the sky and put it at one distance, behind everything else; leave the photo as it is where none is found.
+def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Find the sky and put it at one distance, behind everything else.
 
     A sky begins at the upper border of the photo (sRGB [H, W, 3]), spreads without sharp changes, is bright or blue,
-    and its inverse depth [H, W] is unknown or among the farthest: what is as near as the rest is a wall or a ceiling,
-    whatever its colour. One distance, because a sky whose depth varies swims as the camera moves.
+    and its inverse depth [H, W] is unknown or among the farthest: a nearer region is a wall or a ceiling, whatever its
+    colour. One distance, because a sky whose depth varies swims as the camera moves.
+
+    Returns:
+        Inverse depth [H, W], where it is known [H, W], and the sky's share of the photo; as given if there is no sky.
     """
-    nothing = Sky(inverse_depth, known, 0.0)
+    nothing = (inverse_depth, known, 0.0)
     near = _quantile(inverse_depth, known, NEAR_QUANTILE)
     far = ~known | (inverse_depth <= FAR * near)
     if not far[0].any():
         return nothing
     reach = known & (inverse_depth <= GETS_NEAR * near)
-    sky = _spread(rgb, far & _looks(rgb, BRIGHT), reach & _looks(rgb, DIM))
+    bright, dim = far & _looks(rgb, BRIGHT), reach & _looks(rgb, DIM)
+    sky = torch.from_numpy(_flood(*(a.contiguous().numpy() for a in (rgb, bright[0], bright | dim))))
     rest = known & ~sky
     if float(sky.float().mean()) < LEAST_SHARE or not rest.any():
         return nothing
     horizon = _quantile(inverse_depth, rest, FAR_QUANTILE)
     if not _stands_behind(sky, inverse_depth, known, near, horizon) or _leaks(sky, inverse_depth, rgb, known):
         return nothing
-    sky |= _closed(sky) & reach
+    size = 2 * CLOSING_PX + 1  # close narrow gaps
+    grown = max_pool2d(sky.float()[None, None], size, stride=1, padding=CLOSING_PX)
+    sky |= (-max_pool2d(-grown, size, stride=1, padding=CLOSING_PX)[0, 0] > 0) & reach
     distance = BEYOND * min(horizon, FAR * near)
     inverse_depth = torch.where(sky, distance, torch.where(known, inverse_depth.clamp_min(CLEAR * distance), 0.0))
-    return Sky(inverse_depth, known | sky, float(sky.float().mean()))
+    return inverse_depth, known | sky, float(sky.float().mean())
 
 
 def _quantile(inverse_depth: Tensor, where: Tensor, q: float) -> float:
@@ -79,14 +75,9 @@ def _looks(rgb: Tensor, bright: float) -> Tensor:
     return (rgb.amin(-1) > bright) | is_blue
 
 
-def _spread(rgb: Tensor, strict: Tensor, lenient: Tensor) -> Tensor:
-    """What smooth steps connect to strict candidates on the upper border, through candidates of either kind."""
-    arrays = (rgb, strict[0], strict | lenient)
-    return torch.from_numpy(_flood(*(a.contiguous().numpy() for a in arrays)))
-
-
 @kernel
 def _flood(rgb: Any, first_row: Any, candidates: Any) -> Any:
+    """[H, W] the candidates that smooth steps connect to the chosen ones of the first row."""
     height, width = candidates.shape
     found = np.zeros((height, width), np.bool_)
     stack = np.empty(height * width, np.int64)
@@ -137,10 +128,3 @@ def _leaks(sky: Tensor, inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> bo
             outline += int(rim.sum())
             leaks += int((rim & alike & continues).sum())
     return leaks > MOST_LEAKS * outline
-
-
-def _closed(mask: Tensor) -> Tensor:
-    """A mask with its narrow gaps closed."""
-    size = 2 * CLOSING_PX + 1
-    grown = max_pool2d(mask.float()[None, None], size, stride=1, padding=CLOSING_PX)
-    return -max_pool2d(-grown, size, stride=1, padding=CLOSING_PX)[0, 0] > 0

@@ -129,15 +129,6 @@ class MalformedBoxes(Exception):
     """The file is no HEIF, or not as the standard has it."""
 
 
-@dataclasses.dataclass(frozen=True)
-class DepthItem:
-    """The auxiliary depth map of the primary picture."""
-
-    xmp: bytes  # empty where there is none, or none that can be reached
-    own_turn: Turn  # the item's rotation and mirroring, which a decoder applies
-    turn: Turn  # the primary picture's, where the item has none of its own
-
-
 class _Cursor:
     """Big-endian numbers one after the other; never beyond the end."""
 
@@ -176,8 +167,13 @@ class _Cursor:
             self.at = begin + size
 
 
-def find_depth_item(data: Bytes) -> DepthItem | None:
-    """The depth map of the primary picture; None where there is none, MalformedBoxes where it cannot be said."""
+def find_depth_item(data: Bytes) -> tuple[bytes, Turn, Turn] | None:
+    """The auxiliary depth map of the primary picture; None without any, MalformedBoxes where the boxes are broken.
+
+    Returns:
+        Its XMP, empty if unreachable; its own rotation and mirroring, which a decoder applies; and those of the
+        primary picture if it has none of its own.
+    """
     meta = next((span for kind, span in _Cursor(data, (0, len(data))).boxes() if kind == b"meta"), None)
     if meta is None:
         raise MalformedBoxes
@@ -197,7 +193,7 @@ def find_depth_item(data: Bytes) -> DepthItem | None:
     if not depth:
         return None
     if len(depth) > 1:  # whose XMP describes the one that the decoder picks is unknown
-        return DepthItem(b"", UPRIGHT, UPRIGHT)
+        return b"", UPRIGHT, UPRIGHT
     own, of_primary = (_turn(data, properties.get(item, [])) for item in (depth[0], primary))
     describing = {source for kind, source, targets in references if kind == b"cdsc" and depth[0] in targets}
     try:  # empty where there is none, or none that can be reached
@@ -206,7 +202,7 @@ def find_depth_item(data: Bytes) -> DepthItem | None:
     except MalformedBoxes:
         xmp = b""
     # Apple rotates the picture and leaves the map as the sensor saw it.
-    return DepthItem(xmp, own or UPRIGHT, (own is None and of_primary) or UPRIGHT)
+    return xmp, own or UPRIGHT, (own is None and of_primary) or UPRIGHT
 
 
 def _references(cursor: _Cursor) -> Iterator[tuple[bytes, int, list[int]]]:

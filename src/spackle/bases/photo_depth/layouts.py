@@ -1,23 +1,29 @@
-"""Whose depth map it is: Apple's in JPEG and HEIC, Android's GDepth and Dynamic Depth in JPEG."""
+"""The depth map inside a portrait photo: Apple's in JPEG and HEIC, Android's GDepth and Dynamic Depth in JPEG."""
 
 from __future__ import annotations
 
 import base64
 import binascii
-import dataclasses
+import mmap
 import os
 from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from PIL import Image
 
-from spackle.bases.depth_map import Quantity
+from spackle.bases.depth_map import ASPECT_TOLERANCE, DepthMap, Quantity, StrPath, is_depth
 from spackle.bases.photo_depth.coded import (
+    BY_ORIENTATION,
+    UPRIGHT,
     Array,
     BrokenDepth,
     CodedDepth,
     Lens,
     Scale,
+    Turn,
     check_pixels,
     decoding,
     read_codes,
@@ -34,6 +40,84 @@ from spackle.bases.photo_depth.containers import (
     to_number,
     xmp_of,
 )
+from spackle.camera import Camera
+from spackle.errors import InputError
+from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels, focal_from_exif, read_image
+
+_EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
+PLAUSIBLE_M = (0.3, 30.0)  # a scene's middle, where the file does not say its unit
+USUAL_M = 3.0
+
+
+def load_photo_depth(path: StrPath) -> DepthMap | None:
+    """The depth map inside a photo, upright as the photo itself is; None where it has none.
+
+    Read are, in HEIC, an auxiliary depth image with Apple's XMP or HEVC's depth information; in JPEG,
+    Apple's auxiliary pictures, Android's Dynamic Depth and the older GDepth. `DepthMap.note` says what
+    it was and how far its metres are to be trusted. The picture itself is not decoded.
+
+    Raises:
+        InputError: a missing file, or a photo whose depth map is broken or of another crop.
+    """
+    if check_file(path, "photo") < 12:
+        return None
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if data[:3] == b"\xff\xd8\xff":
+                coded = find_apple(data) or find_android(data)
+            else:
+                coded = find_in_heif(data, path) if data[4:8] == b"ftyp" else None
+        return None if coded is None else _depth_map(coded, path)
+    except BrokenDepth as error:
+        raise InputError(
+            f"{path}: the depth map in the photo {error}: give another one with --depth FILE, or use --base lite"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+
+
+def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
+    photo_width, photo_height, photo_turn, focal = read_image(path, _photo_header)
+    turn = coded.turn.then(photo_turn)
+    stored, quantum = coded.scale.decode(coded.codes, coded.full)
+    depth = turn.grid(torch.from_numpy(stored))
+    height, width = depth.shape
+    if abs(width * photo_height / (height * photo_width) - 1) > ASPECT_TOLERANCE:
+        raise BrokenDepth(f"has {width}×{height} pixels but the photo {photo_width}×{photo_height}, another crop")
+    before = coded.codes.shape[:: 1 if coded.turned.transpose else -1]
+    K = None if coded.lens is None else coded.lens.matrix(*before)
+    K = None if K is None else coded.turned.then(turn).matrix(K, *before)
+    if coded.along_ray:
+        own = Camera.from_focal(focal, photo_width, photo_height).resized(width, height)
+        camera = own if K is None else Camera(K, torch.eye(4), width, height)
+        rays = camera.unproject(camera.pixel_centers(), torch.ones(height, width))
+        depth, quantum = depth / rays.square().sum(-1).sqrt(), None  # from the way to a point to its z
+    note = f"portrait depth of the photo ({coded.source}"
+    known = depth[is_depth(depth)]
+    middle = float(known.median()) if len(known) and not coded.unit_known else USUAL_M
+    if not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
+        factor = USUAL_M / middle
+        depth, note = depth * factor, f"{note}, scaled to a median of {USUAL_M:g} m"
+        quantum = quantum and quantum * (factor if coded.scale.quantity == "depth" else 1 / factor)
+    metres = depth.float()
+    valid = is_depth(metres)
+    if not valid.any():
+        raise BrokenDepth("has no pixel with a depth")
+    return DepthMap(metres.where(valid, 0.0), valid, K, quantum, coded.scale.quantity, Path(path), f"{note})")
+
+
+def _photo_header(image: Image.Image) -> tuple[int, int, Turn, float]:
+    """Upright width and height of the photo, the turn of its stored pixels, and its focal length in pixels."""
+    try:
+        exif = image.getexif()
+        orientation, tags = exif.get(_ORIENTATION, 1), {**exif, **exif.get_ifd(_EXIF_IFD)}
+        turn = BY_ORIENTATION.get(orientation, UPRIGHT)
+    except Exception:  # unreadable EXIF says nothing about the orientation
+        turn, tags = UPRIGHT, {}
+    width, height = image.size[::-1] if turn.transpose else image.size
+    focal = focal_from_exif(tags, width, height) or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
+    return width, height, turn, focal
+
 
 PIXELS, DEPTH = "http://ns.apple.com/pixeldatainfo/1.0/ ", "http://ns.apple.com/depthData/1.0/ "
 
@@ -41,13 +125,7 @@ PIXELS, DEPTH = "http://ns.apple.com/pixeldatainfo/1.0/ ", "http://ns.apple.com/
 _FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep": "depth", "fdep": "depth"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Description:
-    """What an auxiliary image's XMP says of a depth map."""
-
-    scale: Scale | None  # None: the range is not given
-    lens: Lens | None
-    source: str
+Description = tuple[Scale | None, Lens | None, str]  # the scale if XMP gives the range, the lens, the source
 
 
 def find_apple(data: Bytes) -> CodedDepth | None:
@@ -55,12 +133,13 @@ def find_apple(data: Bytes) -> CodedDepth | None:
     for begin, end in further_pictures(data):
         if (described := describe(xmp_of(data, begin))) is None:
             continue
-        if described.scale is None:
+        scale, lens, source = described
+        if scale is None:
             raise BrokenDepth("does not say its range: FloatMinValue or FloatMaxValue is missing")
         if end > len(data):
             raise BrokenDepth("is cut off: the file ends before it does")
         codes, full = read_codes(data[begin:end])
-        return CodedDepth(codes, full, described.scale, described.source, described.lens)
+        return CodedDepth(codes, full, scale, source, lens)
     return None
 
 
@@ -76,7 +155,7 @@ def describe(packet: bytes) -> Description | None:
     scale = None if first is None or last is None else Scale(quantity, first, last, lowest or 0.0, highest)
     accuracy = tree.find(f"{DEPTH}Accuracy")
     source = f"Apple {quantity}, {accuracy if accuracy in ('absolute', 'relative') else 'of unknown accuracy'}"
-    return Description(scale, _apple_lens(tree), source)
+    return scale, _apple_lens(tree), source
 
 
 def _quantity(tree: Node) -> Quantity | None:
@@ -227,10 +306,12 @@ def find_in_heif(data: Bytes, path: str | os.PathLike[str]) -> CodedDepth | None
         return None
     if item is None:
         return None
+    xmp, own_turn, turn = item
     codes, full, stated = _decode(path)
-    described = describe(item.xmp)
-    lens = None if described is None else described.lens
-    return CodedDepth(codes, full, *_meaning(described, stated), lens, item.own_turn, item.turn)
+    scale, lens, source = describe(xmp) or (None, None, "")
+    if scale is None:  # Apple's words count more than HEVC's
+        scale, source = _meaning(stated)
+    return CodedDepth(codes, full, scale, source, lens, own_turn, turn)
 
 
 def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
@@ -246,10 +327,8 @@ def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
         return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
 
 
-def _meaning(described: Description | None, stated: dict[str, Any]) -> tuple[Scale, str]:
-    """Apple's words where they give a range, else HEVC's, else a portrait's usual range."""
-    if described is not None and described.scale is not None:
-        return described.scale, described.source
+def _meaning(stated: dict[str, Any]) -> tuple[Scale, str]:
+    """HEVC's range and its source, else a portrait's usual range."""
     kind = stated.get("representation_type")
     first, last = (stated.get(name) for name in (("d_min", "d_max") if kind == 1 else ("z_near", "z_far")))
     if kind == 3:
