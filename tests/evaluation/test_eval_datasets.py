@@ -538,9 +538,6 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
 def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
     middlebury_2014(tmp_path / "Piano")
     (case,) = cases("middlebury", tmp_path)
-    (tmp_path / "Piano/im1.png").write_bytes(b"not a PNG")
-    with pytest.raises(InputError, match=r"im1\.png: not an image"):
-        load_case(case)
     photo(tmp_path / "Piano/im1.png", HEIGHT, WIDTH)
     with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but its calibration is for 48×36"):
         load_case(case)
@@ -584,14 +581,12 @@ def test_a_known_factor_comes_back_under_outliers() -> None:
 
 def test_points_give_the_scale_too() -> None:
     y, x = torch.meshgrid(torch.arange(2, 120, 10) + 0.3, torch.arange(3, 160, 10) + 0.9, indexing="ij")
-    uv = torch.stack([x, y], -1).reshape(-1, 2)
-    points = Points(
-        torch.cat([uv, torch.tensor([[500.0, 5.0], [-1.0, 5.0]])]),
-        0.25 * (2 + 3 * torch.cat([uv[:, 1], torch.ones(2)]) / 120),
-    )
+    inside = torch.stack([x, y], -1).reshape(-1, 2)
+    uv = torch.cat([inside, torch.tensor([[500.0, 5.0], [-1.0, 5.0]])])
+    points = Points(uv, 0.25 * (2 + 3 * uv[:, 1] / 120))
     found = align(case_with(points=lambda: points), spoilt(ramp(), 0.2), torch.ones(60, 80, dtype=torch.bool))
     assert found.scale == pytest.approx(0.25, rel=0.02)
-    assert (found.source, found.pixels) == ("points", len(uv))
+    assert (found.source, found.pixels) == ("points", len(inside))
 
 
 def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:

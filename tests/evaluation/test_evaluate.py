@@ -53,16 +53,11 @@ Figures = dict[str, dict[str, float | None]]
 # --- metrics
 
 
-def noisy() -> tuple[Tensor, Tensor]:
-    """A random image and a disturbed copy, float64."""
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(57, 83, 3, generator=generator, dtype=torch.float64)
-    return image, (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
-
-
 def test_psnr_and_ssim_are_scikit_images() -> None:
     theirs = pytest.importorskip("skimage.metrics")
-    image, truth = noisy()
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(57, 83, 3, generator=generator, dtype=torch.float64)
+    truth = (image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)).clamp(0, 1)
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1}
     mean, full = theirs.structural_similarity(image.numpy(), truth.numpy(), channel_axis=-1, full=True, **options)
     assert ssim_average(ssim_map(image, truth)) == pytest.approx(mean, abs=1e-6)
@@ -77,11 +72,7 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
     )
     changed = torch.where(mask[..., None], image, torch.zeros_like(image))
     assert psnr(changed, truth, mask) == psnr(image, truth, mask)
-
-
-def test_metrics_of_nothing_and_of_equal_images() -> None:
-    image, truth = noisy()
-    nothing = torch.zeros(image.shape[:2], dtype=torch.bool)
+    nothing = torch.zeros_like(mask)
     assert math.isnan(psnr(image, truth, nothing))
     assert math.isnan(ssim_average(ssim_map(image, truth), nothing))
     assert psnr(image, image) == math.inf
@@ -93,21 +84,15 @@ def test_metrics_of_nothing_and_of_equal_images() -> None:
 # --- pyiqa, by a stand-in
 
 
-@pytest.mark.parametrize(
-    ("error", "says"),
-    [
+def test_without_pyiqa_each_of_its_metrics_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for error, why in (
         (ModuleNotFoundError("No module named 'pyiqa'", name="pyiqa"), NOT_INSTALLED),
         (RuntimeError("operator torchvision::nms does not exist"), "pyiqa cannot be imported: operator torchvision"),
-    ],
-)
-def test_without_pyiqa_each_of_its_metrics_says_so(
-    error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fake_pyiqa(monkeypatch, error=error)
-    metrics, states = open_metrics(["niqe", "lpips"], "cpu", download=False)
-    assert metrics == {}
-    assert {name: why.startswith(f"not run: {says}") for name, why in states.items()} == {"niqe": True, "lpips": True}
-    assert open_metrics([], "cpu", download=False) == ({}, {})
+    ):
+        fake_pyiqa(monkeypatch, error=error)
+        metrics, states = open_metrics(["niqe", "lpips"], "cpu", download=False)
+        assert metrics == {}
+        assert [state.startswith(f"not run: {why}") for state in states.values()] == [True, True]
 
 
 def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -270,18 +255,6 @@ def shot_of(*sides: float) -> Shot:
     return Shot(prediction, cameras, [renderer.render(prediction.gaussians, camera) for camera in cameras], renderer)
 
 
-def test_large_views_are_the_ends_of_a_swipe_at_each_disparity() -> None:
-    prediction = box_before_wall(width=95, height=71).lift()
-    views = large_views(prediction, (0.3, 0.5))
-    assert [(view.setting, view.name) for view in views] == [(s, n) for s in ("0.3", "0.5") for n in ("left", "right")]
-    assert {(view.camera.width, view.camera.height) for view in views} == {(96, 72)}
-    reach = DepthRange.of(prediction.gaussians)
-    for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
-        x, y, z = view.camera.position.tolist()
-        assert x == pytest.approx(sign * max_offset(views[0].camera, float(view.setting), reach), rel=1e-5)
-        assert abs(y) + abs(z) < 1e-6
-
-
 def test_each_method_starts_from_the_same_base() -> None:
     shot = shot_of(0.4, -0.4)
     names = ("base", "seeds", "spackle-scene", "dense")
@@ -310,17 +283,24 @@ def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
     assert float((other.rgb - shot.before[0].rgb).abs().max()) < 1e-3
 
 
-def test_a_metric_that_fails_is_a_remark_and_no_number() -> None:
-    prediction = box_before_wall().lift()
+def test_large_views_are_the_ends_of_a_swipe_and_a_metric_that_fails_is_a_remark() -> None:
+    prediction = box_before_wall(width=95, height=71).lift()
+    views = large_views(prediction, (0.3, 0.5))
+    assert [(view.setting, view.name) for view in views] == [(s, n) for s in ("0.3", "0.5") for n in ("left", "right")]
+    reach = DepthRange.of(prediction.gaussians)
+    for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
+        x, y, z = view.camera.position.tolist()
+        assert x == pytest.approx(sign * max_offset(views[0].camera, float(view.setting), reach), rel=1e-5)
+        assert abs(y) + abs(z) < 1e-6
 
     def broken(picture: Tensor, truth: Tensor | None) -> float:
         raise RuntimeError("svd did not converge")
 
     gauges, methods = Gauges(("niqe",), {"niqe": broken}, None), {"base": make_method("base", None)}
-    found = measure(prediction, large_views(prediction, (0.3,)), methods, gauges, get_renderer())
+    found = measure(prediction, views, methods, gauges, get_renderer())
     assert found.remarks == ["niqe failed: svd did not converge"]
-    assert [row.figures["niqe"] for row in found.rows] == [None, None]
-    assert found.pictures["base"].shape == (72, 96, 3)
+    assert [row.figures["niqe"] for row in found.rows] == [None] * 4
+    assert found.pictures["base"].shape == (72, 96, 3)  # both sides even
 
 
 # --- the command
