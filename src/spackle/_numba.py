@@ -9,8 +9,10 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
 
 R = TypeVar("R")
+Array = NDArray[Any]  # what kernels take
 
 # Constants of float32 kernels: a Python float would widen a whole expression to float64.
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)

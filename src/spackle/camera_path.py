@@ -96,6 +96,12 @@ def view_at(
     return camera.looking(eyes[index], target)
 
 
+def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
+    """The leftmost and the rightmost view at a disparity: where holes are widest."""
+    left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
+    return left, right
+
+
 def _flight(
     kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, frames: int
 ) -> tuple[Tensor, Tensor]:
@@ -106,19 +112,7 @@ def _flight(
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if frames < 1:
         raise ValueError(f"a trajectory needs at least one frame, got {frames}")
-    offset = max_offset(camera, disparity, depth_range)
-    target = torch.tensor([0.0, 0.0, depth_range.focus], dtype=torch.float64)
-    return _eyes(kind, offset, MAX_ZOOM * depth_range.near, frames), target
-
-
-def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
-    """The leftmost and the rightmost view at a disparity: where holes are widest."""
-    left, right = trajectory("swipe", camera, disparity, depth_range, frames=2)
-    return left, right
-
-
-def _eyes(kind: TrajectoryKind, side: float, forward: float, frames: int) -> Tensor:
-    """Eye positions [frames, 3]."""
+    side, forward = max_offset(camera, disparity, depth_range), MAX_ZOOM * depth_range.near
     zero = torch.zeros(frames, dtype=torch.float64)
     turn = torch.linspace(0, 1, frames, dtype=torch.float64) * 2 * math.pi
     if kind == "swipe":
@@ -134,7 +128,7 @@ def _eyes(kind: TrajectoryKind, side: float, forward: float, frames: int) -> Ten
         xyz = [side * turn.sin(), side * turn.cos(), zero]
     else:
         xyz = [side * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
-    return torch.stack(xyz, dim=-1)
+    return torch.stack(xyz, dim=-1), torch.tensor([0.0, 0.0, depth_range.focus], dtype=torch.float64)
 
 
 class PathError(ValueError):
@@ -222,19 +216,19 @@ class KeyframePath:
             (*key.eye, *key.target, *(np.array(key.up) / np.linalg.norm(key.up)), math.log(focal))
             for key, focal in zip(self.keys, focals, strict=True)
         ]
-        values = interpolate(np.array([key.time for key in self.keys]), np.array(rows), np.array(times), self._period)
+        period = self.seconds if self.closed else None
+        values = interpolate(np.array([key.time for key in self.keys]), np.array(rows), np.array(times), period)
         views = []
         for time, row in zip(times, values, strict=True):
             try:
                 matrix = view_matrix(row[:3] * length, row[3:6] * length, row[6:9])
             except PathError as error:
                 raise PathError(f"at {time:.3g} s, between two keyframes, {error}: add a keyframe there") from None
-            views.append(_zoomed(camera, matrix, math.exp(row[9]) / fx))
+            K = camera.K.clone()
+            K[:2, :2] *= math.exp(row[9]) / fx
+            pose = torch.from_numpy(matrix).to(camera.world_to_camera)
+            views.append(dataclasses.replace(camera, K=K, world_to_camera=pose))
         return views
-
-    @property
-    def _period(self) -> float | None:
-        return self.seconds if self.closed else None
 
 
 def view_matrix(eye: Array, target: Array, up: Array) -> Array:
@@ -290,10 +284,3 @@ def _inner_tangents(steps: Array, slopes: Array) -> Array:
     mean = (first + second) / (first / safe_before + second / safe_after)
     tangents: Array = np.where(agree, mean, 0.0)
     return tangents
-
-
-def _zoomed(camera: Camera, matrix: Array, zoom: float) -> Camera:
-    """The photo's lens with its focal length times `zoom`, put elsewhere."""
-    K = camera.K.clone()
-    K[:2, :2] *= zoom
-    return dataclasses.replace(camera, K=K, world_to_camera=torch.from_numpy(matrix).to(camera.world_to_camera))

@@ -52,7 +52,7 @@ def test_reads_the_documented_format(tmp_path: Path) -> None:
     assert torch.equal(first.world_to_camera, torch.tensor(GOOD["frames"][0]["world_to_camera"]))
     del content["width"], content["frames"][0]
     assert load_cameras(write(tmp_path / "c.json", content))[0].width == 100
-    assert len(load_cameras(write(tmp_path / "c.json", pose(0, 0, 1.0003)))) == 1  # nearly rigid
+    assert len(load_cameras(write(tmp_path / "c.json", at("world_to_camera", 0, 0, 1.0003)))) == 1  # nearly rigid
 
 
 def changed(path: list[Any], value: Any) -> dict[str, Any]:
@@ -64,12 +64,8 @@ def changed(path: list[Any], value: Any) -> dict[str, Any]:
     return content
 
 
-def k(row: int, column: int, value: Any) -> dict[str, Any]:
-    return changed(["frames", 0, "K", row, column], value)
-
-
-def pose(row: int, column: int, value: Any) -> dict[str, Any]:
-    return changed(["frames", 0, "world_to_camera", row, column], value)
+def at(name: str, row: int, column: int, value: Any) -> dict[str, Any]:
+    return changed(["frames", 0, name, row, column], value)
 
 
 BAD: dict[str, tuple[Any, str]] = {
@@ -81,16 +77,16 @@ BAD: dict[str, tuple[Any, str]] = {
     "frame is a number": (changed(["frames"], [3]), "frame 0: must be an object"),
     "no K": (changed(["frames", 0, "K"], None), "K must be a list"),
     "ragged": (changed(["frames", 0, "K", 1], [1, 2]), "K must be a list"),
-    "bool": (k(0, 2, True), "K must be a list"),
-    "NaN": (k(0, 2, math.nan), "finite"),
-    "inf": (pose(0, 3, math.inf), "finite"),
-    "huge whole number": (k(0, 2, 10**400), "finite|not JSON"),
-    "zero focal": (k(0, 0, 0), "focal"),
-    "K's last row": (k(2, 2, 2), "last row of K"),
-    "skew": (k(0, 1, 3), "skew"),
-    "scaled": (pose(0, 0, 1.01), "rotation"),
-    "mirror": (pose(0, 0, -1), "rotation"),
-    "pose's last row": (pose(3, 2, 0.5), "last row of world_to_camera"),
+    "bool": (at("K", 0, 2, True), "K must be a list"),
+    "NaN": (at("K", 0, 2, math.nan), "finite"),
+    "inf": (at("world_to_camera", 0, 3, math.inf), "finite"),
+    "huge whole number": (at("K", 0, 2, 10**400), "finite|not JSON"),
+    "zero focal": (at("K", 0, 0, 0), "focal"),
+    "K's last row": (at("K", 2, 2, 2), "last row of K"),
+    "skew": (at("K", 0, 1, 3), "skew"),
+    "scaled": (at("world_to_camera", 0, 0, 1.01), "rotation"),
+    "mirror": (at("world_to_camera", 0, 0, -1), "rotation"),
+    "pose's last row": (at("world_to_camera", 3, 2, 0.5), "last row of world_to_camera"),
     "zero width": (changed(["width"], 0), "width"),
     "giant": (changed(["height"], 16_385), "height"),
     "fraction": (changed(["width"], 640.5), "width"),

@@ -35,9 +35,8 @@ from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_ply
 from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
 from spackle.formats.gltf import encode_glb
-from spackle.formats.scene_files import SceneFile
+from spackle.formats.scene_files import SceneFile, encode_splat
 from spackle.formats.sog import codebook, encode_sog
-from spackle.formats.splat import encode_splat
 from spackle.formats.spz import LIMIT, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.progress import Reporter

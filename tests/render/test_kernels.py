@@ -55,4 +55,3 @@ def test_what_a_kernel_was_made_from_is_noticed(tmp_path: Path) -> None:
     assert run(tmp_path, flags="contract") == [60, 0, 1]
     assert run(tmp_path, side=11) == [66, 0, 1]
     assert run(tmp_path, side=11, factor=5) == [165, 0, 1]
-    assert run(tmp_path, side=11, factor=5) == [165, 1, 0]

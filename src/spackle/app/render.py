@@ -16,7 +16,7 @@ from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_png, save_video
-from spackle.formats.video import FORMATS, is_video_name
+from spackle.formats.video import FORMATS
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.output_folder import results_folder
@@ -42,7 +42,7 @@ def render_scene(
     Raises:
         InputError: a scene, a camera file or an output that cannot be used.
     """
-    single = is_video_name(output)
+    single = output.suffix.lower() in FORMATS
     if single:
         path = dataclasses.replace(path, video=path.video.for_file(output))
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):

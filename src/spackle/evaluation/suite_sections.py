@@ -26,7 +26,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import CpuRenderer, Renderer
 from spackle.render.binning import list_tiles, sort_by_depth
-from spackle.render.pipeline import Canvas, blend, project, wanted_tiles
+from spackle.render.pipeline import blend, project, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import Completer, ResidualNet, hole_area_ratio
 
@@ -109,14 +109,13 @@ def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
     """What `spackle.render.pipeline.draw` does, step by step."""
     view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
-    canvas = Canvas.prepare(view, None, False)
     splats, spans = project([scene], view, wanted)
     lap("project")
     order = sort_by_depth(splats.keys, splats.ids, spans)
     lap("sort")
     lists = list_tiles(order, splats.boxes, wanted)
     lap("bin")
-    blend(splats, lists, wanted, canvas)
+    blend(splats, lists, view, wanted, None, False)
     lap("blend")
 
 

@@ -104,7 +104,9 @@ def read_clip(
                 progress(len(ticks), max(len(ticks), first or stream.frames))
     if frame is None:
         raise InputError(f"{path}: there is not one frame in it: give another clip")
-    width, height = _upright_size(frame, aspect)
+    width, height = _square_size(frame, aspect)
+    if _quarters(frame) % 2:
+        width, height = height, width
     if width * height > MAX_PIXELS:
         raise InputError(f"{path}: frames of {width}×{height} are too large: shrink the clip first")
     times = _rising(ticks, Fraction(rate))
@@ -199,11 +201,6 @@ def _square_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
     """Width and height with square pixels, of pixels that are `aspect` times as wide as high: a side grows."""
     wide, high = max(aspect, Fraction(1)), max(1 / aspect, Fraction(1))
     return max(1, round(frame.width * wide)), max(1, round(frame.height * high))
-
-
-def _upright_size(frame: av.VideoFrame, aspect: Fraction) -> tuple[int, int]:
-    width, height = _square_size(frame, aspect)
-    return (height, width) if _quarters(frame) % 2 else (width, height)
 
 
 def _rising(ticks: list[Fraction | None], rate: Fraction) -> tuple[Fraction, ...]:

@@ -96,16 +96,11 @@ def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_co
     if camera is not None:
         pose = _pose(camera)
         nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
-        description["cameras"] = [_camera(camera)]
+        (fx, fy), width, height = camera.focal, camera.width, camera.height
+        lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
+        extras = {"K": camera.K.tolist(), "width": width, "height": height}  # where the middle lies glTF cannot say
+        description["cameras"] = [{"type": "perspective", "perspective": lens, "extras": extras}]
     return description
-
-
-def _camera(camera: Camera) -> dict[str, Any]:
-    """The photo's camera as far as glTF has words for it; where its middle lies goes into `extras`."""
-    (fx, fy), (width, height) = camera.focal, (camera.width, camera.height)
-    lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
-    extras = {"K": camera.K.tolist(), "width": width, "height": height}
-    return {"type": "perspective", "perspective": lens, "extras": extras}
 
 
 def _pose(camera: Camera) -> list[float]:

@@ -6,15 +6,16 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from spackle.camera import Camera
 from spackle.formats.atomic import write_whole
+from spackle.formats.columns import Columns
 from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
 from spackle.formats.sog import encode_sog
-from spackle.formats.splat import encode_splat
 from spackle.formats.spz import encode_spz
 from spackle.gaussians import Gaussians
 
@@ -51,19 +52,39 @@ def at_origin(camera: Camera) -> bool:
     return torch.equal(camera.world_to_camera, torch.eye(4).to(camera.world_to_camera))
 
 
-def _write_ply(scene: SceneFile, path: Path) -> None:
-    camera, base_count, disparity = scene.untilted_camera, scene.base_count, scene.disparity
-    save_ply(scene.gaussians, path, camera=camera, base_count=base_count, disparity=disparity)
+SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def _write_compressed_ply(scene: SceneFile, path: Path) -> None:
-    write_whole(path, encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count))
+def encode_splat(gaussians: Gaussians) -> bytes:
+    """Gaussians, in their order and axes, as a .splat file of antimatter15's viewer: 32 bytes each, and nothing else.
+
+    Colours, opacities and rotations are rounded to bytes.
+
+    Raises:
+        ValueError: where a Gaussian is not finite.
+    """
+    columns = Columns.of(gaussians)
+    rows = np.empty(len(gaussians), SPLAT_ROW)
+    rows["means"] = columns.means
+    rows["scales"] = np.exp(columns.log_scales)
+    rows["rgba"][:, :3] = np.round(columns.srgb * 255)
+    rows["rgba"][:, 3] = np.round(columns.opacities * 255)
+    rows["quats"] = np.clip(np.round(columns.quats * 128 + 128), 0, 255)
+    return rows.tobytes()
 
 
 # Each writes a whole file or none. A new format is one file and one line here; the first end that fits a name counts.
 SCENE_WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
-    ".compressed.ply": _write_compressed_ply,
-    ".ply": _write_ply,
+    ".compressed.ply": lambda scene, path: write_whole(
+        path, encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count)
+    ),
+    ".ply": lambda scene, path: save_ply(
+        scene.gaussians,
+        path,
+        camera=scene.untilted_camera,
+        base_count=scene.base_count,
+        disparity=scene.disparity,
+    ),
     ".spz": lambda scene, path: write_whole(path, encode_spz(scene.gaussians)),
     ".splat": lambda scene, path: write_whole(path, encode_splat(scene.gaussians)),
     ".sog": lambda scene, path: write_whole(path, encode_sog(scene.gaussians)),

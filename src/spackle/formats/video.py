@@ -25,8 +25,6 @@ from spackle.formats.video_gif import GifEncoder
 
 MAX_REPEATS = 1000  # of a file that has to hold every repetition
 MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
-
-
 BT709, LIMITED_RANGE = 1, 1  # FFmpeg's numbers, the same for primaries, transfer and matrix
 
 
@@ -60,11 +58,6 @@ GIF = VideoFormat("gif", "gif", {}, {}, "pal8", True, (0.01, 50), 65_535)
 # libwebp's own way to YUV is the best; it holds the compressed frames until the end.
 WEBP = VideoFormat("libwebp_anim", "webp", {"quality": "85"}, {}, "bgra", True, (0.01, 90), 16_383)
 FORMATS = {".mp4": H264, ".m4v": H264, ".mov": H264, ".webm": VP9, ".gif": GIF, ".webp": WEBP}
-
-
-def is_video_name(path: str | os.PathLike[str]) -> bool:
-    """Whether `VideoWriter` takes a file of this name."""
-    return Path(path).suffix.lower() in FORMATS
 
 
 def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = None) -> VideoFormat:

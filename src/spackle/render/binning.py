@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spackle._numba import kernel
+from spackle._numba import Array, kernel
 from spackle.device import run_chunks, thread_count
-
-Array = npt.NDArray[Any]
 
 DIGIT_BITS = 11  # three digits hold the 31 bits of a positive float; a table of 2048 counts stays in cache
 BUCKETS = 1 << DIGIT_BITS

@@ -9,10 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle._numba import HALF, MANTISSA, ONE, ZERO, inlined_kernel, kernel
+from spackle._numba import HALF, MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
 from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, HALF_WIDTH, PEAK, RED, SLOPE, X, Y
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
@@ -88,8 +87,6 @@ def srgb_slope(linear: np.float32, encoded: np.float32) -> np.float32:
     slope = LINE if linear <= KNEE else (encoded + np.float32(0.055)) / (np.float32(2.4) * linear)
     return slope if ZERO <= linear <= ONE else ZERO
 
-
-Array = npt.NDArray[Any]
 
 # A tile's state is one flat buffer of six planes: light (the transmittance, 0 once a pixel is full), red,
 # green, blue, depth, alpha. One buffer, because the compiler then knows that the planes do not overlap.

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spackle._numba import HALF, ONE, ZERO, kernel, reordering_kernel
+from spackle._numba import HALF, ONE, ZERO, Array, kernel, reordering_kernel
 from spackle.render.blend import CHECK_EVERY, LIMIT, PLANE, STOP, alpha_of, is_full, span_of, srgb_slope
 from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, PEAK, RED, SLOPE, X, Y
 from spackle.render.protocol import ALPHA_MIN, TILE
-
-Array = npt.NDArray[Any]
 
 # What the pixels of a tile give to one Gaussian. With u = x - centre and v = ∂L/∂ln(alpha), sums of v,
 # v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.

@@ -95,9 +95,6 @@ class SetStore:
         return entry
 
 
-EXTRA = "pip install 'spackle-nvs[cuda]'"
-
-
 class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
@@ -183,7 +180,8 @@ def load_gsplat(device: torch.device) -> ModuleType:
         import gsplat
         from gsplat.cuda import _backend
     except ImportError as error:
-        raise InputError(f"--device cuda: needs gsplat ({error}): {EXTRA}, or use --device cpu") from error
+        install = "pip install 'spackle-nvs[cuda]'"
+        raise InputError(f"--device cuda: needs gsplat ({error}): {install}, or use --device cpu") from error
     except Exception as error:  # its kernels are built when it is first imported: compilers fail in many ways
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InputError(f"--device cuda: gsplat's kernels cannot be built here: {reason}; use --device cpu") from error

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from spackle._numba import Array
 from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
@@ -19,35 +18,8 @@ from spackle.render.blend import blend_tiles
 from spackle.render.project import KernelCamera, Splats, count_before, project_chunk
 from spackle.render.protocol import Rendering
 
-Array = npt.NDArray[Any]
-
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
 BLEND_GRAIN = 64  # tiles a thread blends at a time
-
-
-@dataclasses.dataclass(frozen=True)
-class Canvas:
-    """The images as arrays, to be drawn into tile by tile."""
-
-    rgb: Array  # [H, W, 3] float32 sRGB
-    depth: Array  # [H, W] float32
-    alpha: Array  # [H, W] float32
-    linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
-
-    @staticmethod
-    def prepare(view: KernelCamera, onto: Rendering | None, keep_linear: bool) -> Canvas:
-        """Black and empty, or a copy of `onto`."""
-        size = (view.height, view.width)
-        linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
-        if onto is None:
-            rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
-        else:
-            rgb, depth, alpha = (np.array(as_array(image)) for image in onto.tensors)
-        return Canvas(rgb, depth, alpha, linear)
-
-    def rendering(self) -> Rendering:
-        """The same memory as tensors."""
-        return Rendering(torch.from_numpy(self.rgb), torch.from_numpy(self.depth), torch.from_numpy(self.alpha))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +30,14 @@ class Drawing:
     wanted: Array  # [rows, columns] bool, the tiles that were drawn
     splats: Splats
     lists: TileLists
-    canvas: Canvas
+    rgb: Array  # [H, W, 3] float32 sRGB
+    depth: Array  # [H, W] float32
+    alpha: Array  # [H, W] float32
+    linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
+
+    def rendering(self) -> Rendering:
+        """The images as tensors of the same memory."""
+        return Rendering(*(torch.from_numpy(image) for image in (self.rgb, self.depth, self.alpha)))
 
 
 def draw(
@@ -68,12 +47,9 @@ def draw(
 
     The other tiles are black and empty where `onto` is None. The gradient needs the colour before sRGB (`keep_linear`).
     """
-    canvas = Canvas.prepare(view, onto, keep_linear)
     splats, spans = project(sets, view, wanted)
-    order = sort_by_depth(splats.keys, splats.ids, spans)
-    lists = list_tiles(order, splats.boxes, wanted)
-    blend(splats, lists, wanted, canvas)
-    return Drawing(view, wanted, splats, lists, canvas)
+    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
+    return blend(splats, lists, view, wanted, onto, keep_linear)
 
 
 def as_array(tensor: Tensor) -> Array:
@@ -129,14 +105,27 @@ def project(
     return splats, np.array(sorted(spans), np.int64).reshape(-1, 2)
 
 
-def blend(splats: Splats, lists: TileLists, wanted: Array, canvas: Canvas) -> None:
-    """Draw the wanted tiles."""
+def blend(
+    splats: Splats,
+    lists: TileLists,
+    view: KernelCamera,
+    wanted: Array,
+    onto: Rendering | None,
+    keep_linear: bool = False,
+) -> Drawing:
+    """Draw the wanted tiles; see `draw`."""
+    size = (view.height, view.width)
+    linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
+    if onto is None:
+        rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
+    else:
+        rgb, depth, alpha = (np.array(as_array(image)) for image in onto.tensors)
     tiles = np.flatnonzero(wanted)
 
     def chunk(start: int, stop: int) -> None:
         blend_tiles(
-            start, stop, tiles, wanted.shape[1], lists.ids, lists.starts, splats.records,
-            canvas.rgb, canvas.depth, canvas.alpha, canvas.linear,
-        )  # fmt: skip
+            start, stop, tiles, wanted.shape[1], lists.ids, lists.starts, splats.records, rgb, depth, alpha, linear
+        )
 
     run_chunks(chunk, len(tiles), BLEND_GRAIN)
+    return Drawing(view, wanted, splats, lists, rgb, depth, alpha, linear)

@@ -10,13 +10,11 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spackle._numba import MANTISSA, ZERO, inlined_kernel, kernel
+from spackle._numba import MANTISSA, ZERO, Array, inlined_kernel, kernel
 from spackle.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 
-Array = npt.NDArray[Any]
 Numbers = Array | tuple[Any, ...]
 
 # A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from spackle._numba import kernel
-
-Array = npt.NDArray[Any]
+from spackle._numba import Array, kernel
 
 
 @kernel

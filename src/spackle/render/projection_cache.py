@@ -6,21 +6,17 @@ import dataclasses
 import threading
 import weakref
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
-from spackle._numba import kernel
+from spackle._numba import Array, kernel
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.render.binning import TileLists, list_tiles, sort_by_depth
-from spackle.render.pipeline import Canvas, Drawing, blend, project
+from spackle.render.pipeline import Drawing, blend, project
 from spackle.render.project import DEPTH, KernelCamera, Splats
 from spackle.render.protocol import Rendering
-
-Array = npt.NDArray[Any]
 
 MERGE_GRAIN = 64  # tiles a thread merges at a time
 
@@ -94,20 +90,13 @@ class ProjectionCache:
             more = sets[kept.sets :]
             if kept.count + sum(len(part) for part in more) > len(kept.splats.records):
                 return None
-            return _add(kept, more, wanted, onto)
+            splats = kept.splats
+            _, spans = project(more, view, wanted, splats, kept.count)
+            added = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
+            lists = merged(kept.lists, added, wanted, splats.records)
+            return blend(splats, lists, view, wanted, onto, False)
         finally:
             self._lock.release()
-
-
-def _add(kept: CachedDrawing, more: Sequence[Gaussians], wanted: Array, onto: Rendering | None) -> Drawing:
-    """Draw more sets together with those that are there, in the wanted tiles."""
-    splats, view = kept.splats, kept.view
-    _, spans = project(more, view, wanted, splats, kept.count)
-    order = sort_by_depth(splats.keys, splats.ids, spans)
-    lists = merged(kept.lists, list_tiles(order, splats.boxes, wanted), wanted, splats.records)
-    canvas = Canvas.prepare(view, onto, False)
-    blend(splats, lists, wanted, canvas)
-    return Drawing(view, wanted, splats, lists, canvas)
 
 
 def merged(there: TileLists, more: TileLists, wanted: Array, records: Array) -> TileLists:
