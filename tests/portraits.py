@@ -325,6 +325,7 @@ def _file(items: list[_Item]) -> bytes:
         associations += struct.pack(">HB", number, len(indices)) + indices
         stored_properties += b"".join(item.properties)
         count += len(item.properties)
+    association = full(b"ipma", 0, struct.pack(">I", len(items)) + associations)
     links = {2: b"auxl", 3: b"cdsc"}
     references = [box(links[n], struct.pack(">HHH", n, 1, n - 1)) for n in range(2, len(items) + 1)]
     parts = [
@@ -332,7 +333,7 @@ def _file(items: list[_Item]) -> bytes:
         full(b"pitm", 0, struct.pack(">H", 1)),
         full(b"iinf", 0, struct.pack(">H", len(items)) + entries),
         *([full(b"iref", 0, b"".join(references))] if references else []),
-        box(b"iprp", box(b"ipco", stored_properties) + _ipma(len(items), associations)),
+        box(b"iprp", box(b"ipco", stored_properties) + association),
     ]
     head = box(b"ftyp", b"heic\0\0\0\0mif1heic")
     before = len(head) + 12 + sum(map(len, parts)) + 16 + 14 * len(items) + 8  # meta, iloc and mdat have heads
@@ -342,10 +343,6 @@ def _file(items: list[_Item]) -> bytes:
         before += len(item.data)
     locations = full(b"iloc", 0, struct.pack(">HH", 0x4400, len(items)) + where)
     return head + full(b"meta", 0, b"".join(parts) + locations) + box(b"mdat", b"".join(i.data for i in items))
-
-
-def _ipma(count: int, associations: bytes) -> bytes:
-    return full(b"ipma", 0, struct.pack(">I", count) + associations)
 
 
 def box(kind: bytes, body: bytes) -> bytes:

@@ -25,7 +25,7 @@ import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite.base import LiteBase
-from spackle.bases.open import AUTO, KINDS, BaseError, BaseSettings, Choice, open_base
+from spackle.bases.open import KINDS, BaseError, BaseSettings, Choice, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
@@ -312,19 +312,6 @@ def test_what_fails_for_one_photo_is_tried_for_the_next(
         with pytest.raises(InputError, match=rf"{name}\.png") as caught:
             pick(tmp_path / f"{name}.png", name="sharp")
         assert not isinstance(caught.value, BaseError)
-
-
-def test_weights_that_change_before_they_are_read_stop_the_run(
-    photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def change(path: Path, **options: Any) -> StandIn:
-        sharp.write_bytes(sharp.read_bytes() + b"more")
-        return StandIn("sharp")
-
-    monkeypatch.setattr(SharpBase, "load", change)
-    for name in (AUTO, "sharp"):
-        with pytest.raises(BaseError, match="changed while this was running"):
-            pick(photo, name=name)
 
 
 # What is named never gives way to another.

@@ -248,12 +248,6 @@ def test_disparity_beyond_the_horizon_is_far_not_unknown(tmp_path: Path) -> None
     assert torch.equal(depth.valid, depth.depth > 0)
 
 
-def test_the_step_is_that_of_the_values_in_use(tmp_path: Path) -> None:
-    coarse = codes() // 4 * 4
-    for data in (portraits.heic(coarse, apple_xmp()), portraits.gdepth_jpeg(png(coarse), Range(1 / 3, 2))):
-        assert found(tmp_path, data).quantum == pytest.approx(4 * 2.5 / 255)
-
-
 # Upright, as the photo is.
 
 
