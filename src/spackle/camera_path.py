@@ -26,7 +26,7 @@ MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
 MAX_ZOOM = 0.15  # forward motion of rotate_forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
-UP = (0.0, -1.0, 0.0)  # where nobody says otherwise: the photo's
+UP = (0.0, -1.0, 0.0)  # by default the photo's
 SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
 LEAST_STEP = 1e-6  # seconds between two keys
 STILL = 1e-100  # slopes below it are none; their inverse would overflow

@@ -19,7 +19,7 @@ def reason_in_a_line(error: object) -> str:
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
-    """InputError for a name that there is not, with the nearest one."""
+    """Raise InputError for an unknown name, and name the nearest known one."""
     names = list(known)
     if name in names:
         return

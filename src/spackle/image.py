@@ -104,7 +104,7 @@ def focal_length(
     focal_mm: float | None,
     fov: float | None,
 ) -> tuple[float, str]:
-    """In pixels, and who said so: a person as `load_photo` has it, else the EXIF tags, else nobody.
+    """The focal length in pixels and its source: an option as `load_photo` takes it, else EXIF, else a default lens.
 
     Raises:
         InputError: a senseless one; `path` names the photo in the message.
@@ -289,7 +289,7 @@ def _to_rgb(image: Image.Image, path: str | os.PathLike[str]) -> Tensor:
 
 
 def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert from an embedded colour profile; a broken or unfitting one is passed over."""
+    """Convert from an embedded colour profile; ignores a broken or unfitting one."""
     if not profile:
         return image
     try:

@@ -43,7 +43,7 @@ class VideoFormat:
 
     @property
     def loop(self) -> int:
-        """How often a file plays where nobody says so."""
+        """How often a file plays by default."""
         return 0 if self.counts else 1
 
 

@@ -16,10 +16,10 @@ LOG = logging.getLogger("spackle")
 
 
 def get_renderer(device: str = "auto") -> Renderer:
-    """The renderer for a device: "cpu", "cuda", or "auto" for the best one that there is.
+    """The renderer for a device: "cpu", "cuda", or "auto" for the best one on this machine.
 
     Raises:
-        InputError: where there is no such device, or its renderer cannot be had.
+        InputError: an unknown device, or a renderer that cannot run here.
     """
     if device == "cuda":
         return GsplatRenderer()
