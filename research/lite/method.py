@@ -14,11 +14,12 @@ from depth_loss import MEASURES, DepthJudge
 from frames import Frame
 from mixture import DepthBatch, Mixture
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 from weights import save_networks
 
 from spackle.bases.lite.network import LiteNet
 from spackle.formats import atomic_path
+from spackle.formats.png import thumbnail
 from spackle.training.method import PICTURED, Method
 from spackle.training.ranks import Ranks
 from spackle.training.trainer import samples_of_step
@@ -54,16 +55,9 @@ def ends(values: Tensor) -> tuple[float, float]:
 
 def sheet(rows: Sequence[Sequence[Tensor]], side: int) -> Tensor:
     """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` long; narrower rows are black at their end."""
-    shown = [torch.cat([_at_most(picture, side) for picture in row], dim=1) for row in rows]
+    shown = [torch.cat([thumbnail(picture, side) for picture in row], dim=1) for row in rows]
     widest = max(row.shape[1] for row in shown)
     return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1])) for row in shown])
-
-
-def _at_most(picture: Tensor, side: int) -> Tensor:
-    height, width = picture.shape[:2]
-    scale = min(1.0, side / max(height, width))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
-    return interpolate(picture.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
 
 
 class Prefetch(Generic[K, V]):

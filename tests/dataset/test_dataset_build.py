@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import resource
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -26,7 +24,7 @@ from PIL import Image
 from scenes import psnr
 from sharp_weights import write_tiny
 
-from spackle.dataset import DatasetFiles, ViewDataset
+from spackle.dataset import ViewDataset
 from spackle.dataset import build as building
 from spackle.dataset.maker import Job, Made, Maker, _results
 from spackle.dataset.photos import choose, find_photos
@@ -44,7 +42,6 @@ from spackle.training.sources import PseudoViews
 def test_a_build_leaves_shards_and_a_manifest(whole: Path) -> None:
     assert names_in(whole) == {"manifest.json", "shard-000000.tar", "shard-000001.tar", "shard-000002.tar"}
     manifest = load_manifest(whole)
-    assert manifest.complete
     assert [sample.photo for _, sample in manifest.samples] == ["0.png", "2.png", "3.png", "4.png", "deep/1.png"]
     assert [len(shard.samples) for shard in manifest.shards] == [2, 2, 1]
     assert manifest.views == 5 * VIEWS
@@ -56,13 +53,10 @@ def test_a_build_leaves_shards_and_a_manifest(whole: Path) -> None:
             assert hashlib.sha256(part).hexdigest() == sample.sha256
             assert sample.holes[0] == 0
             assert max(sample.holes) > 0.02
-    for stage in ("load", "base", "render", "inpaint", "encode", "write"):
-        assert re.search(rf"{stage} \d+\.\d\d", (whole.parent / "said").read_text())
 
 
 def test_two_workers_make_the_same_bytes_as_one(whole: Path, place: Path, tmp_path: Path) -> None:
-    done = build(place, tmp_path / "two", "--workers", 2)
-    assert done.code == 0, done.err
+    assert build(place, tmp_path / "two", "--workers", 2).code == 0
     assert content(tmp_path / "two") == content(whole)
 
 
@@ -86,44 +80,42 @@ def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(
     with pytest.raises(InputError, match="not finished"):
         ViewDataset(out)
     (out / "parts" / f".000003.{'0' * 12}.tar").write_bytes(b"half")
-    done = build(place, out)
-    assert done.code == 0, done.err
-    assert f"{out}: going on" in done.err
+    assert build(place, out).code == 0
     assert content(out) == content(whole)
 
 
-def test_workers_end_with_a_killed_build(whole: Path, place: Path, tmp_path: Path) -> None:
-    out, note = tmp_path / "out", tmp_path / "children"
+@pytest.mark.parametrize("more", [(), pytest.param(("--ray", "local"), marks=pytest.mark.slow)])
+def test_workers_end_with_a_killed_build(whole: Path, place: Path, tmp_path: Path, more: tuple[str, ...]) -> None:
+    out, note = tmp_path / "out", tmp_path / "processes"
+    if more:
+        pytest.importorskip("ray")
     patch = f"""
 def dying(*arguments):
     with open({str(note)!r}, "w") as file:
-        file.write(" ".join(str(child.pid) for child in multiprocessing.active_children()))
+        subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
     die()
 build._Build._note = dying"""
-    assert dying_build(tmp_path / "script.py", patch, place, out, "--workers", 2).wait() == -signal.SIGKILL
-    children = [int(pid) for pid in note.read_text().split()]
-    assert len(children) == 2
-    deadline = time.monotonic() + 20
-    while any(is_alive(pid) for pid in children):
+    process = dying_build(tmp_path / "script.py", patch, place, out, "--workers", 2, *more)
+    assert process.wait() == -signal.SIGKILL
+    # Ray's own agents take a minute.
+    pids = [pid for pid, args in below(process.pid, note.read_text()) if "agent" not in args.lower()]
+    assert len(pids) >= (4 if more else 2)  # two workers, and at least two that Ray consists of
+    deadline = time.monotonic() + 30
+    while any(is_alive(pid) for pid in pids):
         assert time.monotonic() < deadline, "a worker goes on without its main process"
         time.sleep(0.05)
     assert build(place, out).code == 0
     assert content(out) == content(whole)
 
 
-def test_few_photos_wait_for_a_worker_at_a_time_and_one_that_dies_is_a_line() -> None:
-    asked: list[int] = []
+def below(top: int, listing: str) -> list[tuple[int, str]]:
+    """Number and command of every process that a process has started, or one of those, by what ps says."""
+    rows = [line.split(None, 2) for line in listing.splitlines()]
+    own = [(int(pid), args) for pid, parent, args in rows if int(parent) == top and not args.startswith("ps ")]
+    return own + [row for pid, _ in own for row in below(pid, listing)]
 
-    def futures() -> Iterator[Future[Made]]:
-        for number in range(20):
-            asked.append(number)
-            future: Future[Made] = Future()
-            future.set_result(Made(number, {}, None))
-            yield future
 
-    for given, _ in enumerate(_results(futures(), 4)):
-        assert len(asked) <= given + 4
-    assert asked == list(range(20))
+def test_a_worker_that_dies_is_a_line() -> None:
     dead: Future[Made] = Future()
     dead.set_exception(BrokenProcessPool("gone"))
     with pytest.raises(InputError, match="a worker process died"):
@@ -141,9 +133,7 @@ def test_ctrl_c_ends_after_the_photo_at_work(
 
     with monkeypatch.context() as patch:
         patch.setattr(Maker, "make", interrupted)
-        done = build(place, tmp_path / "out")
-    assert done.code == 130
-    assert "stopped; the same command goes on from here" in done.lines
+        assert build(place, tmp_path / "out").code == 130
     assert build(place, tmp_path / "out").code == 0
     assert content(tmp_path / "out") == content(whole)
 
@@ -201,38 +191,36 @@ def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     assert done.code == 0, done.err
     manifest = load_manifest(tmp_path / "out")
     assert [sample.photo for _, sample in manifest.samples] == ["grey.png", "moving.gif", "one.png"]
-    passed = [line for line in done.lines if line.startswith("passed over: ")]
-    assert len(passed) == 5
-    for words in ("tiny.png: 8×8 pixels", "cut.png: cannot be decoded", "empty.jpg: the file is empty"):
-        assert any(words in line for line in passed)
-    assert any("two.png: the same photo as one.png" in line for line in passed)
-    assert any("cmyk.jpg: no depth map" in line for line in passed)
+    assert sum(line.startswith("passed over: ") for line in done.lines) == 5
+    for words in (
+        "tiny.png: 8×8 pixels",
+        "cut.png: ",
+        "empty.jpg: ",
+        "two.png: the same photo as one.png",
+        "cmyk.jpg: ",
+    ):
+        assert words in done.err
     (entry,) = [line for shard in manifest.shards for line in shard.passed_over]
     assert entry.startswith("cmyk.jpg: no depth map in --depth: ")
 
 
 def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
-    file = place / "photos" / "coco.json"
+    file = shutil.copytree(place / "photos", tmp_path / "photos") / "coco.json"
     names = ["4.png", "gone.jpg", "0.png", "lost.jpg", "4.png"]
     file.write_text(json.dumps({"images": [{"file_name": name, "id": 1} for name in names]}))
-    try:
-        options = ["--depth", place / "depth", *SHORT, "--views", 2, "-o"]
-        done = run("dataset", "build", "--photos", file, *options, tmp_path / "out")
-        assert done.code == 0, done.err
-        assert f"2 images that {file} names are not in {place}/photos: gone.jpg, lost.jpg" in done.lines
-        assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["0.png", "4.png"]
-        moved = shutil.move(file, tmp_path / "coco.json")
-        done = run("dataset", "build", "--photos", moved, "--images", place / "photos", *options, tmp_path / "out")
-        assert done.code == 0, done.err
-    finally:
-        file.unlink(missing_ok=True)
+    options = ["--depth", place / "depth", *SHORT, "--views", 2, "-o", tmp_path / "out"]
+    done = run("dataset", "build", "--photos", file, *options)
+    assert done.code == 0, done.err
+    assert "gone.jpg, lost.jpg" in done.err
+    assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["0.png", "4.png"]
+    moved = shutil.move(file, tmp_path / "coco.json")
+    assert run("dataset", "build", "--photos", moved, "--images", place / "photos", *options).code == 0
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "no json", "[]", '{"images": []}', '{"images": [{}]}', '{"images": [{"file_name": "../a.png"}]}',
-     '{"images": [{"file_name": 3}]}', '{"images": [{"file_name": "/etc/passwd"}]}',
-     '{"images": [{"file_name": "no.jpg"}]}'],
+    ["", "[]", '{"images": []}', '{"images": [{}]}', '{"images": [{"file_name": "../a.png"}]}',
+     '{"images": [{"file_name": "/etc/passwd"}]}', '{"images": [{"file_name": "no.jpg"}]}'],
 )  # fmt: skip
 def test_bad_annotations_are_a_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "coco.json").write_text(text)
@@ -247,15 +235,10 @@ def test_a_subset_depends_on_the_seed_alone(place: Path, monkeypatch: pytest.Mon
         return [photo.name for photo in chosen]
 
     before = subset(3, 0)
-    assert len(before) == 3
     assert before == sorted(before)
     assert len({tuple(subset(2, seed)) for seed in range(6)}) > 1
-    walk = os.walk
-
-    def backwards(top: Path) -> object:
-        return ((folder, folders, files[::-1]) for folder, folders, files in walk(top))
-
-    monkeypatch.setattr(os, "walk", backwards)
+    listed = list(os.walk(place / "photos"))
+    monkeypatch.setattr(os, "walk", lambda top: ((folder, folders, files[::-1]) for folder, folders, files in listed))
     assert subset(3, 0) == before
     assert len(subset(None, 0)) == 5
     with pytest.raises(InputError, match="--sample asks for 6"):
@@ -263,14 +246,12 @@ def test_a_subset_depends_on_the_seed_alone(place: Path, monkeypatch: pytest.Mon
 
 
 def test_no_photos_is_a_line(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "depth").mkdir()
-    assert "no photos in this folder" in build(tmp_path, tmp_path / "out").err
+    for folder in ("photos", "depth"):
+        (tmp_path / folder).mkdir()
+    refused(build(tmp_path, tmp_path / "out"), "no photos in this folder")
     (tmp_path / "photos" / "a.png").write_bytes(b"no")
     assert "none of 1 photos can be used" in build(tmp_path, tmp_path / "out").lines[-1]
-    write_inputs(tmp_path, 1)
-    shutil.rmtree(tmp_path / "depth")
-    (tmp_path / "depth").mkdir()
+    Image.fromarray(picture(72, 54)).save(tmp_path / "photos" / "0.png")
     for _ in range(2):  # nothing stays of the first, and the second says why again
         done = build(tmp_path, tmp_path / "out")
         assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
@@ -284,14 +265,10 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--views", 1), "--views"), (("--views", 101), "--views"), (("--workers", 0), "--workers"),
-        (("--threads", 0), "--threads"), (("--shard-size", 0), "--shard-size"), (("--sample", 0), "--sample"),
-        (("--seed", -1), "--seed"), (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"),
-        (("--disparity", 0, 0.1), "--disparity 0 0.1"), (("--disparity", 0.1, 9), "--disparity 0.1 9"),
-        (("--trajectory", "loop"), "'loop' is not one of"), (("--base", "none"), "--base none"),
-        (("--base", "auto"), "--base auto"), (("--base", "sharp"), "--depth"),
-        (("--depth", "nowhere"), "--depth nowhere: no such folder"),
-        (("--depth", __file__), f"--depth {__file__}: no such folder"),
+        (("--views", 101), "--views"), (("--shard-size", 0), "--shard-size"), (("--seed", -1), "--seed"),
+        (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"), (("--disparity", 0.1, 9), "--disparity 0.1 9"),
+        (("--trajectory", "loop"), "'loop' is not one of"), (("--base", "auto"), "--base auto"),
+        (("--base", "sharp"), "--depth"), (("--depth", __file__), f"--depth {__file__}: no such folder"),
         (("--inpainter", "lama"), "--inpainter lama"), (("--inpainter", "propainter"), "--inpainter propainter"),
         (("--inpainter", "geometry", "--inpainter-weights", "w"), "the geometry inpainter has no network"),
         (("--inpainter", "opencv", "--inpainter-side", 320), "the opencv inpainter has no network"),
@@ -305,55 +282,37 @@ def test_bad_options_are_a_line_and_leave_nothing(
     assert not (tmp_path / "out").exists()
 
 
-def test_more_photos_than_there_are_keys_are_a_line(
+def test_too_many_photos_and_a_missing_package_are_a_line(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(building, "MAX_PHOTOS", 4)
-    refused(build(place, tmp_path / "out"), "5 photos are too many for a dataset (at most 4): give --sample")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_missing_package_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for package, options in (("cv2", ("--inpainter", "opencv")), ("ray", ("--ray", "local"))):
+    with monkeypatch.context() as patch:
+        patch.setattr(building, "MAX_PHOTOS", 4)
+        refused(build(place, tmp_path / "out"), "5 photos are too many for a dataset (at most 4): give --sample")
+    for package, extra, option, name in (("cv2", "opencv", "--inpainter", "opencv"), ("ray", "ray", "--ray", "local")):
         monkeypatch.setitem(sys.modules, package, None)
-        extra = "opencv" if package == "cv2" else package
-        refused(build(place, tmp_path / "out", *options), f"pip install 'spackle-nvs[{extra}]'")
+        refused(build(place, tmp_path / "out", option, name), f"pip install 'spackle-nvs[{extra}]'")
     assert not (tmp_path / "out").exists()
 
 
-def test_another_configuration_is_refused_and_the_difference_shown(place: Path, copy: Path) -> None:
+def test_another_configuration_and_a_folder_in_which_a_build_is_at_work_are_refused(place: Path, copy: Path) -> None:
     before = content(copy)
     done = build(place, copy, "--inpainter", "none", "--disparity", "0.2", "0.3")
     refused(done, 'inpainter.name: "geometry" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
     assert content(copy) == before
+    with hold(copy / ".lock"):
+        refused(build(place, copy), "another build is at work")
 
 
-def test_a_folder_in_which_a_build_is_at_work_is_refused(place: Path, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    with hold(tmp_path / "out" / ".lock"):
-        done = build(place, tmp_path / "out")
-    assert done.code == 2
-    assert "another build is at work" in done.err
-
-
-def test_sharp_needs_no_depth(tmp_path: Path) -> None:
+def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -> None:
     write_inputs(tmp_path, 1, 64, 48)
     weights = write_tiny(tmp_path / "tiny.safetensors")
     options = ["--base", "sharp", "-c", weights, "--views", 2, "--inpainter", "none", "-o", tmp_path / "out"]
-    done = run("dataset", "build", "--photos", tmp_path / "photos", *options)
-    assert done.code == 0, done.err
-    config = load_manifest(tmp_path / "out").config
-    assert config["base"]["name"] == "sharp"
-    assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
-
-
-def test_info_spells_the_path_as_the_option_does(tmp_path: Path) -> None:
-    write_inputs(tmp_path, count=1)
     for spelling in ("rotate_forward", "rotate-forward"):  # the same build, which is done the second time
-        done = build(tmp_path, tmp_path / "out", "--trajectory", spelling, "--inpainter", "none")
+        done = run("dataset", "build", "--photos", tmp_path / "photos", *options, "--trajectory", spelling)
         assert done.code == 0, done.err
-    assert '"trajectory": "rotate-forward"' in run("dataset", "info", tmp_path / "out").out
-    assert DatasetFiles(tmp_path / "out").group(0).facts["trajectory"]["kind"] == "rotate_forward"  # as Python has it
+    config = load_manifest(tmp_path / "out").config
+    assert (config["base"]["name"], config["views"]["trajectory"]) == ("sharp", "rotate-forward")
+    assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
 
 
 # As a source of training -------------------------------------------------------------------------
@@ -379,25 +338,20 @@ def test_a_sample_of_a_dataset_is_one_of_its_views(whole: Path) -> None:
     sample, again = (source.view(np.random.default_rng(3)) for _ in range(2))
     assert torch.equal(sample.target, again.target)
     assert bool(sample.hole.any())
-    assert bool(sample.valid.all())
     drawn = get_renderer().render(sample.base, sample.camera)
     assert psnr(drawn.rgb, sample.rendering.rgb) > 55
-    views = [view for view in ViewDataset(whole) if torch.equal(view.target, sample.target)]
-    assert len(views) == 1
-    assert torch.equal(views[0].mask, sample.hole)
+    (view,) = [view for view in ViewDataset(whole) if torch.equal(view.target, sample.target)]
+    assert torch.equal(view.mask, sample.hole)
 
 
 def test_a_dataset_that_teaches_nothing_is_refused_and_others_are_told_apart(
     whole: Path, place: Path, tmp_path: Path
 ) -> None:
-    options = ("--inpainter", "none", "--sample", 1, "--views", 2)
-    assert build(place, tmp_path / "out", *options).code == 0
+    options = ("--sample", 1, "--views", 2)
+    assert build(place, tmp_path / "none", *options, "--inpainter", "none").code == 0
     with pytest.raises(InputError, match="--inpainter none"):
-        PseudoViews(tmp_path / "out")
-    with pytest.raises(InputError, match="not there"):
-        PseudoViews(tmp_path)
-    assert build(place, tmp_path / "other", *options[2:]).code == 0
-    shutil.copytree(whole, tmp_path / "whole")
-    supplies = [Supply.of(DataRecipe(pseudo=at), get_renderer()) for at in (whole, tmp_path / "whole")]
-    assert supplies[0].digest == supplies[1].digest
-    assert Supply.of(DataRecipe(pseudo=tmp_path / "other"), get_renderer()).digest != supplies[0].digest
+        PseudoViews(tmp_path / "none")
+    assert build(place, tmp_path / "other", *options).code == 0
+    places = whole, shutil.copytree(whole, tmp_path / "copy"), tmp_path / "other"
+    one, same, other = (Supply.of(DataRecipe(pseudo=at), get_renderer()).digest for at in places)
+    assert one == same != other

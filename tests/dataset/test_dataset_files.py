@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
+import os
 import sys
 import tarfile
 from pathlib import Path
@@ -20,15 +20,15 @@ from torch.utils.data import DataLoader
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
-from spackle.dataset.encode import (
+from spackle.dataset.sample import (
+    END,
     decode_alpha,
     decode_depth,
     decode_gaussians,
     encode_alpha,
     encode_depth,
     encode_gaussians,
-)  # fmt: skip
-from spackle.dataset.sample import END, pack, unpack
+)
 from spackle.dataset.shards import load_manifest
 from spackle.dataset.views import APART, PathChoice, ViewChoices, draw_path, path_cameras
 from spackle.errors import InputError
@@ -43,13 +43,10 @@ from spackle.residual import hole_mask
 def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
     with tarfile.open(whole / "shard-000000.tar") as archive:
         members = archive.getmembers()
-    names = [member.name for member in members]
-    keys = [name.partition(".")[0] for name in names]
-    assert keys == sorted(keys)
-    assert set(keys) == {"000000", "000001"}
-    assert names[:3] == ["000000.json", "000000.photo.png", "000000.base.safetensors"]
     kinds = ("rgb", "target", "mask", "alpha", "depth")
-    assert set(names[3:]) >= {f"000000.{index:02d}.{kind}.png" for index in range(VIEWS) for kind in kinds}
+    pictures = [f"{index:02d}.{kind}.png" for index in range(VIEWS) for kind in kinds]
+    names = ["json", "photo.png", "base.safetensors", *pictures]
+    assert [member.name for member in members] == [f"{key}.{name}" for key in ("000000", "000001") for name in names]
     assert {(m.mtime, m.uid, m.gid, m.uname, m.mode) for m in members} == {(0, 0, 0, "", 0o644)}
     webdataset = pytest.importorskip("webdataset")
     shards = [str(path) for path in sorted(whole.glob("*.tar"))]
@@ -60,34 +57,30 @@ def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
         assert {f"{own.key}.{n}": data for n, data in group.items() if not n.startswith("__")} == dict(own.files)
 
 
-def test_the_files_say_what_the_paper_asks_for(whole: Path) -> None:
-    group = DatasetFiles(whole).group(4)
+def test_what_is_read_is_what_was_drawn_and_what_the_paper_asks_for(whole: Path, place: Path) -> None:
+    group = DatasetFiles(whole).group(0)
     facts = group.facts
-    assert facts["photo"]["name"] == "deep/1.png"
+    assert facts["photo"]["name"] == "0.png"
     assert facts["trajectory"]["kind"] in TRAJECTORIES
     assert 0.1 <= facts["trajectory"]["disparity"] <= 0.6
     assert facts["inpainter"]["name"] == "geometry"
-    assert facts["base"]["gaussians"] == len(group.base())
     for index, view in enumerate(facts["views"]):
         assert view.keys() >= {"K", "world_to_camera", "position", "width", "height", "depth_range", "hole"}
-        with Image.open(io.BytesIO(group.files[f"{group.key}.{index:02d}.mask.png"])) as mask:
-            assert set(np.unique(np.array(mask))) <= {0, 255}
-            assert float((np.array(mask) == 255).mean()) == view["hole"]
-
-
-def test_what_is_read_is_what_was_drawn(whole: Path, place: Path) -> None:
-    group = DatasetFiles(whole).group(0)
-    for index in range(group.views):
         sample = group.view(index, with_base=True)
-        assert sample.base is not None
+        assert isinstance(sample.base, Gaussians)
+        assert len(sample.base) == facts["base"]["gaussians"]
         drawn = get_renderer().render(sample.base, sample.camera)
         assert psnr(drawn.rgb, sample.rendering.rgb) > 55
         assert float((drawn.alpha - sample.rendering.alpha).abs().max()) < 0.01
         assert torch.equal(sample.mask, hole_mask(sample.rendering.alpha))
+        assert float(sample.mask.double().mean()) == view["hole"]
         assert torch.equal(sample.target[~sample.mask], sample.rendering.rgb[~sample.mask])
         if bool(sample.mask.any()):  # no hole is left black
             assert float(sample.target[sample.mask].amax(-1).min()) > 0.2
+        with Image.open(io.BytesIO(group.files[f"{group.key}.{index:02d}.mask.png"])) as mask:
+            assert torch.equal(torch.from_numpy(np.array(mask)), sample.mask * torch.tensor(255, dtype=torch.uint8))
     first = group.view(0)
+    assert first.base is None
     assert first.camera.world_to_camera.tolist() == torch.eye(4).tolist()
     stored = torch.from_numpy(np.array(Image.open(place / "photos" / "0.png"))).float() / 255
     assert torch.equal(first.photo, stored)
@@ -112,30 +105,27 @@ def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
 
 
 def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) -> None:
-    whole = (copy / "shard-000000.tar").read_bytes()
-    (copy / "shard-000000.tar").write_bytes(whole[: len(whole) // 2])
-    (copy / "shard-000001.tar").unlink()
-    (copy / "shard-000002.tar").write_bytes((copy / "shard-000002.tar").read_bytes() + b"x")
+    first, second, third = (copy / f"shard-00000{number}.tar" for number in range(3))
+    os.truncate(first, first.stat().st_size // 2)
+    second.unlink()
+    os.truncate(third, third.stat().st_size + 1)
     done = run("dataset", "verify", copy)
     assert done.code == 1
     for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: not there", "bytes instead of"):
         assert words in done.err
     with pytest.raises(InputError, match="000001"):
         list(ViewDataset(copy))
-    text = (copy / "manifest.json").read_text()
-    (copy / "manifest.json").write_text(text.replace('"0.png"', '"9.png"'))
-    refused(run("dataset", "verify", copy), "manifest.json")
-    refused(run("dataset", "info", copy / "nothing"), "manifest.json: not there")
-    (copy / "manifest.json").unlink()
-    (copy / "manifest.json").mkdir()
-    refused(run("dataset", "info", copy), f"{copy}/manifest.json: cannot be read: Is a directory")
+    manifest = copy / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"0.png"', '"9.png"'))
+    refused(run("dataset", "verify", copy), f"{manifest}: damaged")
+    manifest.unlink()
+    refused(run("dataset", "info", copy), f"{manifest}: not there")
+    manifest.mkdir()
+    refused(run("dataset", "info", copy), f"{manifest}: cannot be read: Is a directory")
 
 
 def test_info_and_preview(whole: Path, tmp_path: Path) -> None:
-    done = run("dataset", "info", whole)
-    assert done.code == 0
-    assert f"5 photos, {5 * VIEWS} views, 3 shards" in done.out
-    assert "holes of each view: 0.0%" in done.out
+    assert f"5 photos, {5 * VIEWS} views, 3 shards" in run("dataset", "info", whole).out
     done = run("dataset", "preview", whole, "-o", tmp_path / "look", "--photos", 2, "--views", 3)
     assert done.code == 0, done.err
     assert names_in(tmp_path / "look") == {"sheet.png", "trajectory.mp4"}
@@ -151,16 +141,14 @@ def names_of(samples: list[DatasetView]) -> list[tuple[str, int]]:
 
 
 def test_ranks_and_workers_read_every_view_once(whole: Path) -> None:
-    every = {(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)}
-    assert names_of(list(ViewDataset(whole))) == sorted(every)
+    every = [(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)]
+    assert names_of(list(ViewDataset(whole))) == every
     for shuffle in (0, 7):
         for ranks in (1, 2, 3, 7):
             parts = [list(ViewDataset(whole, shuffle=shuffle, rank=r, ranks=ranks)) for r in range(ranks)]
-            seen = [name for part in parts for name in names_of(part)]
-            assert len(seen) == len(every)
-            assert set(seen) == every
+            assert sorted(name for part in parts for name in names_of(part)) == every
     loaders = [DataLoader(ViewDataset(whole, rank=r, ranks=2), batch_size=None, num_workers=2) for r in range(2)]
-    assert sorted(name for loader in loaders for name in names_of(list(loader))) == sorted(every)
+    assert sorted(name for loader in loaders for name in names_of(list(loader))) == every
     with pytest.raises(ValueError, match="rank"):
         ViewDataset(whole, rank=2, ranks=2)
 
@@ -173,15 +161,6 @@ def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: Pat
 
     assert order(0, 0) == order(0, 0)
     assert len({tuple(order(seed, epoch)) for seed in (0, 1) for epoch in (0, 1)}) == 4
-
-
-def test_samples_are_values_of_the_house(whole: Path) -> None:
-    sample = next(iter(ViewDataset(whole, with_base=True)))
-    assert isinstance(sample.camera, Camera)
-    assert isinstance(sample.base, Gaussians)
-    assert sample.rendering.rgb.shape == sample.target.shape == (54, 72, 3)
-    assert sample.mask.dtype == torch.bool
-    assert next(iter(ViewDataset(whole))).base is None
 
 
 def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,21 +179,20 @@ def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(whole: Path, monk
 
 
 @pytest.mark.parametrize("kind", TRAJECTORIES)
-@pytest.mark.parametrize("views", [2, 3, 5, 19, 20])
+@pytest.mark.parametrize("views", [2, 3, 20])
 def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind, views: int) -> None:
     camera = Camera.from_focal(80.0, 96, 72)
     cameras = path_cameras(PathChoice(kind, 0.4), camera, DepthRange(2.0, 3.0), views)
     assert len(cameras) == views
     assert cameras[0] is camera
     eyes = torch.stack([view.position.double() for view in cameras])
-    apart = torch.cdist(eyes, eyes) + torch.eye(views)
-    assert float(apart.min()) > APART
+    assert float(torch.nn.functional.pdist(eyes).min()) > APART
     with pytest.raises(ValueError, match="different views"):
         path_cameras(PathChoice(kind, 0.0), camera, DepthRange(2.0, 3.0), views)
 
 
 def test_a_photos_path_depends_on_the_photo_and_the_seed() -> None:
-    drawn = [draw_path(ViewChoices(), hashlib.sha256(bytes([n])).hexdigest()) for n in range(40)]
+    drawn = [draw_path(ViewChoices(), str(number)) for number in range(40)]
     assert {path.kind for path in drawn} == set(TRAJECTORIES)
     assert all(0.1 <= path.disparity <= 0.6 for path in drawn)
     path = draw_path(ViewChoices(), "ab")
@@ -256,11 +234,3 @@ def test_gaussians_come_back_and_look_the_same() -> None:
     assert len(decode_gaussians(encode_gaussians(Gaussians.empty()))) == 0
     with pytest.raises(ValueError, match="no Gaussians"):
         decode_gaussians(b"nothing")
-
-
-def test_archives_come_back_and_follow_one_another() -> None:
-    one, other = [("a.txt", b"1" * 600), ("a.png", b"")], [("b.txt", b"2" * 512)]
-    assert unpack(pack(one)) == dict(one)
-    assert unpack(pack(one) + pack(other) + END) == dict(one + other)
-    with pytest.raises(ValueError, match="archive"):
-        unpack(b"nothing" * 100)

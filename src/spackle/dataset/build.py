@@ -19,7 +19,7 @@ from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
-NAMED = 5  # missing files that are spelled out
+NAMED = 5  # missing files that the log names
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
@@ -29,7 +29,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         source: a folder of photos, or COCO annotations.
         output: a folder for manifest and shards.
         options: everything else.
-        reporter: logs what is passed over, and at the end how long each stage took.
+        reporter: logs the photos that give no sample, and at the end the time of each stage.
 
     Returns:
         "complete", or "stopped" where Ctrl-C came.
@@ -38,7 +38,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
         InputError: options, photos or folders that cannot be used; another dataset in `output`.
     """
     options.check()
-    inpainter = Maker.of(options, output).inpainter  # what cannot be is refused before long work
+    inpainter = Maker.of(options, output).inpainter  # fails before long work
     if inpainter.notice:
         reporter.say(inpainter.notice)
     with cluster(options) as ray:
@@ -52,8 +52,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
 def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[PhotoFile]:
     found = find_photos(source, options.images)
     if found.missing:
-        more = len(found.missing) - NAMED
-        names = ", ".join(found.missing[:NAMED]) + (f" and {more} more" if more > 0 else "")
+        names = ", ".join((*found.missing[:NAMED], *(["…"] if len(found.missing) > NAMED else [])))
         reporter.say(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
     if options.sample is None and len(found.names) > MAX_PHOTOS:
         raise InputError(
@@ -65,7 +64,7 @@ def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[P
 
 
 def _begin(output: Path, config: dict[str, Any]) -> Manifest:
-    """The manifest to go on from, a new one where there is none; InputError where it is of another dataset."""
+    """The manifest of an earlier run, or a new one; InputError for that of another dataset."""
     new = Manifest(config, (), complete=False)
     if not (output / NAME).exists():
         new.save(output)
@@ -85,7 +84,8 @@ class _Build:
     ) -> None:
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
         self.config, size = manifest.config, options.shard_size
-        self.shards = {int(shard.file[6:-4]): shard for shard in manifest.shards if shard.lies_in(output)}
+        here = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
+        self.shards = {int(s.file[6:-4]): s for s in manifest.shards if here.get(s.file) == s.size}
         self.problems: dict[int, str] = {}  # of photos that give no sample
         self.seconds: Seconds = dict.fromkeys(STAGES, 0.0)
         self.jobs = [
@@ -93,48 +93,46 @@ class _Build:
             for index, photo in enumerate(photos)
             if index // size not in self.shards and not part_file(output, index).is_file()
         ]
-        missing = range(-(-len(photos) // size))
-        self.waiting: dict[int, set[int]] = {n: set() for n in missing if n not in self.shards}  # shards for photos
+        self.waiting: dict[int, set[int]] = {  # photos that a shard lacks
+            index // size: set() for index in range(len(photos)) if index // size not in self.shards
+        }
         for index, _ in self.jobs:
             self.waiting[index // size].add(index)
 
     def run(self, ray: Any) -> str:
         """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
-        ready, made = len(self.photos) - len(self.jobs), 0
-        if ready:
+        if ready := len(self.photos) - len(self.jobs):
             self.reporter.say(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
         with self.reporter.stage("photos", {}) as step, asked_to_stop(alone=True) as stop:
             self._write_ready()
             if not self.jobs:
-                return self._finish(0, 0.0)
+                return self._finish(0.0)
             total: Seconds = {}
             work = (self.options, self.output, self.jobs)
             workers = at_work(*work) if ray is None else at_work_on_ray(ray, *work, self.reporter.say)
             with timed("wall", total), workers as results:
-                for result in results:
-                    made += self._note(result)
+                for done, result in enumerate(results, ready + 1):
+                    self._note(result)
                     self._write_ready()
-                    step(ready + made + len(self.problems), len(self.photos))
+                    step(done, len(self.photos))
                     if stop():
                         break
         if any(self.waiting.values()):
             self.reporter.say("stopped; the same command goes on from here")
             return "stopped"
-        return self._finish(made, total["wall"])
+        return self._finish(total["wall"])
 
-    def _note(self, result: Made) -> int:
-        """1 where a photo gave a sample, else 0."""
+    def _note(self, result: Made) -> None:
+        """Count a photo as done, and log why it gave no sample."""
         self.waiting[result.index // self.options.shard_size].discard(result.index)
         for stage, time in result.seconds.items():
             self.seconds[stage] += time
-        if result.problem is None:
-            return 1
-        self.problems[result.index] = result.problem
-        self.reporter.say(f"passed over: {result.problem}")
-        return 0
+        if result.problem is not None:
+            self.problems[result.index] = result.problem
+            self.reporter.say(f"passed over: {result.problem}")
 
     def _write_ready(self) -> None:
-        """Shards whose photos are all done: first the file, then its entry, and its parts go last."""
+        """Write shards whose photos are all done: first the file, then its entry; its parts go last."""
         size = self.options.shard_size
         for number in sorted(n for n, missing in self.waiting.items() if not missing and n not in self.shards):
             own = range(number * size, min((number + 1) * size, len(self.photos)))
@@ -150,12 +148,8 @@ class _Build:
     def _save(self, *, complete: bool) -> None:
         Manifest(self.config, tuple(self.shards[n] for n in sorted(self.shards)), complete).save(self.output)
 
-    def _finish(self, made: int, wall: float) -> str:
-        """The last manifest, and no trace of how it came to be.
-
-        Raises:
-            InputError: no photo gave a sample; then nothing stays, and the next run tries all photos again.
-        """
+    def _finish(self, wall: float) -> str:
+        """Write the last manifest and remove the rest; InputError, and nothing stays, if no photo gave a sample."""
         shards = self.shards.values()
         samples = sum(len(shard.samples) for shard in shards)
         if samples:
@@ -168,7 +162,7 @@ class _Build:
                 (self.output / name).unlink(missing_ok=True)
             why = min(line for shard in shards for line in shard.passed_over)
             raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample, such as {why}")
-        if made:
+        if made := len(self.jobs) - len(self.problems):
             stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
             self.reporter.say(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
         total = decimal(sum(shard.size for shard in shards))
@@ -176,7 +170,7 @@ class _Build:
         return "complete"
 
     def _portable(self, name: str, problem: str) -> str:
-        """What is wrong with a photo, without the folders in which it and its depth happened to lie."""
+        """What is wrong with a photo, without the folders of photos and depth maps."""
         for photo in self.photos:
             problem = problem.replace(str(photo.path), photo.name)
         depth = self.options.base.depth

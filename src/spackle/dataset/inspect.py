@@ -11,13 +11,14 @@ import torch
 from rich.console import Console
 from rich.filesize import decimal
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 
 from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import load_manifest, problems
 from spackle.errors import InputError
 from spackle.formats import save_png, save_video
+from spackle.formats.png import thumbnail
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 
@@ -30,12 +31,10 @@ def show_info(location: str, console: Console) -> None:
     """Counts, sizes, holes and configuration."""
     manifest = load_manifest(location)
     samples = manifest.samples
-    size = sum(shard.size for shard in manifest.shards)
     state = "complete" if manifest.complete else "not finished"
     lines = [f"{location}: {state}", f"{len(samples)} photos, {manifest.views} views, {len(manifest.shards)} shards"]
-    lines.append(f"{decimal(size)}, {decimal(size // max(1, len(samples)))} a photo")
-    passed = sum(len(shard.passed_over) for shard in manifest.shards)
-    if passed:
+    lines.append(f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo")
+    if passed := sum(len(shard.passed_over) for shard in manifest.shards):
         lines.append(f"{passed} photos gave no sample: manifest.json says why")
     if samples:
         holes = np.mean([sample.holes for _, sample in samples], axis=0)
@@ -54,8 +53,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
             reporter.say(f"{location}: {line}")
             count += 1
     if not count:
-        size = sum(shard.size for shard in manifest.shards)
-        reporter.say(f"{location}: {len(manifest.samples)} photos, {decimal(size)}, as they were written")
+        reporter.say(f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, as they were written")
     return count
 
 
@@ -86,27 +84,19 @@ def _spread(total: int, count: int) -> list[int]:
 
 
 def _block(group: PhotoGroup, views: int) -> Tensor:
-    """Three rows: base, mask and target; a column for each view."""
+    """Rows of base, mask and target, with a column for each view."""
     columns = []
     for index in _spread(group.views, views):
         view = group.view(index)
         mask = view.mask[..., None].expand(-1, -1, 3).float()
-        columns.append(_stack([_small(picture) for picture in (view.rendering.rgb, mask, view.target)], 0))
+        columns.append(
+            _stack([thumbnail(picture, THUMBNAIL) for picture in (view.rendering.rgb, mask, view.target)], 0)
+        )
     return _stack(columns, 1)
-
-
-def _small(picture: Tensor) -> Tensor:
-    height, width = picture.shape[:2]
-    scale = min(1.0, THUMBNAIL / max(height, width))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
-    return interpolate(picture.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
 
 
 def _stack(pictures: Sequence[Tensor], axis: int) -> Tensor:
     """Pictures in a row or column, the smaller ones filled up with white."""
     longest = max(picture.shape[1 - axis] for picture in pictures)
-    filled = []
-    for picture in pictures:
-        missing = longest - picture.shape[1 - axis]
-        filled.append(pad(picture, (0, 0, 0, missing) if axis == 0 else (0, 0, 0, 0, 0, missing), value=1.0))
-    return torch.cat(filled, dim=axis)
+    sides = (0, 0, 0) if axis == 0 else (0, 0, 0, 0, 0)
+    return torch.cat([pad(p, (*sides, longest - p.shape[1 - axis]), value=1.0) for p in pictures], dim=axis)

@@ -1,4 +1,4 @@
-"""Who makes the samples of a dataset: a photo's base, views, targets and files, in this process or several at once."""
+"""Makes the samples of a dataset: a photo's base, views, targets and files, in this process or in several."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection
@@ -20,16 +20,15 @@ from pathlib import Path
 import torch
 
 from spackle.bases.open import BaseError, OpenedBase, open_base
-from spackle.bases.protocol import BasePrediction
 from spackle.camera_path import DepthRange
 from spackle.dataset.options import DatasetOptions
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.sample import pack_sample
-from spackle.dataset.views import PathChoice, draw_path, path_cameras, render_views, scene_completion
+from spackle.dataset.views import draw_path, path_cameras, render_views, scene_completion
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
+from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 
 PARTS = "parts"  # in the output: samples that are in no shard yet
@@ -100,8 +99,14 @@ class Maker:
             photo = load_photo(file.path)
         with timed("base", seconds):
             prediction, _ = self.base.predict(photo, self.options.depth_of(file))
+        choices, base, camera = self.options.choices, prediction.gaussians, prediction.camera
         with timed("render", seconds):
-            path, stack = self._draw(file, prediction)
+            path = draw_path(choices, file.sha256)
+            try:
+                cameras = path_cameras(path, camera.even(), DepthRange.of(base), choices.views)
+            except ValueError as error:
+                raise InputError(f"{file.path}: no camera path: {error}") from error
+            stack = render_views(base, camera, cameras, self.renderer, choices.threshold)
         with timed("inpaint", seconds):
             targets = self.inpainter.complete(stack)
         with timed("encode", seconds):
@@ -109,20 +114,11 @@ class Maker:
             size = {"width": photo.width, "height": photo.height}
             facts = {
                 "photo": {"name": file.name, "sha256": file.sha256} | size | lens,
-                "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
+                "base": {"gaussians": len(base), **prediction.notes},
                 "inpainter": {"name": self.inpainter.name, "version": self.inpainter.version},
-                "threshold": self.options.choices.threshold,
+                "threshold": choices.threshold,
             }
             return pack_sample(key, resize_photo(photo).rgb, stack, targets, path, facts)
-
-    def _draw(self, file: PhotoFile, prediction: BasePrediction) -> tuple[PathChoice, ViewStack]:
-        choices, camera = self.options.choices, prediction.camera
-        path = draw_path(choices, file.sha256)
-        try:
-            cameras = path_cameras(path, camera.even(), DepthRange.of(prediction.gaussians), choices.views)
-        except ValueError as error:
-            raise InputError(f"{file.path}: no camera path: {error}") from error
-        return path, render_views(prediction.gaussians, camera, cameras, self.renderer, choices.threshold)
 
 
 def keep(output: Path, made: Made, data: bytes | None) -> Made:
@@ -161,19 +157,19 @@ def at_work(options: DatasetOptions, output: Path, jobs: Sequence[Job]) -> Itera
         return
     count = min(options.workers, len(jobs))
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(options, output))
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(options.threads,))
     try:
-        yield _results((pool.submit(_make, job) for job in jobs), IN_HAND * count)
+        yield _results((pool.submit(_make, options, output, job) for job in jobs), IN_HAND * count)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _results(futures: Iterable[Future[Made]], most: int = 1) -> Iterator[Made]:
-    """Results as they come; the next future is taken when fewer than `most` are open."""
-    left, open_ones = iter(futures), set[Future[Made]]()
+    """Results as they come, of at most `most` futures at a time."""
+    left, pending = iter(futures), set[Future[Made]]()
     try:
-        while open_ones := open_ones | set(itertools.islice(left, most - len(open_ones))):
-            done, open_ones = wait(open_ones, return_when=FIRST_COMPLETED)
+        while pending := pending | set(itertools.islice(left, most - len(pending))):
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
@@ -182,23 +178,20 @@ def _results(futures: Iterable[Future[Made]], most: int = 1) -> Iterator[Made]:
         ) from error
 
 
-_maker: Callable[[], Maker] | None = None  # of this worker process
-
-
-def _start(options: DatasetOptions, output: Path) -> None:
-    """Begin as a worker: Ctrl-C is the main process's, and without that one there is nothing to do."""
-    global _maker
+def _start(threads: int) -> None:
+    """Begin as a worker, which leaves Ctrl-C to the main process and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    torch.set_num_threads(options.threads)
-    _maker = functools.cache(lambda: Maker.of(options, output))  # what it says goes wrong belongs to a photo's result
+    torch.set_num_threads(threads)
 
 
-def _make(job: Job) -> Made:
-    assert _maker is not None
-    return _maker().make(job)
+_maker = functools.cache(Maker.of)  # of a worker process; its errors belong to a photo's result
+
+
+def _make(options: DatasetOptions, output: Path, job: Job) -> Made:
+    return _maker(options, output).make(job)
 
 
 def _end_with(sentinel: int) -> None:

@@ -1,4 +1,4 @@
-"""The choices of `spackle dataset build`, which of them cannot be, and what they are called in the manifest."""
+"""The choices of `spackle dataset build`, their checks, and their names in the manifest."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import ViewChoices
 from spackle.digest import digest_of, fingerprint, weights_digest
 from spackle.errors import InputError
-from spackle.inpaint import INPAINTERS, Inpainter
+from spackle.inpaint import Inpainter
 
 MAX_VIEWS = 100  # two digits name a view
 MAX_PHOTOS = 1_000_000  # six digits name a photo
@@ -37,11 +37,6 @@ class DatasetOptions:
     ray: str | None = None  # the cluster where they are; this machine where None
     threads: int = 2  # of each
     shard_size: int = 50  # photos
-
-    @property
-    def takes_gpu(self) -> bool:
-        """Whether a worker could use a GPU."""
-        return self.base.device != "cpu" and (self.base.kind.network or INPAINTERS[self.inpainter].network)
 
     def check(self) -> None:
         """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
@@ -87,12 +82,12 @@ class DatasetOptions:
         try:
             depth = self.depth_of(photo)
             return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
-        except InputError:  # its turn will come
+        except InputError:  # the build names it later
             return [photo.name, photo.sha256, "none"]
 
 
 def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter) -> dict[str, Any]:
-    """Everything that decides what the shards hold, ready for JSON; nothing of where files lie.
+    """Everything that decides what the shards hold, ready for JSON, without the places of files.
 
     Threads are part of it: SHARP's last bits depend on their number. Workers are not.
     """

@@ -1,4 +1,4 @@
-"""Which photos a dataset is made of: those of a folder, or those that COCO's annotations name."""
+"""The photos of a dataset: those of a folder, or those that COCO's annotations name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ MAX_JSON_BYTES = 1 << 30
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFile:
-    """A photo, and what tells it from all others."""
+    """A photo and its digest."""
 
     path: Path
     name: str  # relative to its folder, with slashes
@@ -93,18 +93,17 @@ def _named_by_coco(source: Path, folder: Path | None) -> Found:
 def choose(found: Found, count: int | None, seed: int, warn: Log, progress: Step) -> list[PhotoFile]:
     """The photos of a dataset, in the order of their names: all, or a random subset of `count`.
 
-    The subset depends on the names, the contents and the seed, not on the order in which a file system lists them.
-    What cannot be read, is too small, or repeats another photo byte for byte is passed over, which `warn` is told, and
-    in a subset the next one takes its place.
+    The subset depends on the names, the contents and the seed alone. `warn` names each photo that cannot be read, is
+    too small, or is a copy of another; in a subset the next one takes its place.
 
     Raises:
         InputError: fewer good photos than `count`, or none.
     """
     repeated = _repeated(found, warn)
-    names: Iterable[str] = (name for name in found.names if name not in repeated)
-    wanted = len(found.names) - len(repeated) if count is None else count
+    names = [name for name in found.names if name not in repeated]
+    wanted = len(names) if count is None else count
     if count is not None:
-        names = sorted(names, key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
+        names.sort(key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
     chosen: list[PhotoFile] = []
     for name in names:
         if len(chosen) == wanted:
@@ -112,9 +111,9 @@ def choose(found: Found, count: int | None, seed: int, warn: Log, progress: Step
         path = found.root / name
         try:
             photo = load_photo(path)  # from its first to its last pixel
-            if min(photo.width, photo.height) < MIN_SIDE:
-                size = f"{photo.width}×{photo.height}"
-                raise InputError(f"{path}: {size} pixels are too few (at least {MIN_SIDE} each way)")
+            width, height = photo.width, photo.height
+            if min(width, height) < MIN_SIDE:
+                raise InputError(f"{path}: {width}×{height} pixels are too few (at least {MIN_SIDE} each way)")
             chosen.append(PhotoFile(path, name, _sha256(path)))
         except InputError as error:
             warn(f"passed over: {error}")
@@ -130,18 +129,15 @@ def _repeated(found: Found, warn: Log) -> set[str]:
     """Names whose file holds the same bytes as one of an earlier name. Only files of one size are read."""
     by_size: dict[int, list[str]] = defaultdict(list)
     for name in found.names:
-        with contextlib.suppress(OSError):  # what cannot be read is found out later
+        with contextlib.suppress(OSError):  # `choose` names what cannot be read
             by_size[(found.root / name).stat().st_size].append(name)
     repeated: set[str] = set()
-    for size, names in by_size.items():
-        if len(names) == 1 or not size:  # empty ones are told as such
-            continue
-        first: dict[str, str] = {}
-        for name in names:
-            sha256 = _sha256(found.root / name)
-            if sha256 and first.setdefault(sha256, name) != name:
-                warn(f"passed over: {found.root / name}: the same photo as {first[sha256]}")
-                repeated.add(name)
+    first: dict[str, str] = {}
+    for name in (name for size, names in by_size.items() if size and len(names) > 1 for name in names):
+        sha256 = _sha256(found.root / name)
+        if sha256 and first.setdefault(sha256, name) != name:
+            warn(f"passed over: {found.root / name}: the same photo as {first[sha256]}")
+            repeated.add(name)
     return repeated
 
 

@@ -25,11 +25,12 @@ from spackle.dataset.photos import PhotoFile
 from spackle.dataset.shards import differences
 from spackle.digest import fingerprint
 from spackle.errors import InputError, reason_in_a_line
+from spackle.inpaint import INPAINTERS
 
 ANSWER_S = 30.0  # for a cluster to answer
 START_S = 600.0  # for a worker to start where there is none, on a cluster that has room for it
 RETRIES = 3  # of a photo whose worker died
-STARTING = -1  # in place of a photo's index, for a worker that died before it had one
+STARTING = -1  # in place of a photo's index, for deaths before the first photo
 
 
 @contextlib.contextmanager
@@ -57,7 +58,7 @@ def cluster(options: DatasetOptions) -> Iterator[Any]:
 
 
 def _connect(ray: Any, address: str, cpus: int) -> None:
-    """Where the cluster is our own, it gets as many processes as are asked for, as a run without Ray does."""
+    """Connect to a cluster, or start one of our own (`local`) with this number of CPUs."""
     own: dict[str, Any] = {"num_cpus": cpus, "include_dashboard": False} if address == "local" else {}
     reason = None if own else _silence(address)
     if reason is None:
@@ -79,7 +80,7 @@ def _connect(ray: Any, address: str, cpus: int) -> None:
 
 
 def _silence(address: str) -> str | None:
-    """Why nobody answers; asked in a process of its own, for Ray tries for minutes and then ends its process."""
+    """Why nobody answers, or None; a process of its own asks, as Ray tries for minutes and then ends its process."""
     code = "import ray, sys; ray.init(sys.argv[1], log_to_driver=False)"
     words = [sys.executable, "-W", "ignore", "-c", code, address]
     try:
@@ -91,7 +92,7 @@ def _silence(address: str) -> str | None:
 
 
 def _check_room(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> None:
-    """Ray would wait for room for ever; what is busy now does count, what an autoscaler could add does not."""
+    """Refuse a cluster that is too small, for which Ray would wait for ever; busy CPUs count as room."""
     alive = [node["Resources"] for node in nodes if node["Alive"]]
     cpus, gpus = options.threads, gpus_of(options, nodes)
     room = sum(int(min(has.get("CPU", 0) // cpus, has.get("GPU", 0) // gpus if gpus else 1e9)) for has in alive)
@@ -104,26 +105,24 @@ def _check_room(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> 
 
 
 def gpus_of(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> int:
-    """GPUs of a worker: one where a network would use it and any node has one, so all workers are alike."""
+    """GPUs of each worker: 1 if any node has one and a network can use it, else 0."""
     there = any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes)
-    return int(there and options.takes_gpu)
+    network = options.base.kind.network or INPAINTERS[options.inpainter].network
+    return int(there and network and options.base.device != "cpu")
 
 
 class RemoteMaker:
-    """A `Maker` on a node, which has to see the very files that the main process sees.
-
-    It gives samples back as bytes, so a node needs no place to write.
-    """
+    """A `Maker` on a node, which has to see the same files as the main process; it returns samples as bytes."""
 
     def __init__(self, options: DatasetOptions, folder: str) -> None:
-        """Start in `folder`, the main process's: relative paths, and what is said of them, stay what they are."""
+        """Start in `folder`, the main process's, so that relative paths mean the same files."""
         self.options = options
         torch.set_num_threads(options.threads)
         with contextlib.suppress(OSError):  # where it is missing, so are the files that are looked for in it
             os.chdir(folder)
 
     def begin(self, expected: Mapping[str, Any]) -> None:
-        """Set up; InputError where samples could not be the same as elsewhere: the version or weights differ."""
+        """Set up; InputError if version or weights differ from the main process's."""
         try:
             self.maker = Maker.of(self.options, Path())
             own = configuration(self.options, (), self.maker.inpainter)
@@ -136,7 +135,7 @@ class RemoteMaker:
             )
 
     def make(self, job: Job, seen: Sequence[str]) -> tuple[Made, bytes | None]:
-        """As `Maker.sample`; InputError also where the node does not see the same photo or depth map."""
+        """As `Maker.sample`; InputError also if the node sees another photo or depth map."""
         if what_is_seen(job[1], self.options) != seen:
             raise InputError(
                 f"{job[1].path}: node {socket.gethostname()} does not find this photo or its depth map, or others in "
@@ -183,8 +182,8 @@ class _Worker:
 class WorkerPool:
     """Workers with few photos each, replaced when they die.
 
-    Ray's `ActorPool` cannot stand for it: it gives an actor one call at a time, and when a call fails, it says neither
-    which one nor on which actor, so nobody could name the photo, make it again and start another worker.
+    Ray's `ActorPool` gives an actor one call at a time and names neither the call nor the actor that failed, so the
+    photo could not be named and made again.
     """
 
     def __init__(self, ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], log: Log) -> None:
@@ -231,7 +230,7 @@ class WorkerPool:
         self.calls[worker.actor.begin.remote(self.expected)] = worker
 
     def _hand_out(self) -> None:
-        """Few photos to each at a time: what is made and not yet written takes memory."""
+        """Give each worker few photos at a time: samples that are not yet written take memory."""
         for have in range(IN_HAND):
             for worker in self.workers:
                 if self.left and worker.ready and len(worker.photos) == have:
@@ -241,8 +240,8 @@ class WorkerPool:
                     self.calls[worker.actor.make.remote((index, photo), seen)] = worker
 
     def _replace(self, worker: _Worker, why: str) -> None:
-        """Another worker, and to its photos another turn."""
-        self.ray.kill(worker.actor)  # where it was merely out of reach
+        """Start another worker and queue the photos of this one again; InputError after `RETRIES` deaths."""
+        self.ray.kill(worker.actor)  # it may only be out of reach
         self.workers.remove(worker)
         self.calls = {call: other for call, other in self.calls.items() if other is not worker}
         index, photo = next(iter(worker.photos.items()), (STARTING, None))

@@ -1,4 +1,4 @@
-"""Reading a dataset as a stream: out of the tar files, in a random order, each view once between all readers."""
+"""Reads a dataset as a stream: from the tar files, in a random order, each view once between all readers."""
 
 from __future__ import annotations
 
@@ -103,7 +103,11 @@ class ViewDataset(IterableDataset[DatasetView]):
         """
         worker = get_worker_info()
         part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        mine = self._order()[self.rank * parts + part :: self.ranks * parts]
+        shards = list(self.files.manifest.shards)  # the same order for everybody
+        if self.shuffle:
+            np.random.default_rng([self.seed, self.epoch]).shuffle(shards)
+        order = [(shard, sample) for shard in shards for sample in shard.samples]
+        mine = order[self.rank * parts + part :: self.ranks * parts]
         views = (
             (group.only(index, with_base=self.with_base), index)
             for group in self.files.groups(mine)
@@ -111,13 +115,6 @@ class ViewDataset(IterableDataset[DatasetView]):
         )
         for group, index in self._shuffled(views, self.rank * parts + part) if self.shuffle else views:
             yield group.view(index, with_base=self.with_base)
-
-    def _order(self) -> Sequence[Place]:
-        """All photos, the same list for everybody: whole shards one after the other."""
-        shards = list(self.files.manifest.shards)
-        if self.shuffle:
-            np.random.default_rng([self.seed, self.epoch]).shuffle(shards)
-        return [(shard, sample) for shard in shards for sample in shard.samples]
 
     def _shuffled(self, views: Iterator[tuple[PhotoGroup, int]], reader: int) -> Iterator[tuple[PhotoGroup, int]]:
         """A random one of those held back makes room for the next."""

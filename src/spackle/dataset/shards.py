@@ -1,7 +1,4 @@
-"""What a dataset holds and how it was made: the manifest and the shards, and whether they are still what they were.
-
-They lie in a folder, or at an address (optional: pip install fsspec, and what the address needs).
-"""
+"""The manifest and the shards of a dataset, in a folder or at an address (optional: pip install fsspec)."""
 
 from __future__ import annotations
 
@@ -14,13 +11,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from spackle.dataset.sample import END, PhotoGroup
+from spackle.digest import digest_of
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import atomic_path
 from spackle.progress import Step
 
 NAME = "manifest.json"
 FORMAT = 1  # of shards and manifest; a reader of another one refuses
-PIECE = 1 << 20  # bytes read at once
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
@@ -31,23 +28,21 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """
     place = f"{str(location).rstrip('/')}/{name}"
     try:
-        return _open_address(place) if "://" in place else open(os.path.join(location, name), "rb")
+        if "://" not in place:
+            return open(os.path.join(location, name), "rb")
+        import fsspec
+
+        file: IO[bytes] = fsspec.open(place, "rb").open()
+        return file
     except FileNotFoundError as error:
         raise InputError(f"{place}: not there: is {location} a dataset of `spackle dataset build`?") from error
     except OSError as error:
         raise InputError(f"{place}: cannot be read: {error.strerror or reason_in_a_line(error)}") from error
-
-
-def _open_address(url: str) -> IO[bytes]:
-    try:
-        import fsspec
-    except ImportError as error:
-        raise InputError(f"{url}: addresses need a package: pip install fsspec") from error
-    try:
-        file: IO[bytes] = fsspec.open(url, "rb").open()
-        return file
-    except (ValueError, ImportError) as error:  # an unknown protocol, or one whose package is missing
-        raise InputError(f"{url}: cannot be opened: {reason_in_a_line(error)}") from error
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{place}: cannot be opened ({reason_in_a_line(error)}): an address needs a package (pip install fsspec), "
+            "and its protocol perhaps another"
+        ) from error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,11 +67,6 @@ class ShardEntry:
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
 
-    def lies_in(self, folder: Path) -> bool:
-        """Whether a file of its size is there; what is in it is for `problems`."""
-        path = folder / self.file
-        return path.is_file() and path.stat().st_size == self.size
-
 
 Place = tuple[ShardEntry, SampleEntry]
 
@@ -100,9 +90,14 @@ class Manifest:
         return sum(len(sample.holes) for _, sample in self.samples)
 
     @property
+    def size(self) -> int:
+        """Bytes of all shards."""
+        return sum(shard.size for shard in self.shards)
+
+    @property
     def digest(self) -> str:
         """SHA-256 over everything that is in it."""
-        return _digest(self._plain())
+        return digest_of(self._plain())
 
     def save(self, folder: Path) -> None:
         """Write manifest.json, whole or not at all."""
@@ -111,10 +106,9 @@ class Manifest:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def _plain(self) -> dict[str, Any]:
-        counts = {"photos": len(self.samples), "views": self.views, "bytes": sum(shard.size for shard in self.shards)}
-        shards = [dataclasses.asdict(shard) for shard in self.shards]
-        content = {"format": FORMAT, "config": dict(self.config), "counts": counts, "shards": shards}
-        plain: dict[str, Any] = json.loads(json.dumps(content | {"complete": self.complete}))  # no tuples
+        counts = {"photos": len(self.samples), "views": self.views, "bytes": self.size}
+        content = dataclasses.asdict(self) | {"format": FORMAT, "counts": counts}
+        plain: dict[str, Any] = json.loads(json.dumps(content))  # no tuples
         return plain
 
 
@@ -130,24 +124,29 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
         recorded = content.pop("sha256")
         shards = tuple(_shard(shard) for shard in content["shards"])
         manifest = Manifest(dict(content["config"]), shards, bool(content["complete"]))
-        if _digest(content) != recorded or manifest.digest != recorded:
+        if digest_of(content) != recorded or manifest.digest != recorded:
             raise ValueError("its digest does not fit")
+    except InputError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{where}: damaged, or no manifest of a dataset: {error}") from error
     return manifest
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
     """What two configurations disagree on, as "key: old -> new"."""
+
+    def short(value: object) -> str:
+        text = json.dumps(value)
+        return text if len(text) <= 40 else text[:12] + "…"
+
     found: list[str] = []
     for key in sorted({*old, *new}):
         a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
             found += differences(a, b, f"{where}{key}.")
         elif a != b:
-            found.append(f"{where}{key}: {_short(a)} -> {_short(b)}")
+            found.append(f"{where}{key}: {short(a)} -> {short(b)}")
     return found
 
 
@@ -156,22 +155,13 @@ def _shard(content: Mapping[str, Any]) -> ShardEntry:
     return ShardEntry(**{**content, "samples": tuple(samples), "passed_over": tuple(content["passed_over"])})
 
 
-def _digest(content: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _short(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:12] + "…"
-
-
 def shard_name(number: int) -> str:
     """The file of a shard."""
     return f"shard-{number:06d}.tar"
 
 
 def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
-    """Put samples, by key and file, one after the other into a tar file, whole or not at all; its entry.
+    """Write a tar file of samples, each given by its key and file, whole or not at all; returns its entry.
 
     Raises:
         InputError: a part that is damaged, or a disk that is full.
@@ -196,7 +186,7 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
 
 
 def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
-    """One photo's files out of an open shard; InputError where they are not what their digest says."""
+    """One photo's files out of an open shard; InputError where they differ from their digest."""
     try:
         file.seek(sample.offset)
         data = file.read(sample.size)
@@ -211,7 +201,7 @@ def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
 
 def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Step) -> Iterator[str]:
     """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
-    total, done = sum(shard.size for shard in manifest.shards), 0
+    done = 0
     if not manifest.complete:
         yield "the dataset is not finished: the command that builds it goes on"
     for shard in manifest.shards:
@@ -223,31 +213,19 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
         except OSError as error:
             yield f"{shard.file}: cannot be read: {error.strerror or error}"
         done += shard.size
-        progress(done, total)
+        progress(done, manifest.size)
 
 
 def _shard_problems(file: IO[bytes], shard: ShardEntry) -> Iterator[str]:
-    """Each sample is held to its own digest, and the end of the file to what it must be."""
+    """Compare each sample with its digest, and the rest with the end of an archive."""
     size = file.seek(0, os.SEEK_END)
     if size != shard.size:
         yield f"{size:,} bytes instead of {shard.size:,}"
     file.seek(0)
-    whole, named = hashlib.sha256(), False
+    damaged = False
     for sample in shard.samples:
-        digest = hashlib.sha256()
-        for piece in _pieces(file, sample.size):
-            digest.update(piece)
-            whole.update(piece)
-        if digest.hexdigest() != sample.sha256:
-            named = True
+        if hashlib.sha256(file.read(sample.size)).hexdigest() != sample.sha256:
+            damaged = True
             yield f"sample {sample.key} ({sample.photo}) is damaged"
-    for piece in _pieces(file, len(END)):
-        whole.update(piece)
-    if whole.hexdigest() != shard.sha256 and not named:
+    if not damaged and file.read(len(END)) != END:
         yield "damaged after its last sample"
-
-
-def _pieces(file: IO[bytes], size: int) -> Iterator[bytes]:
-    while size and (piece := file.read(min(PIECE, size))):
-        yield piece
-        size -= len(piece)

@@ -55,8 +55,7 @@ def draw_path(choices: ViewChoices, photo_sha256: str) -> PathChoice:
 def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int = VIEWS) -> list[Camera]:
     """The photo's own view, and then the others along the path, no two alike.
 
-    Paths pass through the photo's eye, and closed ones end where they begin; such frames are left out, and
-    the path is drawn a little finer instead.
+    Frames at the photo's eye and at the end of a closed path repeat others, so the path gets more frames instead.
 
     Args:
         path: its kind and width.
@@ -67,28 +66,24 @@ def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, view
     Raises:
         ValueError: a path that cannot be, or one on which the camera does not move.
     """
-    cameras: list[Camera] = []
+    cameras = [camera]
     least = APART * max_offset(camera, path.disparity, depth_range)
-    for frames in range(views - 1, views + SPARE):
-        found = trajectory(path.kind, camera, path.disparity, depth_range, frames)
-        cameras = _apart([camera, *found], least) if least > 0 else []
+    for frames in range(views - 1, views + SPARE) if least > 0 else ():
+        cameras = [camera]
+        for view in trajectory(path.kind, camera, path.disparity, depth_range, frames):
+            if all(_distance(view, other) > least for other in cameras):
+                cameras.append(view)
         if len(cameras) >= views:
             break
     if len(cameras) < views:
         raise ValueError(f"{path.kind} at a disparity of {path.disparity:g} has no {views} different views")
     while len(cameras) > views:  # the least interesting one
-        reach = [float((view.position.double() - camera.position.double()).norm()) for view in cameras[1:]]
-        del cameras[1 + int(np.argmin(reach))]
+        del cameras[1 + int(np.argmin([_distance(view, camera) for view in cameras[1:]]))]
     return cameras
 
 
-def _apart(cameras: Sequence[Camera], least: float) -> list[Camera]:
-    """Those whose eye is farther than `least` from all before them."""
-    kept: list[Camera] = []
-    for camera in cameras:
-        if all(float((camera.position.double() - other.position.double()).norm()) > least for other in kept):
-            kept.append(camera)
-    return kept
+def _distance(one: Camera, other: Camera) -> float:
+    return float((one.position.double() - other.position.double()).norm())
 
 
 @torch.no_grad()

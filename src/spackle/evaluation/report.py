@@ -21,11 +21,11 @@ from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import NEAR
 from spackle.evaluation.results import RESULTS, TIMES, ImageResult, Run, image_file, load_run, read_json
-from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, rank, thumbnail
+from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, rank
 from spackle.evaluation.table import BEST, EMPTY, Table
 from spackle.evaluation.tables import ADDING, NOT_RUN, PAPER_ROW, count_text, make_tables, method_name, ratio_text
 from spackle.formats import atomic_path
-from spackle.formats.png import to_bytes
+from spackle.formats.png import thumbnail, to_bytes
 
 REPORT = "report.html"
 BENCH = "bench.json"  # of `spackle bench`

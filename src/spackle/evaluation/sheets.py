@@ -10,11 +10,12 @@ from pathlib import Path
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
 from spackle.evaluation.results import ImageResult, Run
+from spackle.formats.png import thumbnail
 
 SIDE = 320  # pixels of a thumbnail's longer side
 GAP, LINE = 6, 22  # pixels between pictures, and of a line of text
@@ -44,14 +45,6 @@ def strip(pictures: Mapping[str, Tensor]) -> Tensor:
 def columns(run: Run) -> list[str]:
     """What a strip shows: the methods, and the truth where there is one."""
     return [*run.methods, *([TRUTH] if run.near else [])]
-
-
-def thumbnail(picture: Tensor, side: int) -> Tensor:
-    """A picture whose longer side is at most `side`."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, side / max(height, width))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
-    return interpolate(picture.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
 
 
 def rank(run: Run) -> Ranking | None:

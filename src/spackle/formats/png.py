@@ -7,6 +7,7 @@ import os
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from spackle.formats.atomic import atomic_path
 
@@ -15,6 +16,14 @@ def to_bytes(image: Tensor) -> Tensor:
     """Values in 0..1 of any shape as uint8 on the CPU, rounded; outside values are clamped, NaN is 0."""
     scaled = image.detach().float().mul(255)  # a copy: what follows is in place
     return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
+
+
+def thumbnail(picture: Tensor, side: int) -> Tensor:
+    """A picture [H, W, C] whose longer side has at most `side` pixels, each the mean of those it covers."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    return interpolate(picture.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
 
 
 def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:
