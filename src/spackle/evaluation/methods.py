@@ -101,7 +101,7 @@ def _dense(shot: Shot, network: ResidualNet | None, precision: Precision) -> Ite
 
 
 def _inpaint_2d(shot: Shot, inpainter: Inpainter) -> Iterator[View]:
-    """The base's render with its hole inpainted as a flat picture, by OpenCV."""
+    """The base's render with its hole inpainted as a flat picture."""
     for camera, before in zip(shot.cameras, shot.before, strict=True):
         flat = [image[None] for image in (before.rgb, before.depth, before.alpha, hole_mask(before.alpha))]
         stack = ViewStack(shot.base, shot.prediction.camera, [camera], *flat)
@@ -148,9 +148,9 @@ def make_method(
 
     Args:
         name: which one.
-        network: of the residual; None for seeds alone.
-        direct_ft: predicts the photo at hand with the other base, and gives that one's unit of length in this one's.
-        precision: of the residual's network.
+        network: of the residual, run at `precision`; None for seeds alone.
+        direct_ft: predicts the photo with the other base, and gives that one's unit of length in this one's.
+        precision: see `network`.
 
     Raises:
         InputError: OpenCV is not installed, for inpaint2d.

@@ -73,9 +73,7 @@ class ReportSource:
 def make_report(sources: Sequence[ReportSource], bench: Mapping[str, Any] | None = None) -> str:
     """A report as HTML: one file that needs nothing else, the same bytes for the same results.
 
-    Args:
-        sources: evaluations whose tables go together; at least one.
-        bench: what a benchmark wrote, shown as it is but for its single images.
+    `sources` are one or more evaluations whose tables go together; of `bench` all but the single images is shown.
     """
     titles = dict.fromkeys(source.run.title for source in sources)
     text = resources.files("spackle.evaluation").joinpath(REPORT).read_text(encoding="utf-8")

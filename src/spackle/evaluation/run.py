@@ -38,16 +38,10 @@ TABLES = (results.MARKDOWN, results.LATEX)
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
-    """Evaluate a dataset, or go on with that.
+    """Evaluate a dataset, or resume that: "complete", or "stopped" by Ctrl-C.
 
-    Args:
-        options: what on what.
-        output: a folder; results.json, times.json, tables.md, tables.tex, worst.png, best.png and images/ go there.
-        reporter: logs what is passed over.
-        html: write report.html too.
-
-    Returns:
-        "complete", or "stopped" where Ctrl-C came.
+    Writes results.json, times.json, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and
+    report.html with `html`.
 
     Raises:
         InputError: options, a dataset or a folder that cannot be used; another evaluation in `output`; too little
@@ -243,13 +237,9 @@ def _write_tables(runs: Sequence[Run], output: Path) -> None:
 
 
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
-    """The tables of several evaluations in one.
+    """Write the tables of several finished evaluations into `output`, and report.html with `html`.
 
-    Args:
-        folders: outputs of `evaluate`, finished.
-        output: a folder for the two files.
-        reporter: logs where they lie.
-        html: write report.html too; a folder may then hold a bench.json alone.
+    With `html` a folder may hold a bench.json alone.
 
     Raises:
         InputError: a folder without results, results that do not go together, or an output that cannot be written to.
@@ -259,9 +249,8 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     measured = list(folders)
     if html:
         check_matplotlib("--html")
-        measured = [
-            f for f in folders if (f / results.RESULTS).exists() or not (f / report.BENCH).is_file()
-        ] or measured
+        idle = [f for f in folders if (f / report.BENCH).is_file() and not (f / results.RESULTS).exists()]
+        measured = [folder for folder in folders if folder not in idle] or measured
     sources = [report.load_source(folder) for folder in measured]
     runs = [source.run for source in sources]
     make_tables(runs)  # what does not go together is refused before anything is written

@@ -144,11 +144,7 @@ class Evaluation:
     config: dict[str, Any]  # everything that decides the figures, ready for JSON; nothing of where files lie
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
-        """The base of a case: the network, or the case's own depth or points.
-
-        Raises:
-            InputError: the case has no depth for a base that takes it, or a file of it cannot be used.
-        """
+        """The base of a case: the network, or the case's own depth or points; InputError where it lacks those."""
         network = self.options.base.kind.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 

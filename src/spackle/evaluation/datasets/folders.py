@@ -38,8 +38,7 @@ def scene_folders(root: Path, dataset: str) -> list[Path]:
     """The scenes of a dataset at or below `root`, by their names.
 
     Raises:
-        InputError: no such folder, or none of the dataset's scenes in it; the message tells what was
-            expected, and which other dataset it looks like.
+        InputError: no such folder, or no scene of the dataset in it; the message names what was expected.
     """
     if not root.is_dir():
         raise InputError(f"{root}: no such folder: give the one that {dataset} was unpacked in")
@@ -93,18 +92,17 @@ def _has(folder: Path, *names: str) -> bool:
     return any((folder / name).exists() for name in names)
 
 
-def _words(folder: Path) -> set[str]:
-    return set(re.split(r"[_\-. ]", folder.name.lower()))
+def _called(folder: Path, scenes: set[str]) -> bool:
+    return not scenes.isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
 
 
 def _is_llff(folder: Path) -> bool:
-    return _has(folder, "poses_bounds.npy", "sparse") and not _words(folder) & TANKS_SCENES
+    return _has(folder, "poses_bounds.npy", "sparse") and not _called(folder, TANKS_SCENES)
 
 
 def _is_tanks(folder: Path) -> bool:
-    known = bool(_words(folder) & TANKS_SCENES)
-    other = _has(folder, "poses_bounds.npy") or bool(_words(folder) & LLFF_SCENES)
-    return _has(folder, "sparse", "dense/sparse") and (known or not other)
+    other = _has(folder, "poses_bounds.npy") or _called(folder, LLFF_SCENES)
+    return _has(folder, "sparse", "dense/sparse") and (_called(folder, TANKS_SCENES) or not other)
 
 
 def is_two_view(folder: Path) -> bool:

@@ -71,9 +71,9 @@ def make_cases(
     """Photos as cases, their second views in their own frames.
 
     Args:
-        views: all photos of a scene.
-        wanted: which of them become cases; all where None.
-        model: where the views' points are; its views are in the order of `views`.
+        views: all photos of a scene; those at the indices `wanted` become cases, all where None.
+        wanted: see `views`.
+        model: has the views' points, and views in the same order.
         bounds: nearest and farthest depth by photo, where known.
         metric: the poses' lengths are metres.
     """
@@ -82,18 +82,12 @@ def make_cases(
     for index, others in near_views(views, range(len(views)) if wanted is None else wanted).items():
         view, to_world = views[index], torch.linalg.inv(views[index].camera.world_to_camera)
         seconds = [
-            SecondView(other.name, other.photo, _placed(other.camera, other.camera.world_to_camera @ to_world))
-            for other in (views[k] for k in others)
+            SecondView(v.name, v.photo, _placed(v.camera, v.camera.world_to_camera @ to_world))
+            for v in (views[k] for k in others)
         ]
-        case = Case(
-            view.name,
-            view.photo,
-            _placed(view.camera, torch.eye(4)),
-            points=partial(model.points, model.views[index]) if model and len(model.views[index].ids) else None,
-            bounds=(bounds or {}).get(view.photo),
-            seconds=tuple(seconds),
-            metric=metric,
-        )
+        seen = partial(model.points, model.views[index]) if model and len(model.views[index].ids) else None
+        camera, near_far = _placed(view.camera, torch.eye(4)), (bounds or {}).get(view.photo)
+        case = Case(view.name, view.photo, camera, points=seen, bounds=near_far, seconds=tuple(seconds), metric=metric)
         cases.append(case)
     return cases
 

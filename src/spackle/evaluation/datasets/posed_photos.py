@@ -174,11 +174,7 @@ def _read_bounds(path: Path, count: int) -> NDArray[Any]:
 
 
 def _camera_of_row(row: NDArray[Any]) -> Camera:
-    """A row of `poses_bounds.npy` as a camera, float64.
-
-    Its matrix is camera-to-world with the columns down, right, backwards; then the eye; then height, width and focal
-    length. The principal point is the middle.
-    """
+    """A row of `poses_bounds.npy` as a float64 camera: down, right, backwards, the eye; height, width, focal length."""
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
     down, right, backwards, eye, lens = matrix.unbind(1)
     height, width, focal = (float(number) for number in lens)
