@@ -10,12 +10,11 @@ from types import ModuleType
 import av
 import pytest
 import torch
-from photos import HEIGHT, WIDTH, metres, picture, read_ply, write_depth, write_pair, write_photo
+from photos import HEIGHT, WIDTH, metres, read_ply, write_depth, write_pair, write_photo
 from scenes import psnr, same_bits
 
 import spackle
 from spackle.bases.lift import RgbdBase
-from spackle.camera_path import TrajectoryKind
 from spackle.formats import load_ply_camera
 
 
@@ -65,22 +64,6 @@ def test_files_names_and_values_are_the_same_input_and_the_base_comes_first(
     assert same_bits(scene.base, alone.gaussians)
     assert len(scene.gaussians) == len(scene.base) + len(scene.aux) > len(scene.base)
     assert same_bits(scene.gaussians.select(torch.arange(len(scene.base))), scene.base)
-
-
-@pytest.mark.parametrize("kind", ["swipe", "shake", "rotate", "rotate_forward"])
-def test_holes_close_along_the_path_and_the_photo_stays(tmp_path: Path, kind: TrajectoryKind) -> None:
-    made, renderer = spackle.predict(*write_pair(tmp_path), kind=kind), spackle.get_renderer("cpu")
-    path = made.path(kind)[::6]
-    before, after = (
-        [spackle.hole_area_ratio(renderer.render(gaussians, camera).alpha) for camera in path]
-        for gaussians in (made.base, made.gaussians)
-    )
-    assert max(before) > 0.3
-    assert max(after) < 0.01
-    bare, whole = renderer.render(made.base, made.camera), made.render(made.camera, renderer)
-    covered = ~spackle.hole_mask(bare.alpha)
-    assert psnr(whole.rgb[covered], bare.rgb[covered]) >= 45
-    assert psnr(whole.rgb, torch.from_numpy(picture()).float() / 255) > 25
 
 
 def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:

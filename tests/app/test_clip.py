@@ -60,17 +60,17 @@ def test_depth_of_another_scale_and_shift_is_brought_back() -> None:
     assert align_depth(now, then, dataclasses.replace(found, sure=torch.zeros_like(found.sure))) == DepthAlignment()
 
 
-def test_stretched_gaussians_look_the_same_from_the_photos_eye() -> None:
+def test_aligned_gaussians_look_the_same_from_the_photos_eye() -> None:
     scene = box_before_wall()
-    base, stretch = scene.base(), DepthAlignment(1.2, 0.05)
-    moved = stretch.of_gaussians(base)
-    torch.testing.assert_close(1 / moved.means[:, 2], stretch.of(1 / base.means[:, 2]))
+    base, alignment = scene.base(), DepthAlignment(1.2, 0.05)
+    moved = alignment.of_gaussians(base)
+    torch.testing.assert_close(1 / moved.means[:, 2], alignment.of(1 / base.means[:, 2]))
     torch.testing.assert_close(
         scene.camera.project(moved.means)[0], scene.camera.project(base.means)[0], rtol=1e-4, atol=1e-3
     )
     assert DepthAlignment().of_gaussians(base) is base
     first, value = DepthAlignment(0.9, -0.01), torch.tensor([0.3, 0.7])
-    torch.testing.assert_close(stretch.after(first).of(value), stretch.of(first.of(value)))
+    torch.testing.assert_close(alignment.after(first).of(value), alignment.of(first.of(value)))
 
 
 WALL, BOX = 6.0, 2.0

@@ -57,15 +57,6 @@ def test_the_demo_leaves_a_scene_and_fills_the_hole_better_than_2d_inpainting(tm
         assert printed == pytest.approx([score["in_hole"], score["outside"]], abs=0.006)
 
 
-@pytest.mark.parametrize("kind", ["file", "file/deep", "folder"])
-def test_an_output_that_cannot_be_written_is_one_line(tmp_path: Path, kind: str) -> None:
-    pytest.importorskip("skimage.data")
-    (tmp_path / "file").touch()
-    (tmp_path / "folder" / "comparison.png").mkdir(parents=True)
-    refuses(run("demo", "-o", tmp_path / kind), tmp_path / kind)
-    assert names_in(tmp_path / "folder") == {"comparison.png"}
-
-
 def test_without_scikit_image_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skimage.data", None)
     refuses(run("demo", "-o", tmp_path / "out"), "pip install 'spackle-nvs[demo]'")

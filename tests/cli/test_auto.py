@@ -59,9 +59,6 @@ def test_a_photo_alone_gets_lite_and_advice(tmp_path: Path) -> None:
     first, second, _ = result.lines
     assert first.startswith(f"photo.jpg: base lite ({NO_DEPTH}, {NO_SHARP}): rough geometry; for better: --depth FILE")
     assert "Gaussians from lite, focal length" in second
-    depth = ("--depth", write_depth(tmp_path / "d.npy"))
-    base, result = base_of(tmp_path, "-i", tmp_path / "photo.jpg", *depth)
-    assert (base["name"], base["chosen"], len(result.lines)) == ("rgbd", "--depth", 2)
 
 
 def test_a_folder_is_done_again_when_better_weights_come(

@@ -18,7 +18,6 @@ from spackle.bases.protocol import BasePrediction, Progress
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.evaluation.setup import EvaluateOptions
 from spackle.image import Photo
 
 
@@ -136,4 +135,3 @@ def test_where_results_must_say_what_they_are_of_auto_is_refused_and_sharp_the_d
         refuses(result, "--base auto: results must say what they are of")
     refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, lite, hf:NAME_OR_FOLDER need none")
     assert not (tmp_path / "out").exists()
-    assert EvaluateOptions("middlebury", Path("x")).base.name == "sharp"

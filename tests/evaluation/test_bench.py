@@ -369,10 +369,10 @@ def test_a_video_in_one_scene_and_frame_by_frame() -> None:
     found = {name: float(row.values[0]) for name, row in rows_of(section).items()}
     same = found[stages.LIFT] + found[stages.ENCODE] + found[stages.EACH]
     anew, whole = found["frame by frame: photo to video"], found["one scene: photo to video"]
-    assert anew == pytest.approx(same + found[stages.SHIELDS])
+    assert anew == pytest.approx(same + found[stages.GUARDS])
     assert found["frame by frame over one scene"] == pytest.approx(anew / whole)
-    once = (same + found[stages.SHIELDS] / 4) / whole
-    assert found["the same, the photo's shield made once"] == pytest.approx(once)
+    once = (same + found[stages.GUARDS] / 4) / whole
+    assert found["the same, the photo's occlusion guard made once"] == pytest.approx(once)
     assert section[1]["added"] > 0
 
 

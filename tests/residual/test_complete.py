@@ -148,6 +148,19 @@ def test_the_neighbours_of_a_completed_view_have_fewer_holes_for_it(
     assert len(completer.complete_scene([path[index]] * 2, exact=True)) > len(alone)
 
 
+@pytest.mark.parametrize(("holes", "reach"), [(0, 0.75), (25, 0.75), (26, 0.5), (100, 0.5), (101, 0.0)])
+def test_the_fewer_holes_the_farther_a_frame_speaks_but_a_speck_silences_it(holes: int, reach: float) -> None:
+    alpha = torch.ones(250, 400)
+    alpha.view(-1)[torch.arange(holes) * 37] = 0.3  # nowhere together
+    assert reach_of(hole_area_ratio(alpha), alpha) == reach
+    assert not has_speck(alpha)
+    for height, width, speck in ((4, 5, True), (3, 3, False), (1, 60, False)):
+        alpha = torch.ones(120, 160)
+        alpha[120 - height :, 160 - width :] = 0.3
+        assert has_speck(alpha) is speck
+        assert not (speck and reach_of(hole_area_ratio(alpha), alpha))
+
+
 class Counting(CpuRenderer):
     """A renderer that keeps the cameras that whole pictures are taken by."""
 
@@ -180,22 +193,6 @@ def test_a_quiet_frame_speaks_for_a_part_of_the_way_to_the_next_known_ones(
     assert [k for k in range(frames) if settled.known(k)] == expected
 
 
-@pytest.mark.parametrize(("holes", "reach"), [(0, 0.75), (25, 0.75), (26, 0.5), (100, 0.5), (101, 0.0)])
-def test_the_fewer_holes_the_farther_a_frame_speaks(holes: int, reach: float) -> None:
-    alpha = torch.ones(250, 400)
-    alpha.view(-1)[torch.arange(holes) * 37] = 0.3  # nowhere together
-    assert reach_of(hole_area_ratio(alpha), alpha) == reach
-
-
-@pytest.mark.parametrize(("height", "width", "speck"), [(4, 5, True), (3, 3, False), (1, 60, False)])
-def test_few_holes_are_a_speck_where_they_lie_together(height: int, width: int, speck: bool) -> None:
-    alpha = torch.ones(120, 160)
-    alpha[120 - height :, 160 - width :] = 0.3
-    assert has_speck(alpha) is speck
-    assert not reach_of(hole_area_ratio(alpha), alpha) or not speck
-    assert not has_speck(torch.zeros(2, 60))
-
-
 @pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 30), ("rotate", 60), ("swipe", 20)])
 def test_few_frames_of_a_path_are_looked_at_all_of_them_are_closed_and_what_the_widest_show_stays(
     kind: TrajectoryKind, most: int
@@ -218,9 +215,6 @@ def test_few_frames_of_a_path_are_looked_at_all_of_them_are_closed_and_what_the_
     counting.cameras.clear()
     completer.complete_scene(path[::5], exact=True)  # views of an exact path speak for themselves alone
     assert all(any(camera is seen for seen in counting.cameras) for camera in path[::5])
-
-
-# Motorcycle, a real photo with real depth, at Middlebury's quarter size
 
 
 def test_motorcycle_is_closed_plausibly_and_nothing_that_was_seen_changes() -> None:

@@ -86,21 +86,6 @@ def test_the_slope_of_seeds_is_by_pixel_not_by_cell(axis: int) -> None:
     assert float(middle[..., axis].abs().max()) < 0.05 * expected
 
 
-def test_a_stray_speck_does_not_colour_a_hole() -> None:
-    """One far green cell in the middle of a hole in a red wall."""
-    rgb, depth, alpha = torch.zeros(48, 64, 3), torch.full((48, 64), 2.0), torch.ones(48, 64)
-    rgb[..., 0] = 0.8
-    alpha[12:36, 16:48] = 0
-    speck = (slice(24, 26), slice(30, 32))
-    alpha[speck], depth[speck], rgb[speck] = 1.0, 50.0, torch.tensor([0.0, 0.8, 0.0])
-    rgb, depth = rgb * (alpha > 0)[..., None], depth * (alpha > 0)
-    camera = Camera.from_focal(60, 64, 48)
-    seeds = make_seeds(Cues.of(Rendering(rgb, depth, alpha)), camera, camera)
-    assert float(seeds.rgb[6:18, 8:24, 1].mean()) < 0.1
-
-
-# The far rim
-
 HEIGHT, WIDTH = 12, 20  # cells
 CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)
 SIDEWAYS = (0.3, 0.0, 0.0)

@@ -181,11 +181,9 @@ def test_what_is_no_photo_is_found_out_by_decoding_and_every_kind_that_is_named_
 @pytest.mark.parametrize(
     ("query", "shown"),
     [
-        ("name=a.png", "a.png"),
         ("name=..%2F..%2Fetc%2Fpasswd.png", "passwd.png"),
         ("name=C:%5Cphotos%5Ca.png", "a.png"),
         ("name=%1b%5b31m%0d%0aa%E2%80%AE.png", "[31ma.png"),
-        ("name=%ff.png", "\ufffd.png"),
         ("name=a%3Cb%3E.png", "a<b>.png"),
         (f"name={200 * 'a'}.png", f"{40 * 'a'}…{36 * 'a'}.png"),
         ("", ""),

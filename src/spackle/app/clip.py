@@ -92,7 +92,7 @@ def predict_clip(
         if clip.hdr:
             reporter.say(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
         run = _Run(clip, focal, completer, reporter)
-        (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the video
+        (folder / "report.json").unlink(missing_ok=True)  # a report means that the video is complete
         with reporter.stage("frames", seconds) as step:
             run.write(folder / "video.mp4", step)
         report = run.report(seconds)

@@ -22,12 +22,10 @@ from spackle.image import focal_length
 from spackle.progress import Reporter
 from spackle.viewer import PageScene, page_scene, single_html
 
-
-def _html(scene: SceneFile, path: Path) -> None:
-    write_whole(path, single_html(page_of(scene)))
-
-
-WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {**SCENE_WRITERS, ".html": _html}
+WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
+    **SCENE_WRITERS,
+    ".html": lambda scene, path: write_whole(path, single_html(page_of(scene))),
+}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -46,7 +44,9 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
         raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
     loaded = SceneFile.load(scene)
     size = os.path.getsize(scene)
-    if rest := _harmonics(scene):
+    with open(scene, "rb") as file:
+        elements = read_header(file, scene).elements
+    if rest := sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields):
         reporter.say(
             f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
         )
@@ -57,13 +57,6 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
         except InputError as error:
             raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
         _say(reporter, loaded, output, size, time.perf_counter() - start)
-
-
-def _harmonics(scene: Path) -> int:
-    """How many values above degree 0 each Gaussian of a file has."""
-    with open(scene, "rb") as file:
-        elements = read_header(file, scene).elements
-    return sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields)
 
 
 def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:

@@ -122,7 +122,7 @@ def predict_one(
         _warn_of_lite(done, folder, options.base, reporter)
         scene, views, renderer = done.scene, done.views, completer.renderer
         with reporter.stage("write", seconds):
-            (folder / "report.json").unlink(missing_ok=True)  # an earlier run's, which vouches for the other files
+            (folder / "report.json").unlink(missing_ok=True)  # a report means that the other files are complete
             reach = None if options.path.cameras or options.path.path else options.path.disparity
             for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
                 save_ply(part, folder / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)

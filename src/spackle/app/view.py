@@ -27,8 +27,6 @@ from spackle.viewer import PageScene, page_files, page_scene
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell
 
-LOOK = 0.05  # seconds between two looks whether somebody wants to stop
-MAGIC = b"ply"
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
 OPEN_TO_ALL = (
     "warning: everybody in the network can see this photo at --host {host}, send photos of their own and use this "
@@ -64,7 +62,7 @@ def is_scene(path: Path) -> bool:
     if path.suffix.lower() in WRITTEN_ONLY:
         raise InputError(f"{path}: {path.suffix} files are written, not read: give the scene.ply that it was made of")
     with open(path, "rb") as file:
-        return path.suffix.lower() == ".ply" or file.read(len(MAGIC)) == MAGIC
+        return path.suffix.lower() == ".ply" or file.read(3) == b"ply"
 
 
 def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
@@ -82,7 +80,7 @@ def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
             begin(server)
             announce(server, target.name, reporter, browser=options.browser)
             while not stopped():
-                time.sleep(LOOK)
+                time.sleep(0.05)
         finally:
             ended = server.close()
     return ended
@@ -115,7 +113,7 @@ def _first(
 
 
 def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller: Teller) -> PageScene:
-    """A loaded photo to what the page shows; what goes wrong is said here too."""
+    """A loaded photo to what the page shows; the terminal gets errors too."""
     seconds: dict[str, float] = {}
     try:
         scene = completer.complete(photo, teller, seconds).scene
@@ -127,7 +125,7 @@ def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller
 
 
 class Uploads:
-    """Completes photos that the page sends; what was said of the first photo alone does not hold for them."""
+    """Completes photos that the page sends; the first photo's depth, calibration and lens do not apply to them."""
 
     def __init__(self, options: ViewOptions, reporter: Reporter) -> None:
         """InputError: an option that cannot be used."""
@@ -140,7 +138,7 @@ class Uploads:
         self.completer: PhotoCompleter | None = None
 
     def complete(self, path: Path, name: str, tell: Tell) -> PageScene:
-        """As the server wants it: one at a time."""
+        """A photo's file to what the page shows; the server calls it for one photo at a time."""
         teller = Teller(self._reporter, tell, path, name)
         self.completer = self.completer or self._options.completer(self._base)
         seconds: dict[str, float] = {}
@@ -150,7 +148,7 @@ class Uploads:
 
 
 class Teller(Reporter):
-    """Tells the page what the terminal is told."""
+    """A reporter that sends the page what the terminal gets."""
 
     def __init__(self, reporter: Reporter, tell: Tell, path: Path | None = None, name: str = "") -> None:
         """`path` is a file of ours that people know by `name`."""
@@ -182,24 +180,19 @@ class Teller(Reporter):
 
 
 def announce(server: ViewerServer, name: str, reporter: Reporter, *, browser: bool) -> None:
-    """Say where to look, warn where strangers can look too, and open a browser where there is one."""
+    """Print the page's address, warn if it is open to the network, and open a browser if there is a screen."""
     if not server.local:
         reporter.say(OPEN_TO_ALL.format(host=server.host))
         reporter.say(f"{name}: from other machines {server.url_at(address_in_network(server.host))}")
     reporter.say(f"{name}: {server.url} (Ctrl-C ends)")
     reporter.result({"url": server.url})
-    if browser and not has_screen():
+    # A browser of text would take the terminal away.
+    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    if browser and sys.platform.startswith("linux") and not screen:
         reporter.say("no screen here: open that page yourself; from another machine through `ssh -L`")
     elif browser:
         # Some browsers come back only when they are closed.
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True, name="browser").start()
-
-
-def has_screen() -> bool:
-    """Whether a browser would have a window; one of text would take the terminal away."""
-    if not sys.platform.startswith("linux"):
-        return True
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
 
 
 def address_in_network(host: str) -> str:

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from spackle.cli import dataset, evaluate, predict, render, train, view, weights
+from spackle.cli import dataset, evaluate, predict, render, train, weights
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
 
@@ -60,7 +60,7 @@ app = typer.Typer(
 
 app.command(short_help="Photos, or a clip, to completed scenes and videos")(predict.predict)
 app.command(short_help="A saved scene to a video")(render.render)
-app.command(short_help="Look at a scene, or at a photo that becomes one")(view.view)
+app.command(short_help="Look at a scene, or at a photo that becomes one")(render.view)
 app.command(short_help="A scene for other viewers, or as one page to send")(render.export)
 app.command(short_help="The Middlebury Motorcycle, against its true second photo")(predict.demo)
 app.command(short_help="Train the residual or SHARP's decoder")(train.train)

@@ -101,7 +101,7 @@ def dataset_info(location: DatasetArgument) -> None:
 
 @dataset.command("verify")
 def dataset_verify(location: DatasetArgument) -> None:
-    """Read every byte and name each damaged sample; exit code 1 where there is one."""
+    """Read every byte and name each damaged sample; exit code 1 if any is damaged."""
     from spackle.dataset.inspect import verify_dataset
     from spackle.progress import Reporter
 

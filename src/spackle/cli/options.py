@@ -33,7 +33,7 @@ CheckpointOption = Annotated[
 
 
 def trajectory_named(text: str) -> str:
-    """A trajectory as Python spells it, of either spelling; BadParameter where there is none."""
+    """A trajectory as Python spells it, from either spelling; BadParameter for another name."""
     if text.replace("_", "-") not in SPELLINGS:
         raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, SPELLINGS))}.")
     return text.replace("-", "_")

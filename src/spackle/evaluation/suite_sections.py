@@ -38,7 +38,7 @@ GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
 HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of the completed view; of the search for it, and its relative tolerance
 VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
 LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
-EACH, SHIELDS = "frames rendered and completed, each by itself", "the photo's shield, for each of them"
+EACH, GUARDS = "frames rendered and completed, each by itself", "the photo's occlusion guard, for each of them"
 FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
 
 SIDE = 1536  # pixels along SHARP's picture
@@ -131,9 +131,14 @@ def completion_section(
     disparity, camera = find_view(base, photo_camera, renderer)
     completer = Completer(base, photo_camera, renderer, network)
     times = measure(runs, {"": lambda lap: complete_in_laps(completer, camera, lap)}, device)
-    render, shield, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
-    names = ("base render of the view", "photo's shield, once a photo", "mask, seeds, network, placing", "redraw")
-    rows = [Row(name, values) for name, values in zip(names, (render, shield, place, redraw), strict=True)]
+    render, guard, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
+    names = (
+        "base render of the view",
+        "photo's occlusion guard, once a photo",
+        "mask, seeds, network, placing",
+        "redraw",
+    )
+    rows = [Row(name, values) for name, values in zip(names, (render, guard, place, redraw), strict=True)]
     rows.append(Row("added time", place + redraw))
     rows.append(Row("added time over base render", (place + redraw) / render, "×"))
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
@@ -169,8 +174,9 @@ def video_section(
 ) -> Section:
     """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate_forward`: as one scene, and frame by frame.
 
-    Frame by frame, each is rendered and completed from scratch, its shield included, and shares nothing with the others
-    but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most `VIDEO_RUNS`.
+    Frame by frame, each is rendered and completed from scratch, its occlusion guard included, and shares nothing with
+    the others but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most
+    `VIDEO_RUNS`.
     """
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
@@ -193,20 +199,20 @@ def video_section(
 
     def scratch(lap: Lap) -> None:
         for camera in path:
-            shield = completer.photo_guard()
-            lap(SHIELDS)
-            completer.completed_view(camera, [shield])
+            guard = completer.photo_guard()
+            lap(GUARDS)
+            completer.completed_view(camera, [guard])
             lap(EACH)
 
     times = measure(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
-    whole, each, shields = times["scene", TOTAL], times["scratch", EACH], times["scratch", SHIELDS]
-    anew = times["scene", LIFT] + each + shields + times["scene", ENCODE]
-    kept = anew - shields * (frames - 1) / frames
+    whole, each, guards = times["scene", TOTAL], times["scratch", EACH], times["scratch", GUARDS]
+    anew = times["scene", LIFT] + each + guards + times["scene", ENCODE]
+    kept = anew - guards * (frames - 1) / frames
     rows = [Row(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
-    rows += [Row("one scene: photo to video", whole), Row(EACH, each), Row(SHIELDS, shields)]
+    rows += [Row("one scene: photo to video", whole), Row(EACH, each), Row(GUARDS, guards)]
     rows.append(Row("frame by frame: photo to video", anew))
     rows.append(Row("frame by frame over one scene", anew / whole, "×"))
-    rows.append(Row("the same, the photo's shield made once", kept / whole, "×"))
+    rows.append(Row("the same, the photo's occlusion guard made once", kept / whole, "×"))
     facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
     return rows, {**facts, "width": path[0].width, "height": path[0].height}
 

@@ -83,9 +83,9 @@ def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussian
     """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
     before = completer.renderer.render(completer.base, camera)
     lap("view")
-    shield = completer.photo_guard()
+    guard = completer.photo_guard()
     lap("photo")
     inside = dataclasses.replace(completer, renderer=_LappedRenderer(completer.renderer, lap))
-    aux = inside.complete_view(camera, [shield], rendering=before)
+    aux = inside.complete_view(camera, [guard], rendering=before)
     lap("completion")
     return aux

@@ -90,8 +90,8 @@ class Completer:
 
         Args:
             cameras: the frames of a path, in their order; with `exact` any views.
-            exact: look at every view and complete it where it has a hole; else frames beside one that needs
-                nothing are passed over, and what nobody would see may stay open.
+            exact: look at every view and complete it if it has a hole; else skip frames beside one that needs
+                nothing, so that holes too small to see may stay open.
             progress: called with (views visited, views in all).
         """
         if not cameras:

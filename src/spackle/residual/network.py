@@ -156,7 +156,7 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 def predict_deltas(
     network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto", *, dense: bool = False
 ) -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's masked cells; nothing of use at the others.
+    """Deltas [h, w, 14] float32 of a view's masked cells; other cells are undefined.
 
     The network looks only around the masked cells, see `spackle.residual.sparse`; on a processor it does not compute
     what only the others need, see `ResidualNet.deltas_at`.
@@ -190,7 +190,7 @@ def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
 
 
 def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
-    """Deltas [B, 14, ...] of what the heads say [B, 16, ...].
+    """Deltas [B, 14, ...] from the outputs of the heads [B, 16, ...].
 
     Colours that are there need not be learnt: it is enough to say how much of them to take.
     """
@@ -227,7 +227,7 @@ def _initialise(network: ResidualNet) -> None:
 
 @functools.cache
 def shipped_network() -> ResidualNet | None:
-    """The network with the weights that come with the package; None where a build has none."""
+    """The network with the weights that come with the package; None if a build has none."""
     return load_residual(SHIPPED) if SHIPPED.is_file() else None
 
 

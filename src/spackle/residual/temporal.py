@@ -128,7 +128,7 @@ def _thinned(chosen: Tensor, fewest: int) -> Tensor:
 
 
 def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
-    """The six numbers of the motion that most of the picture follows; what moves by itself is outvoted."""
+    """The six numbers of the motion that most of the picture follows; moving objects are outvoted."""
     chosen = _thinned(trusted, 6)
     rows, wanted = basis[chosen].double(), flow[chosen].double()
     size = rows.flatten(0, 1).norm(dim=0).clamp_min(1e-12)  # so that one small ridge suits all columns
@@ -151,19 +151,19 @@ class FrameMemory:
     """What is known of a view once its frame is done."""
 
     shown: Tensor  # [H, W, 3] sRGB of the completed view
-    light: Tensor  # [H, W, 3] linear: what was seen, and in the holes what stands behind their veil
+    light: Tensor  # [H, W, 3] linear: what was seen, and in the holes the light behind their veil
     inverse_depth: Tensor  # [H, W] of the same, positive
     trust: Tensor  # [H, W] in 0..1: 1 where it was seen, about KEEP^n where that was n frames ago
 
 
 @dataclasses.dataclass(frozen=True)
 class CompletedFrame:
-    """A completed view whose holes are as they were, as far as they were there."""
+    """A completed view whose holes keep the colours of the view before, where it showed them."""
 
     aux: Gaussians
     view: Rendering
     memory: FrameMemory
-    flow: Tensor | None  # [H, W, 2] into the view before, holes included; None where there is none
+    flow: Tensor | None  # [H, W, 2] into the view before, holes included; None without one
 
 
 def propagate_colors(
@@ -183,7 +183,7 @@ def propagate_colors(
         camera: the view.
         renderer: draws the view again.
         views: the view of the base alone, and with `aux`.
-        past: of the view before; None at the start. One of another shot is passed over, see `Track.same_shot`.
+        past: of the view before; None at the start. A view of another shot is ignored, see `Track.same_shot`.
         flow: finds the motion between two pictures.
     """
     before, own = views
@@ -286,7 +286,7 @@ def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> floa
     Args:
         view, earlier: of the same size.
         flow: from the view's pixels to the earlier one's.
-        chosen: [H, W] bool, the pixels that count; None is returned where there are none.
+        chosen: [H, W] bool, the pixels that count; none of them: None.
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)

@@ -69,7 +69,7 @@ class SettledFrames:
             self._known[frame] = True
 
     def _unknown(self, index: int, step: int) -> int:
-        """How many unknown frames lie between this one and the next known; none where the path ends before."""
+        """How many unknown frames lie between this one and the next known one; 0 if the path ends before it."""
         count = 0
         frame = index + step
         while 0 <= frame < len(self._known):

@@ -60,7 +60,7 @@ class Routes:
         self._limits = limits
 
     def get(self, path: str) -> Body | None:
-        """Content type and bytes; None where there is nothing of that name."""
+        """Content type and bytes; None for an unknown path."""
         with self._lock:
             return self._bodies.get(path)
 
@@ -206,7 +206,7 @@ class Handler(BaseHTTPRequestHandler):
         if not self.request_version.startswith("HTTP/1."):
             self.request_version = "HTTP/1.0"  # an answer to HTTP/0.9 would have no headers
             return HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "this server speaks HTTP/1.1"
-        if self.headers.defects:  # what stands below the broken line was not read
+        if self.headers.defects:  # the parser stops at a broken line
             return HTTPStatus.BAD_REQUEST, "a line of the headers makes no sense"
         line = refusal(self.headers, self.site.names, local=self.site.local)
         return (HTTPStatus.FORBIDDEN, line) if line else None
@@ -245,7 +245,7 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(HTTPStatus(code), JSON, as_json({"error": HTTPStatus(code).phrase}))
 
     def version_string(self) -> str:
-        return "spackle"  # which versions is nobody's business
+        return "spackle"  # strangers learn no versions
 
     def log_message(self, format: str, *args: Any) -> None:
         self.site.log(f"{self.address_string()} {format % args!a}")

@@ -84,7 +84,7 @@ class Worker:
 
         Args:
             job: returns the path of the scene that is ready. An InputError of it is told in a line.
-            done: called when it has ended in whatever way, before the place is free.
+            done: called when the job has ended or failed, before the place is free.
         """
         with self._lock:
             self._count += 1
