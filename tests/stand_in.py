@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
-from spackle.bases.lite.network import LiteNet
+from spackle.bases.lite import LiteNet
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.image import Photo, resize_photo
 

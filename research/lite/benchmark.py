@@ -24,7 +24,7 @@ from method import colored, ends, sheet
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.bases.lite.base import LiteBase
+from spackle.bases.lite import LiteBase
 from spackle.evaluation.datasets.stereo import pair_of_2014
 from spackle.formats import save_png
 from spackle.image import load_photo

@@ -13,7 +13,7 @@ from mixture import DepthBatch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases.lite.base import network_size
+from spackle.bases.lite import network_size
 from spackle.training.recipe import Share
 
 FARTHEST = 0.02  # of the median inverse depth: what is farther, sky above all, counts as this far

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 from weights import save_networks
 
-from spackle.bases.lite.network import LiteNet
+from spackle.bases.lite import LiteNet
 from spackle.formats import atomic_path
 from spackle.formats.png import thumbnail
 from spackle.training.method import PICTURED, Method

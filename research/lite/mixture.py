@@ -16,7 +16,7 @@ from synthetic_scenes import TRIES, SyntheticScenes, Warn
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from spackle.bases.lite.base import InputScale, LiteBase, scaled_size
+from spackle.bases.lite import InputScale, LiteBase, scaled_size
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import load_photo

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from depth_loss import DepthLossWeights
 from frames import Group, Measured, of_camera, of_scenes
 
-from spackle.bases.lite.network import STAGES, STRIDE, Size
+from spackle.bases.lite import STAGES, STRIDE, Size
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES
 from spackle.training.data import digest_of, find_files

@@ -20,8 +20,7 @@ from recipe import LiteFiles, LiteRecipe
 from synthetic_scenes import SyntheticScenes
 from weights import first_network, freeze
 
-from spackle.bases.lite.base import LiteBase
-from spackle.bases.lite.network import LiteNet
+from spackle.bases.lite import LiteBase, LiteNet
 from spackle.errors import InputError
 from spackle.output_folder import make_folder
 from spackle.progress import Reporter

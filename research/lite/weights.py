@@ -12,7 +12,7 @@ from recipe import RANDOM, LiteRecipe
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.bases.lite.network import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
+from spackle.bases.lite import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 
@@ -170,7 +170,7 @@ STEPS = 127  # of eight bits, to either side of zero
 
 
 def save_networks(networks: Sequence[LiteNet], path: Path) -> None:
-    """Write networks into one file, which `spackle.bases.lite.network.load_networks` reads.
+    """Write networks into one file, which `spackle.bases.lite.load_networks` reads.
 
     Weights are stored in eight bits, with a scale for each output of a layer; biases and depthwise convolutions in half
     precision. `InputScale.network` counts them in this order.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.bases.depth_map import DepthMap as DepthMap
     from spackle.bases.depth_map import load_depth as load_depth
     from spackle.bases.hf import HfBase as HfBase
-    from spackle.bases.lite.base import LiteBase as LiteBase
+    from spackle.bases.lite import LiteBase as LiteBase
     from spackle.bases.protocol import Base as Base
     from spackle.bases.protocol import BasePrediction as BasePrediction
     from spackle.bases.sharp import SharpBase as SharpBase
@@ -42,7 +42,7 @@ __version__ = "0.1.0"
 _NAMES = {
     "spackle.bases.depth_map": ("DepthMap", "load_depth"),
     "spackle.bases.hf": ("HfBase",),
-    "spackle.bases.lite.base": ("LiteBase",),
+    "spackle.bases.lite": ("LiteBase",),
     "spackle.bases.protocol": ("Base", "BasePrediction"),
     "spackle.bases.sharp": ("SharpBase",),
     "spackle.camera": ("Camera",),

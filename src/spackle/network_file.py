@@ -16,23 +16,11 @@ from spackle.errors import InputError
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def read_network(network: Network, path: str | os.PathLike[str], what: str, otherwise: str) -> Network:
-    """Fill a network from a file, ready to be asked; half precision is widened to single.
-
-    Args:
-        network: of the architecture that the file is for.
-        path: the file.
-        what: for messages: whose weights they are.
-        otherwise: for messages: what to give in place of a file that is missing.
-
-    Raises:
-        InputError: a missing or broken file, or weights of another architecture.
-    """
-    return fill_network(network, read_tensors(path, what, otherwise), path, what)
-
-
 def read_tensors(path: str | os.PathLike[str], what: str, otherwise: str) -> dict[str, Tensor]:
-    """The tensors of a file by name; InputError where it is missing or broken, in the words of `read_network`."""
+    """The tensors of a file by name; InputError where it is missing or broken.
+
+    `what` says for messages whose weights they are, `otherwise` what to give in place of a missing file.
+    """
     if not os.path.isfile(path):
         raise InputError(f"{what} weights {path} not found: give {otherwise}")
     try:
@@ -43,7 +31,10 @@ def read_tensors(path: str | os.PathLike[str], what: str, otherwise: str) -> dic
 
 
 def fill_network(network: Network, tensors: Mapping[str, Tensor], path: str | os.PathLike[str], what: str) -> Network:
-    """The network with these weights; InputError where they are another's, in the words of `read_network`."""
+    """The network with these weights, ready to be asked; half precision is widened to single.
+
+    InputError for weights of another architecture; `path` and `what` are for its message.
+    """
     expected = network.state_dict()
     wrong = sorted(name for name in expected.keys() & tensors.keys() if expected[name].shape != tensors[name].shape)
     wrong += sorted(expected.keys() ^ tensors.keys())

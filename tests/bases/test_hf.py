@@ -6,16 +6,12 @@ import contextlib
 import copy
 import dataclasses
 import functools
-import hashlib
 import json
-import logging
 import math
 import os
 import shutil
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +29,7 @@ from torch.nn.functional import interpolate
 from spackle.bases import hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import DepthModel, HfBase
-from spackle.bases.hf_models import FARTHEST_M, MEANINGS, UNFIT, Window, crop, meaning_of, to_depth_map
+from spackle.bases.hf_models import FARTHEST_M, MEANINGS, UNFIT, Window, meaning_of, to_depth_map
 from spackle.bases.protocol import NEAREST_M
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
@@ -177,9 +173,8 @@ def front_depth(base: HfBase, photo: Photo) -> Tensor:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_each_kind_of_model_gives_gaussians_with_the_photos_colours(name: str, folders: dict[str, Path]) -> None:
-    photo, steps = photo_of(), []
-    base = load(folders[name])
-    prediction = base.predict(photo, lambda done, of: steps.append((done, of)))
+    photo, base = photo_of(), load(folders[name])
+    prediction = base.predict(photo)
     assert base.name == f"hf:{folders[name]}"
     front = photo.width * photo.height
     torch.testing.assert_close(prediction.gaussians.colors[:front], srgb_to_linear(photo.rgb).reshape(-1, 3))
@@ -187,7 +182,6 @@ def test_each_kind_of_model_gives_gaussians_with_the_photos_colours(name: str, f
     uv, z = prediction.camera.project(prediction.gaussians.means[:front])
     torch.testing.assert_close(uv, prediction.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-2)
     assert float(z.max() / z.min()) > 1.01
-    assert steps == [(1, 2), (2, 2)]
     said = "relative, scaled to 1.5–30 m" if name in RELATIVE else "metric, by the model"
     assert prediction.notes["depth_scale"] == said
     assert prediction.notes["precision"] == "fp32"
@@ -196,39 +190,24 @@ def test_each_kind_of_model_gives_gaussians_with_the_photos_colours(name: str, f
     assert all(isinstance(value, str | int | float) for value in prediction.notes.values())
 
 
-@pytest.mark.parametrize("name", [*METRIC, *RELATIVE])
+@pytest.mark.parametrize("name", ["metric", "glpn", *RELATIVE])
 @pytest.mark.parametrize(("width", "height"), [(96, 64), (61, 83)])
 def test_the_map_is_the_models_output_as_transformers_gives_it(
     name: str, width: int, height: int, folders: dict[str, Path], maps: list[DepthMap]
 ) -> None:
     photo = photo_of(width, height)
     output, processor = by_hand(folders[name], photo)
-    raw, expected = output.predicted_depth[0], None
-    if name == "zoedepth":  # as its own post-processing, in the sizes that it names, without torchvision
-        pads = [int(math.sqrt(side / 2) * 3) for side in (height, width)]
-        whole = interpolate(raw[None, None], (height + 2 * pads[0], width + 2 * pads[1]), mode="bicubic")[0, 0]
-        expected = whole[pads[0] : -pads[0], pads[1] : -pads[1]]
-    elif name == "dinov2":  # the photo stands in the middle of what was padded to multiples of 14
-        tall, wide = (-(-side // 14) * 14 for side in (height, width))
-        top, left = (tall - height) // 2, (wide - width) // 2
-        whole = interpolate(raw[None, None], (tall, wide), mode="bilinear", antialias=True)[0, 0]
-        expected = whole[top : top + height, left : left + width]
-    else:
-        expected = processor.post_process_depth_estimation(output)[0]["predicted_depth"]
+    expected = processor.post_process_depth_estimation(output)[0]["predicted_depth"]
     load(folders[name]).predict(photo)
     (found,) = maps
-    depth = found.depth
     assert bool(found.valid.all())
     assert (found.K, found.quantum, found.path) == (None, None, photo.path)
     if name in RELATIVE:
-        share = (1 / depth - 1 / FARTHEST_M) / (1 / NEAREST_M - 1 / FARTHEST_M)
+        share = (1 / found.depth - 1 / FARTHEST_M) / (1 / NEAREST_M - 1 / FARTHEST_M)
         near = float(expected.flatten().kthvalue(1 + round(0.999 * (expected.numel() - 1))).values)
         torch.testing.assert_close(share, (expected / near).clamp(0, 1), rtol=1e-4, atol=1e-5)
-    elif name in ("zoedepth", "dinov2"):
-        resized = interpolate(expected[None, None], depth.shape, mode="bilinear", antialias=True)[0, 0]
-        assert float((depth / resized - 1).abs().mean()) < 0.01
     else:
-        torch.testing.assert_close(depth, expected, rtol=1e-5, atol=0)
+        torch.testing.assert_close(found.depth, expected, rtol=1e-5, atol=0)
 
 
 def test_a_photo_larger_than_the_working_size_is_looked_at_and_lifted_at_that_size(folders: dict[str, Path]) -> None:
@@ -239,20 +218,6 @@ def test_a_photo_larger_than_the_working_size_is_looked_at_and_lifted_at_that_si
 
 
 # What a model sees.
-
-
-def test_depth_pro_sees_the_photo_normalised_and_stretched_without_smoothing(folders: dict[str, Path]) -> None:
-    photo = photo_of(
-        192, 128
-    )  # every pixel of the network's 64×64 is the mean of 2 of the 3 that it stands for, or of 4
-    pixels, window = load(folders["depth_pro"]).model.prepare(photo.rgb)
-    expected = torch.empty(3, 64, 64)
-    for channel, (mean, std) in enumerate(zip((0.5, 0.4, 0.3), (0.5, 0.6, 0.7), strict=True)):
-        values = (photo.rgb[..., channel] - mean) / std
-        rows = (values[0::2] + values[1::2]) / 2
-        expected[channel] = rows[:, 1::3]
-    torch.testing.assert_close(pixels[0], expected)
-    assert window == Window()
 
 
 def test_tips_sees_the_photo_stretched_as_pillow_does_it(folders: dict[str, Path]) -> None:
@@ -300,18 +265,6 @@ def test_depth_lies_where_the_photo_shows_it_whatever_is_resized_and_padded(
         assert pixel * (last + 1) == pytest.approx(sides[2], abs=within * pixel)
 
 
-def test_the_window_of_a_ramp_is_the_same_ramp() -> None:
-    ys, xs = torch.meshgrid(torch.arange(40.0) + 0.5, torch.arange(60.0) + 0.5, indexing="ij")
-    window = Window(left=0.11, top=0.07, width=0.78, height=0.86)
-    found = crop(3 * xs + 5 * ys, window)
-    assert found.shape == (34, 47)
-    v, u = torch.meshgrid((torch.arange(34) + 0.5) / 34, (torch.arange(47) + 0.5) / 47, indexing="ij")
-    expected = 3 * 60 * (0.11 + 0.78 * u) + 5 * 40 * (0.07 + 0.86 * v)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-2)
-    whole = torch.rand(5, 7)
-    assert crop(whole, Window()) is whole
-
-
 # Scale.
 
 
@@ -357,30 +310,24 @@ def depth_pro_by_hand(folder: Path, photo: Photo) -> tuple[Tensor, float]:
     return output.predicted_depth[0], float(output.field_of_view)
 
 
-def test_depth_pro_gives_the_lens_where_nobody_knows_it(folders: dict[str, Path], maps: list[DepthMap]) -> None:
-    photo = photo_of(focal=90.0, source=f"default {DEFAULT_FOCAL_MM:g} mm")
-    canonical, fov = depth_pro_by_hand(folders["depth_pro"], photo)
-    assert 20 < fov < 90
-    prediction = load(folders["depth_pro"]).predict(photo)
-    focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2)
-    assert prediction.camera.focal == pytest.approx((focal, focal), rel=1e-4)
-    assert prediction.lens_source == "Depth Pro"
-    # The formula of its image processor, which exists for torchvision alone.
-    expected = 1 / (canonical * photo.width / focal).clamp(1e-4, 1e4)
-    torch.testing.assert_close(maps[0].depth, expected, rtol=1e-3, atol=0)
-
-
-@pytest.mark.parametrize("source", ["EXIF", "--focal-px"])
-def test_depth_pro_believes_a_known_lens_and_scales_its_depth_to_it(
-    source: str, folders: dict[str, Path], maps: list[DepthMap]
+def test_depth_pro_gives_the_lens_where_nobody_knows_it_and_else_scales_its_depth_to_it(
+    folders: dict[str, Path], maps: list[DepthMap]
 ) -> None:
-    canonical, _ = depth_pro_by_hand(folders["depth_pro"], photo_of())
-    for focal in (48.0, 96.0, 192.0):
-        prediction = load(folders["depth_pro"]).predict(photo_of(focal=focal, source=source))
-        assert prediction.camera.focal == (focal, focal)
-        assert prediction.lens_source == ""
-    for found, focal in zip(maps, (48.0, 96.0, 192.0), strict=True):
-        torch.testing.assert_close(found.depth, 1 / (canonical * 96 / focal).clamp(1e-4, 1e4), rtol=1e-3, atol=0)
+    base, unknown = load(folders["depth_pro"]), photo_of(focal=90.0, source=f"default {DEFAULT_FOCAL_MM:g} mm")
+    canonical, fov = depth_pro_by_hand(folders["depth_pro"], unknown)
+    assert 20 < fov < 90
+    seen = 0.5 * unknown.width / math.tan(math.radians(fov) / 2)
+    photos = [
+        unknown,
+        *(photo_of(focal=focal, source=source) for focal, source in ((48.0, "EXIF"), (192.0, "--focal-px"))),
+    ]
+    for photo, focal, source in zip(photos, (seen, 48.0, 192.0), ("Depth Pro", "", ""), strict=True):
+        prediction = base.predict(photo)
+        assert prediction.camera.focal == pytest.approx((focal, focal), rel=1e-4)
+        assert prediction.lens_source == source
+        # The formula of its image processor, which exists for torchvision alone.
+        expected = 1 / (canonical * photo.width / focal).clamp(1e-4, 1e4)
+        torch.testing.assert_close(maps[-1].depth, expected, rtol=1e-3, atol=0)
 
 
 # What the numbers mean.
@@ -393,40 +340,19 @@ def test_every_depth_model_of_the_installed_transformers_has_a_known_meaning_or_
 
 
 @pytest.mark.parametrize(
-    ("settings", "meaning"),
-    [
-        ({"model_type": "depth_anything"}, "relative disparity"),
-        ({"model_type": "depth_anything", "depth_estimation_type": "relative"}, "relative disparity"),
-        ({"model_type": "depth_anything", "depth_estimation_type": "metric"}, "metres"),
-        ({"model_type": "dpt"}, "relative disparity"),
-        ({"model_type": "dpt", "backbone_config": None}, "relative disparity"),
-        ({"model_type": "dpt", "backbone_config": {"model_type": "beit"}}, "relative disparity"),
-        ({"model_type": "dpt", "backbone_config": {"model_type": "dinov2"}}, "metres"),
-        ({"model_type": "glpn"}, "metres"),
-        ({"model_type": "zoedepth"}, "metres"),
-        ({"model_type": "tipsv2_dpt"}, "metres"),
-        ({"model_type": "depth_pro"}, "canonical disparity"),
-    ],
-)
-def test_the_meaning_of_the_output_follows_from_the_settings(settings: dict[str, Any], meaning: str) -> None:
-    assert meaning_of(settings, "hf:x") == meaning
-
-
-@pytest.mark.parametrize(
     ("settings", "words"),
     [
         ({}, "its config.json names no kind of depth model that is known here: give one of depth_anything, depth_pro"),
-        ({"model_type": "bert"}, "'bert' is no kind of depth model that is known here"),
         ({"model_type": ["dpt"]}, "no kind of depth model"),
         ({"model_type": "chmv2"}, "how high trees stand"),
-        ({"model_type": "prompt_depth_anything"}, "measured depth map"),
-        ({"model_type": "depth_anything", "depth_estimation_type": "ordinal"}, "neither relative nor metric"),
         ({"model_type": "depth_anything", "depth_estimation_type": ["metric"]}, "neither relative nor metric"),
     ],
 )
 def test_an_output_that_nobody_can_read_is_refused(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
         meaning_of(settings, "hf:x")
+    for kind in ({"model_type": "depth_anything"}, {"model_type": "dpt", "backbone_config": {"model_type": "beit"}}):
+        assert meaning_of(kind, "hf:x") == "relative disparity"  # the default, and MiDaS
 
 
 # Bad outputs.
@@ -459,15 +385,10 @@ SLOPE = torch.linspace(2, 5, 96).expand(1, 64, 96).contiguous()
     ("depth", "meaning", "words"),
     [
         (torch.zeros(1, 64, 96), "metres", "predicts 0 for every pixel"),
-        (torch.zeros(1, 64, 96), "relative disparity", "predicts 0 for every pixel"),
-        (torch.zeros(1, 64, 96), "canonical disparity", "predicts 0 for every pixel"),
-        (torch.full((1, 64, 96), 3.0), "metres", "predicts 3 for every pixel"),
         (torch.full((1, 64, 96), math.nan), "metres", "no finite number"),
-        (torch.full((1, 64, 96), math.inf), "relative disparity", "no finite number"),
         (-SLOPE, "metres", "no depth above zero"),
         (-SLOPE, "relative disparity", "no disparity above zero"),
         (SLOPE[0], "metres", r"fails \(an output of shape \(64, 96\)\)"),
-        (SLOPE[None], "metres", "fails"),
     ],
 )
 def test_an_output_that_is_no_depth_is_one_line_with_photo_and_model(depth: Tensor, meaning: str, words: str) -> None:
@@ -487,12 +408,9 @@ def test_a_few_bad_pixels_are_filled_and_counted(maps: list[DepthMap]) -> None:
     assert prediction.notes["depth_filled"] == pytest.approx(4 / (64 * 96), abs=1e-4)
     z = prediction.gaussians.means[: 64 * 96, 2].reshape(64, 96)
     torch.testing.assert_close(z[10, 20:24], SLOPE[0, 10, 20:24], rtol=0.1, atol=0)
-    relative = SLOPE.clone()
-    relative[0, 5, 5] = math.nan
-    assert saying(relative, "relative disparity").predict(photo_of()).notes["depth_invalid_pixels"] == 1
 
 
-@pytest.mark.parametrize("fov", [0.0, -3.0, 180.0, 179.999, math.nan, math.inf])
+@pytest.mark.parametrize("fov", [0.0, 179.999, math.nan])
 def test_a_field_of_view_that_no_lens_has_is_refused_unless_the_lens_is_known(fov: float) -> None:
     base = saying(SLOPE, "canonical disparity", fov)
     with pytest.raises(InputError, match="which no lens has: give the focal length with --focal-mm"):
@@ -523,7 +441,10 @@ def test_bf16_is_close_to_fp32_without_stairs_and_repeats(folders: dict[str, Pat
     assert (exact.precision, low.precision) == ("fp32", "bf16")
     for base in (exact, low, low):
         assert base.predict(photo).notes["precision"] == base.precision
-    one, other, again = (found.depth for found in maps)
+    with torch.autocast("cpu", torch.bfloat16):  # the caller's changes nothing
+        exact.predict(photo)
+    one, other, again, within = (found.depth for found in maps)
+    assert torch.equal(one, within)
     assert not torch.equal(one, other)
     torch.testing.assert_close(other, one, rtol=0.02, atol=0)
     assert torch.equal(other, again)
@@ -553,14 +474,6 @@ def test_weights_of_half_precision_are_widened(folders: dict[str, Path], tmp_pat
     torch.testing.assert_close(maps[0].depth, maps[1].depth, rtol=0.02, atol=0)
 
 
-def test_switches_of_the_caller_change_nothing(folders: dict[str, Path], maps: list[DepthMap]) -> None:
-    base = load(folders["metric"])
-    base.predict(photo_of())
-    with torch.autocast("cpu", torch.bfloat16):
-        base.predict(photo_of())
-    assert torch.equal(maps[0].depth, maps[1].depth)
-
-
 # Folders that are no model.
 
 
@@ -576,10 +489,6 @@ def writing(name: str, content: str | bytes) -> Callable[[Path], None]:
 def cut(folder: Path) -> None:
     weights = folder / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1000])
-
-
-def of_another_model(folder: Path) -> None:
-    save_file({"linear.weight": torch.zeros(3, 3)}, folder / "model.safetensors", metadata={"format": "pt"})
 
 
 def lacking(prefix: str) -> Callable[[Path], None]:
@@ -615,14 +524,11 @@ INPUT = "preprocessor_config.json"
     [
         (without("config.json"), "has no config.json, so it is no model of transformers"),
         (writing("config.json", "{"), "config.json cannot be read"),
-        (writing("config.json", b"\xff\xfe"), "config.json cannot be read"),
         (writing("config.json", "[]"), "config.json is no JSON object"),
         (writing("config.json", '{"model_type": "bert"}'), "'bert' is no kind of depth model"),
-        (writing("config.json", '{"architectures": []}'), "its config.json names no kind of depth model"),
         (with_setting("config.json", neck_hidden_sizes="many"), "cannot be loaded"),
         (with_setting("config.json", reassemble_hidden_size=48), "its weights have another shape than its config.json"),
         (without(INPUT), "has no preprocessor_config.json"),
-        (writing(INPUT, "{"), "cannot be loaded"),
         (writing(INPUT, '{"image_processor_type": "Crystal"}'), "cannot be loaded|fails"),
         pytest.param(
             with_setting(INPUT, image_processor_type="Sam2ImageProcessor"),
@@ -631,16 +537,13 @@ INPUT = "preprocessor_config.json"
         ),
         (without("model.safetensors"), "has no model.safetensors, the only kind of weights that runs no code"),
         (pickled, "has no model.safetensors, the only kind of weights that runs no code"),
-        (writing("model.safetensors", b""), "cannot be loaded"),
-        (writing("model.safetensors", b"PK\x03\x04" * 100), "cannot be loaded"),
         (cut, "cannot be loaded"),
-        (of_another_model, "its weights lack .* and .* more: give the weights that belong to its config.json"),
+        (lacking("head"), "its weights lack .* and .* more: give the weights that belong to its config.json"),
         (lacking("head.conv3.bias"), "its weights lack head.conv3.bias: give"),
         (
             writing(INDEX, '{"weight_map": {"a": "model-00001-of-00002.safetensors"}}'),
             "not there .model-00001-of-00002.s",
         ),
-        (writing(INDEX, '{"weight_map": {"a": ["b"]}}'), "names weights that are not there"),
         (writing(INDEX, '{"weight_map": []}'), "names weights that are not there"),
         (writing(INDEX, "{"), "model.safetensors.index.json cannot be read"),
     ],
@@ -664,7 +567,7 @@ def test_a_folder_that_is_no_model_is_one_line(
 
 @pytest.mark.parametrize(
     "changes",
-    [{"size": {"height": 0, "width": 64}}, {"size": {"height": 1 << 20, "width": 64}}, {"size": 64}, {"resample": 3}],
+    [{"size": {"height": 1 << 20, "width": 64}}, {"size": 64}, {"resample": 3}],
 )
 def test_an_input_for_depth_pro_that_is_not_known_here_is_one_line(
     changes: dict[str, Any], folders: dict[str, Path], tmp_path: Path
@@ -681,15 +584,7 @@ def test_weights_that_a_model_never_uses_may_be_missing(
     """DPT-Large as published lacks them: the first stage of the neck has nothing to add to."""
     folder = shutil.copytree(folders["dpt"], tmp_path / "dpt")
     lacking("neck.fusion_stage.layers.0.residual_layer1")(folder)
-    warned: list[logging.LogRecord] = []
-    listener = logging.Handler()
-    listener.emit = warned.append  # type: ignore[method-assign]
-    logging.getLogger("transformers").addHandler(listener)
-    try:
-        load(folder).predict(photo_of())
-    finally:
-        logging.getLogger("transformers").removeHandler(listener)
-    assert not warned
+    load(folder).predict(photo_of())
     load(folders["dpt"]).predict(photo_of())
     assert torch.equal(maps[0].depth, maps[1].depth)
 
@@ -762,132 +657,64 @@ def test_folders_are_told_from_names_of_the_hub(
             HfBase.load(name)
 
 
-# The hub, as a server on this machine.
+# The hub.
 
 
-class Hub(ThreadingHTTPServer):
-    """Models as the hub serves them."""
+class Hub:
+    """Stands for huggingface_hub's snapshot_download: copies a model's files into a cache, or raises what it raises."""
 
-    daemon_threads = False
-    models: dict[str, Path]
-    gated: set[str]
-    requests: list[str]
+    def __init__(self, models: dict[str, Path], cache: Path) -> None:
+        self.models, self.cache, self.asked, self.connected = models, cache, list[list[str]](), True
 
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
+    def __call__(self, model: str, *, allow_patterns: list[str], local_files_only: bool = False) -> str:
+        from huggingface_hub import errors
 
-
-class Answers(BaseHTTPRequestHandler):
-    server: Hub
-    sha = "0123456789abcdef0123456789abcdef01234567"
-
-    def do_GET(self) -> None:
-        path = self.path.partition("?")[0].strip("/")
-        self.server.requests.append(f"{self.command} {path}")
-        api = path.startswith("api/models/")
-        owner, name, *rest = path.removeprefix("api/models/").split("/")
-        folder = self.server.models.get(f"{owner}/{name}")
-        if folder is None:
-            return self.answer(401, b"{}", {"X-Error-Code": "RepoNotFound", "X-Error-Message": "Repository not found"})
-        if f"{owner}/{name}" in self.server.gated and not (api and rest[:1] != ["tree"]):
-            return self.answer(403, b"{}", {"X-Error-Code": "GatedRepo", "X-Error-Message": "Access is restricted"})
-        if api and rest[:1] == ["tree"]:
-            return self.answer(200, json.dumps([self.entry(file) for file in sorted(folder.iterdir())]).encode())
-        if api:
-            return self.answer(200, json.dumps({"id": f"{owner}/{name}", "sha": self.sha, "siblings": []}).encode())
-        data = (folder / rest[-1]).read_bytes()
-        tag = f'"{hashlib.sha1(data).hexdigest()}"'
-        return self.answer(200, data, {"ETag": tag, "X-Repo-Commit": self.sha})
-
-    do_HEAD = do_GET
-
-    def entry(self, file: Path) -> dict[str, Any]:
-        data = file.read_bytes()
-        return {"type": "file", "path": file.name, "size": len(data), "oid": hashlib.sha1(data).hexdigest()}
-
-    def answer(self, status: int, data: bytes, headers: dict[str, str] | None = None) -> None:
-        self.send_response(status)
-        for name, value in {"Content-Length": str(len(data)), **(headers or {})}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(data)
-
-    def log_message(self, *_: Any) -> None:
-        pass
+        cached = self.cache / model
+        if not local_files_only:
+            self.asked.append(allow_patterns)
+            if not self.connected:
+                raise errors.LocalEntryNotFoundError("not there, and no connection")
+            if model not in self.models:
+                refusal = errors.GatedRepoError if model.endswith("gated") else errors.RepositoryNotFoundError
+                raise refusal.__new__(refusal)  # what they take depends on the version
+            cached.mkdir(parents=True, exist_ok=True)
+            for pattern in allow_patterns:
+                for file in self.models[model].glob(pattern):
+                    shutil.copy(file, cached)
+        elif not cached.is_dir():
+            raise errors.LocalEntryNotFoundError("not there")
+        return str(cached)
 
 
 @pytest.fixture
-def hub(folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    """A hub with one model that is to be had and one that asks for consent, and an empty cache."""
-    import huggingface_hub
-
-    server = Hub(("127.0.0.1", 0), Answers)
-    server.models = {"owner/name": folders["metric"], "owner/gated": folders["metric"], "owner/text": tmp_path / "text"}
-    server.gated, server.requests = {"owner/gated"}, []
+def hub(folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
+    """A hub with a model and what is none, and an empty cache."""
     (tmp_path / "text").mkdir()
     for name, content in {"config.json": '{"model_type": "bert"}', INPUT: "{}", "model.safetensors": "x"}.items():
         (tmp_path / "text" / name).write_text(content)
-    original = huggingface_hub.snapshot_download
-    here = functools.partial(original, endpoint=server.url, cache_dir=tmp_path / "cache")
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", here)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    server = Hub({"owner/name": folders["metric"], "owner/text": tmp_path / "text"}, tmp_path / "cache")
+    monkeypatch.setattr("huggingface_hub.snapshot_download", server)
+    return server
 
 
-def test_a_model_of_the_hub_is_fetched_once_and_then_needs_no_network(
-    hub: Hub, folders: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+def test_a_model_of_the_hub_is_fetched_once_and_then_needs_no_network_unless_a_file_is_missing(
+    hub: Hub, folders: dict[str, Path]
 ) -> None:
-    photo = photo_of()
-    (folders["metric"] / "pytorch_model.bin").write_bytes(b"never asked for")
-    try:
-        first = HfBase.load("owner/name", device="cpu", precision="fp32")
-    finally:
-        os.remove(folders["metric"] / "pytorch_model.bin")
+    first = HfBase.load("owner/name", device="cpu", precision="fp32")
     assert first.name == "hf:owner/name"
-    asked = [request for request in hub.requests if "/resolve/" in request]
-    assert {request.rpartition("/")[2] for request in asked} == {"config.json", INPUT, "model.safetensors"}
-    hub.requests.clear()
+    assert not any(pattern.endswith((".bin", ".py")) for patterns in hub.asked for pattern in patterns)
+    hub.asked.clear()
     again = HfBase.load("owner/name", device="cpu", precision="fp32")
-    assert hub.requests == []
-    depth = front_depth(first, photo)
-    assert torch.equal(depth, front_depth(again, photo))
-    assert torch.equal(depth, front_depth(load(folders["metric"]), photo))
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("listed", [True, False])
-def test_a_fetch_that_broke_off_is_finished(
-    listed: bool, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import huggingface_hub
-
+    assert hub.asked == []
+    depth = front_depth(first, photo_of())
+    assert torch.equal(depth, front_depth(again, photo_of()))
+    assert torch.equal(depth, front_depth(load(folders["metric"]), photo_of()))
+    os.remove(hub.cache / "owner" / "name" / "model.safetensors")  # as after a fetch that broke off
     HfBase.load("owner/name", device="cpu")
-    cache = tmp_path / "cache"
-    if not listed:  # transformers itself fills the cache without a list of what belongs there
-        ignored = shutil.ignore_patterns("trees")
-        cache = shutil.copytree(cache, tmp_path / "other", symlinks=True, ignore=ignored)
-        elsewhere = functools.partial(huggingface_hub.snapshot_download, cache_dir=cache)
-        monkeypatch.setattr(huggingface_hub, "snapshot_download", elsewhere)
-    (snapshot,) = cache.rglob("snapshots/*")
-    os.remove(snapshot / "model.safetensors")
-    hub.requests.clear()
-    HfBase.load("owner/name", device="cpu")
-    assert hub.requests
+    assert hub.asked
 
 
-def test_what_the_hub_cannot_give_is_one_line(
-    hub: Hub, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    import huggingface_hub
-
+def test_what_the_hub_cannot_give_is_one_line(hub: Hub) -> None:
     for name, words in (
         ("owner/text", "'bert' is no kind of depth model"),
         ("owner/absent", "the hub has no such model, or only for its owner: check"),
@@ -895,9 +722,7 @@ def test_what_the_hub_cannot_give_is_one_line(
     ):
         with pytest.raises(InputError, match=f"^hf:{name}: {words}"):
             HfBase.load(name)
-    assert not any("model.safetensors" in request for request in hub.requests)  # no weights of what is no depth model
-    closed = functools.partial(huggingface_hub.snapshot_download, endpoint="http://127.0.0.1:9")
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", closed)
+    assert not any("model.safetensors" in patterns for patterns in hub.asked)  # no weights of what is no depth model
+    hub.connected = False
     with pytest.raises(InputError, match=r"^hf:owner/name: not on this machine yet, and the hub cannot be reached"):
         HfBase.load("owner/name")
-    assert capfd.readouterr() == ("", "")

@@ -14,8 +14,20 @@ from torch.nn.functional import interpolate
 from weights import save_networks
 
 import spackle
-from spackle.bases.lite.base import FARTHEST, INPUT_SCALES, NEAREST_M, SHIPPED, LiteBase, merged, network_size
-from spackle.bases.lite.network import SCALE, STRIDE, LiteNet, Size, load_networks
+from spackle.bases.lite import (
+    FARTHEST,
+    INPUT_SCALES,
+    SCALE,
+    SHIPPED,
+    STRIDE,
+    LiteBase,
+    LiteNet,
+    Size,
+    load_networks,
+    merged,
+    network_size,
+)
+from spackle.bases.protocol import NEAREST_M
 from spackle.errors import InputError
 from spackle.image import Photo
 
@@ -95,15 +107,10 @@ def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(heig
         assert bool(torch.isfinite(shipped().inverse_depth(small)).all())
 
 
-def test_the_weights_are_small_and_of_the_network_that_reads_them() -> None:
-    assert SHIPPED.stat().st_size <= 12_000_000
-    networks = load_networks(SHIPPED)
-    assert [network.encoder.size for network in networks] == ["lite0", "lite2"]
-    assert sum(weight.numel() for network in networks for weight in network.parameters()) < SHIPPED.stat().st_size
-
-
-def test_stored_weights_are_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
+def test_stored_weights_are_small_and_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
     """Steps of 1/127 of an output's largest weight: half of that is the most that one can be off."""
+    assert SHIPPED.stat().st_size <= 12_000_000
+    assert [network.encoder.size for network in load_networks(SHIPPED)] == ["lite0", "lite2"]
     networks = [some_network("lite2", 1), some_network("lite0", 2)]
     save_networks(networks, tmp_path / "two.safetensors")
     read = load_networks(tmp_path / "two.safetensors")
@@ -161,20 +168,11 @@ def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, ha
     else:
         del tensors[name]
     save_file(tensors, tmp_path / "harmed.safetensors")
+    (tmp_path / "broken.safetensors").write_bytes(b"\x00" * 100)
+    for name, problem in (("broken", "not readable as safetensors"), ("none", "not found")):
+        with pytest.raises(InputError, match=problem):
+            LiteBase.load(tmp_path / f"{name}.safetensors")
     with pytest.raises(
         InputError, match=r"harmed.safetensors are of another network: (1 tensors differ, e.g. context|encoder\.stages)"
     ):
         LiteBase.load(tmp_path / "harmed.safetensors")
-
-
-def test_weights_of_another_network_are_refused_in_a_line(tmp_path: Path) -> None:
-    from spackle.residual.network import SHIPPED as RESIDUAL
-
-    with pytest.raises(InputError, match=r"lite weights .* are of another network"):
-        LiteBase.load(RESIDUAL)
-    broken = tmp_path / "broken.safetensors"
-    broken.write_bytes(b"\x00" * 100)
-    with pytest.raises(InputError, match="not readable as safetensors"):
-        LiteBase.load(broken)
-    with pytest.raises(InputError, match="not found"):
-        LiteBase.load(tmp_path / "none.safetensors")

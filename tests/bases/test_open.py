@@ -24,7 +24,7 @@ from stand_in import StandIn, write_lite, write_model
 import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
-from spackle.bases.lite.base import LiteBase
+from spackle.bases.lite import LiteBase
 from spackle.bases.open import KINDS, BaseError, BaseSettings, Choice, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
@@ -51,7 +51,7 @@ def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPat
     """A machine without SHARP, and with weights of lite that belong to the test."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
-    monkeypatch.setattr("spackle.bases.lite.base.SHIPPED", lite)
+    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
     return lite
 
 

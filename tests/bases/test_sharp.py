@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,19 @@ from torch import Tensor, nn
 
 import spackle
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import to_metric, to_square
+from spackle.bases.sharp.base import to_metric
 from spackle.bases.sharp.checkpoint import expected_shapes
-from spackle.bases.sharp.encoder import FULL_WINDOWS, HALF_WINDOWS, WINDOWS, cut, merge
-from spackle.bases.sharp.layers import FULL, TINY, GroupNorm, set_precision
+from spackle.bases.sharp.layers import (
+    FULL,
+    FULL_WINDOWS,
+    HALF_WINDOWS,
+    TINY,
+    WINDOWS,
+    GroupNorm,
+    cut,
+    merge,
+    set_precision,
+)
 from spackle.bases.sharp.network import SharpNetwork, compose, make_start
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.device import enough_memory, multiplies_bf16, own_arithmetic, pick_device, pick_dtype
@@ -61,14 +70,10 @@ def test_the_published_checkpoint_has_exactly_these_tensors() -> None:
     assert gaussians_of(FULL) == 1_179_648
 
 
-def test_the_tiny_network_says_what_the_original_says_about_depth() -> None:
-    disparity, _ = run_tiny(torch.float32)
-    assert off(disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
-
-
 @pytest.mark.parametrize("attribute", COLUMNS)
-def test_the_tiny_network_gives_the_originals_gaussians(attribute: str) -> None:
-    _, gaussians = run_tiny(torch.float32)
+def test_the_tiny_network_gives_the_originals_depth_and_gaussians(attribute: str) -> None:
+    disparity, gaussians = run_tiny(torch.float32)
+    assert off(disparity[:, ::48, ::48], GOLDEN["disparity"]) < 1e-5
     index = torch.from_numpy(GOLDEN["index"].astype(np.int64))
     columns = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.colors, gaussians.opacities[:, None]]
     found = torch.cat(columns, dim=1)[index]
@@ -93,7 +98,7 @@ def test_bf16_draws_the_same_picture_to_45_db() -> None:
     assert not torch.equal(*views)
 
 
-@pytest.mark.parametrize("batch", [1, 4, 35])
+@pytest.mark.parametrize("batch", [4, 35])
 def test_the_number_of_windows_at_once_changes_nothing(batch: int) -> None:
     network, seen = micro_network(), []
     with torch.inference_mode():
@@ -145,24 +150,13 @@ def test_without_deltas_gaussians_lie_on_the_nearest_depth_of_their_cells_with_i
     assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(32, 4))
 
 
-def test_the_photo_is_stretched_to_the_square_with_corners_on_corners() -> None:
-    rgb = torch.rand(5, 9, 3)
-    square = to_square(rgb, 17)[0]
-    for row, column in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
-        torch.testing.assert_close(square[:, row, column], rgb[row, column])
-    torch.testing.assert_close(square[:, 8, 8], rgb[2, 4])  # the middle pixel
-
-
 def odd_photos() -> dict[str, Image.Image]:
     color = Image.fromarray(picture())
     grey = np.asarray(color.convert("L"))
     return {
         "one.png": color.resize((1, 1)),
         "long.png": color.resize((10_000, 10)),
-        "grey.png": Image.fromarray(grey),
-        "rgba.png": color.convert("RGBA"),
         "deep.png": Image.fromarray(grey.astype(np.uint16) * 257),
-        "cmyk.jpg": color.convert("CMYK"),
     }
 
 
@@ -172,7 +166,9 @@ def test_odd_photos_become_gaussians_in_front_of_their_camera(tmp_path: Path, na
     image.save(tmp_path / name)
     seen: list[tuple[int, int]] = []
     photo = load_photo(tmp_path / name)
-    prediction = SharpBase(micro_network()).predict(photo, lambda done, total: seen.append((done, total)))
+    base = SharpBase(micro_network(), weights="w.pt")
+    prediction = base.predict(photo, lambda done, total: seen.append((done, total)))
+    assert prediction.notes == {"precision": "fp32", "weights": "w.pt"}
     camera, gaussians = prediction.camera, prediction.gaussians
     assert (camera.width, camera.height) == ((1536, 2) if name == "long.png" else image.size)
     assert len(gaussians) == gaussians_of(MICRO)
@@ -185,14 +181,6 @@ def test_odd_photos_become_gaussians_in_front_of_their_camera(tmp_path: Path, na
     assert float(CpuRenderer().render(gaussians, camera).alpha.mean()) > 0.5
 
 
-def test_what_a_prediction_ran_in_and_on_stands_in_its_notes() -> None:
-    photo = Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg"))
-    network = micro_network()
-    assert SharpBase(network, weights="w.pt").predict(photo).notes == {"precision": "fp32", "weights": "w.pt"}
-    set_precision(network, torch.bfloat16)
-    assert SharpBase(network, low_memory=True).predict(photo).notes["precision"] == "bf16"
-
-
 def test_a_wider_lens_sees_the_same_depth_factor_as_the_paper_has_it() -> None:
     """Depth goes with focal length over width, and sideways positions do not."""
     base = SharpBase(micro_network())
@@ -202,35 +190,22 @@ def test_a_wider_lens_sees_the_same_depth_factor_as_the_paper_has_it() -> None:
     torch.testing.assert_close(far[:, :2], near[:, :2], rtol=1e-2, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("flags", "native"),
-    [
-        ({"amx_bf16": True}, True),
-        ({"avx512_bf16": True}, True),
-        ({"avx512_f": True, "avx512_bf16": False}, False),
-        ({}, False),
-    ],
-)
-def test_auto_is_bf16_where_the_processor_multiplies_it(
-    monkeypatch: pytest.MonkeyPatch, flags: dict[str, bool], native: bool
+@pytest.mark.parametrize(("flag", "native"), [("amx_bf16", True), ("avx512_bf16", True), ("avx512_f", False)])
+def test_auto_is_bf16_where_the_hardware_multiplies_it(
+    monkeypatch: pytest.MonkeyPatch, flag: str, native: bool
 ) -> None:
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: flags, raising=False)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {flag: True}, raising=False)
     assert multiplies_bf16(CPU) is native
     assert pick_dtype("auto", CPU) == (torch.bfloat16 if native else torch.float32)
     assert (pick_dtype("fp32", CPU), pick_dtype("bf16", CPU)) == (torch.float32, torch.bfloat16)
     monkeypatch.delattr(torch.cpu, "get_capabilities")
     assert pick_dtype("auto", CPU) == torch.float32  # an older torch cannot tell
+    for capability, ampere in (((7, 5), False), ((8, 0), True)):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device, found=capability: found)
+        assert multiplies_bf16(torch.device("cuda")) is ampere
 
 
-@pytest.mark.parametrize(("capability", "native"), [((7, 5), False), ((8, 0), True), ((9, 0), True)])
-def test_auto_is_bf16_on_ampere_and_later(
-    monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], native: bool
-) -> None:
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-    assert multiplies_bf16(torch.device("cuda")) is native
-
-
-@pytest.mark.parametrize("device", ["cuda", "cuda:0", "banana", "ban\x1b[31mana\n", "meta", "mps", ""])
+@pytest.mark.parametrize("device", ["cuda", "ban\x1b[31mana\n", "meta", ""])
 def test_a_device_that_is_not_there_is_one_line_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
@@ -242,8 +217,6 @@ def test_a_device_that_is_not_there_is_one_line_before_anything_is_read(
 
 
 def test_a_device_that_is_there_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert pick_device(None) == pick_device("cpu") == pick_device(CPU) == CPU
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert (pick_device(None), pick_device("cpu")) == (torch.device("cuda"), CPU)
@@ -278,34 +251,18 @@ def too_much(*arguments: object, **options: object) -> Tensor:
     return torch.empty(2**60, dtype=torch.uint8)
 
 
-@pytest.mark.parametrize("low_memory", [False, True])
-def test_too_little_memory_to_predict_is_one_line(monkeypatch: pytest.MonkeyPatch, low_memory: bool) -> None:
-    base = SharpBase(micro_network(), low_memory=low_memory)
-    monkeypatch.setattr(base.network, "forward", too_much)
-    with pytest.raises(spackle.InputError, match="not enough memory for the network") as caught:
-        base.predict(Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg")))
-    assert ("--low-memory" in str(caught.value)) is not low_memory
-
-
-def too_much_for_a_device(network: SharpNetwork, *device: object, **layout: object) -> object:
-    """`to` that fails for a device, and leaves the rest as it is."""
-    return too_much() if device else network
-
-
 @pytest.mark.parametrize(
-    ("kind", "method", "failing", "advice"),
+    ("kind", "method", "advice"),
     [
-        (Tensor, "clone", too_much, "try --precision bf16, or close"),
-        (Tensor, "float", too_much, "try --precision bf16, or close"),
-        (SharpNetwork, "to", too_much_for_a_device, "try --precision bf16, or close"),
-        (torch, "load", too_much, "close"),  # to map the file
+        (Tensor, "float", "try --precision bf16, or close"),
+        (torch, "load", "close"),  # to map the file
     ],
 )
 def test_too_little_memory_to_load_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any, method: str, failing: Callable[..., object], advice: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any, method: str, advice: str
 ) -> None:
     path = write_tiny(tmp_path / "w.pt")
-    monkeypatch.setattr(kind, method, failing)
+    monkeypatch.setattr(kind, method, too_much)
     with pytest.raises(spackle.InputError, match=f"not enough memory for the network: {advice}"):
         SharpBase.load(path, precision="fp32", device="cpu")
 

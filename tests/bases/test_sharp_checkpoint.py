@@ -16,7 +16,6 @@ from sharp_weights import tiny_weights, write_tiny
 from torch import Tensor
 
 import spackle
-from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.checkpoint import load_network
 
 FP32 = torch.float32
@@ -85,7 +84,7 @@ def test_a_pickle_with_code_is_refused_and_not_run(tmp_path: Path, weights: dict
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.999])
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
 def test_a_cut_file_is_refused(tmp_path: Path, suffix: str, share: float) -> None:
     path = write_tiny(tmp_path / f"weights{suffix}")
@@ -112,18 +111,14 @@ def repacked(source: Path, target: Path, method: int = zipfile.ZIP_STORED, byteo
     return target
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_zip_that_was_compressed_is_refused(tmp_path: Path, weights: dict[str, Tensor], method: int) -> None:
+def test_a_zip_that_was_compressed_or_is_big_endian_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
     path = write_tiny(tmp_path / "w.pt")
-    assert "zipped again by another program" in refused(repacked(path, tmp_path / "packed.pt", method))
+    packed = repacked(path, tmp_path / "packed.pt", zipfile.ZIP_DEFLATED)
+    assert "zipped again by another program" in refused(packed)
+    assert "big-endian" in refused(repacked(path, tmp_path / "turned.pt", byteorder=b"big"))
+    assert "endian" in refused(repacked(path, tmp_path / "turned.pt", byteorder=b"middle"))
     network = load_network(repacked(path, tmp_path / "stored.pt"), FP32)  # packed again without compression
     assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
-
-
-@pytest.mark.parametrize(("order", "said"), [(b"big", "big-endian"), (b"", "endian"), (b"middle", "endian")])
-def test_numbers_in_another_byte_order_are_refused(tmp_path: Path, order: bytes, said: str) -> None:
-    path = repacked(write_tiny(tmp_path / "w.pt"), tmp_path / "turned.pt", byteorder=order)
-    assert said in refused(path)
 
 
 def test_a_zip_with_one_changed_byte_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
@@ -133,25 +128,14 @@ def test_a_zip_with_one_changed_byte_is_refused(tmp_path: Path, weights: dict[st
     content[number + 40] ^= 1  # a last digit
     path.write_bytes(content)
     assert "damaged at " in refused(path)
-
-
-def test_a_zip_that_was_written_without_sums_is_read(tmp_path: Path) -> None:
     torch.serialization.set_crc32_options(False)
     try:
-        path = write_tiny(tmp_path / "w.pt")
+        load_network(write_tiny(path), FP32)  # without sums there is nothing to hold it against
     finally:
         torch.serialization.set_crc32_options(True)
-    load_network(path, FP32)
 
 
-@pytest.mark.parametrize("name", ["w.SAFETENSORS", "w.pt", "w"])
-def test_a_files_kind_is_told_from_its_content(tmp_path: Path, name: str) -> None:
-    for suffix in (".pt", ".safetensors"):
-        write_tiny(tmp_path / f"w{suffix}").rename(tmp_path / name)
-        load_network(tmp_path / name, FP32)
-
-
-def files_of_other_kinds() -> dict[str, bytes]:
+def files_of_other_kinds() -> dict[str, bytes | None]:
     zipped = io.BytesIO()
     with zipfile.ZipFile(zipped, "w") as archive:
         archive.writestr("hello.txt", "hello")
@@ -162,6 +146,7 @@ def files_of_other_kinds() -> dict[str, bytes]:
     numbered = io.BytesIO()
     torch.save({0: torch.zeros(2)}, numbered)
     return {
+        "missing.pt": None,
         "empty.pt": b"",
         "text.pt": b"<html>not found</html>",
         "answer.json": b'{"data":{"error": "gone"}}',
@@ -170,47 +155,34 @@ def files_of_other_kinds() -> dict[str, bytes]:
         "list.pt": numbers.getvalue(),
         "nested.pt": nested.getvalue(),
         "numbered.pt": numbered.getvalue(),
-        "text.safetensors": b"not a header",
         "huge.safetensors": (2**62).to_bytes(8, "little") + b"{}",
     }
 
 
 @pytest.mark.parametrize("name", files_of_other_kinds())
 def test_files_of_other_kinds_are_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(files_of_other_kinds()[name])
+    content = files_of_other_kinds()[name]
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
     line = refused(tmp_path / name)
-    known = name in ("empty.pt", "zip.pt", "list.pt", "nested.pt", "numbered.pt")
+    known = name in ("missing.pt", "empty.pt", "zip.pt", "list.pt", "nested.pt", "numbered.pt")
     assert ("neither a PyTorch checkpoint nor a safetensors file" in line) is not known
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    assert "no such checkpoint" in refused(tmp_path / "none.pt")
-    assert "not a plain file" in refused(tmp_path)
-
-
-def test_another_networks_weights_are_refused_with_what_differs(tmp_path: Path) -> None:
-    save_file(torch.nn.Conv2d(3, 8, 3).state_dict(), tmp_path / "conv.safetensors")
-    line = refused(tmp_path / "conv.safetensors")
-    assert "of 1038 tensors 1038 missing" in line
-    assert "2 unknown (bias, weight)" in line
 
 
 def test_each_difference_is_listed(tmp_path: Path, weights: dict[str, Tensor]) -> None:
     changed = dict(weights)
     del changed["prediction_head.geometry_prediction_head.bias"]
     changed["extra"] = torch.zeros(1)
+    unused = "depth_alignment.scale_map_estimator.conv_out.weight"  # by inference
+    changed[unused] = torch.zeros(2, 16, 1, 1)
     changed["feature_model.fusion.out_conv.bias"] = torch.zeros(17)
     save_file(changed, tmp_path / "w.safetensors")
     line = refused(tmp_path / "w.safetensors")
     assert "1 missing (prediction_head.geometry_prediction_head.bias)" in line
     assert "1 unknown (extra)" in line
-    assert "1 of another shape (feature_model.fusion.out_conv.bias [17] instead of [16])" in line
-
-
-def test_what_inference_never_uses_is_checked_all_the_same(tmp_path: Path, weights: dict[str, Tensor]) -> None:
-    name = "depth_alignment.scale_map_estimator.conv_out.weight"
-    save_file({**weights, name: torch.zeros(2, 16, 1, 1)}, tmp_path / "w.safetensors")
-    assert name in refused(tmp_path / "w.safetensors")
+    assert "2 of another shape (" in line
+    assert "feature_model.fusion.out_conv.bias [17] instead of [16]" in line
+    assert unused in line
 
 
 def odd_names() -> dict[str, object]:
@@ -221,40 +193,26 @@ def odd_names() -> dict[str, object]:
         "escapes": "\x1b[31mred\x1b[0m\r\n\u202e",
         "long": "\x07" * 100_000,
         "nested": nested,
-        "number": 10**5000,
-        "pair": ("a\n", "b\x1b"),
     }
 
 
-@pytest.mark.parametrize("value", [torch.zeros(1), torch.zeros(1, dtype=torch.int32)], ids=["float", "int"])
 @pytest.mark.parametrize("kind", odd_names())
-def test_odd_names_do_not_reach_the_terminal(
-    tmp_path: Path, weights: dict[str, Tensor], kind: str, value: Tensor
-) -> None:
-    torch.save({**weights, odd_names()[kind]: value}, tmp_path / "w.pt")
-    assert refused(tmp_path / "w.pt").isprintable()
+def test_odd_names_do_not_reach_the_terminal(tmp_path: Path, weights: dict[str, Tensor], kind: str) -> None:
+    for value in (torch.zeros(1), torch.zeros(1, dtype=torch.int32)):
+        torch.save({**weights, odd_names()[kind]: value}, tmp_path / "w.pt")
+        assert refused(tmp_path / "w.pt").isprintable()
 
 
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
-    spoiled = weights["feature_model.fusion.out_conv.bias"].clone()
-    spoiled[3] = torch.nan
-    save_file({**weights, "feature_model.fusion.out_conv.bias": spoiled}, tmp_path / "w.safetensors")
-    assert "not finite" in refused(tmp_path / "w.safetensors")
-
-
-def test_large_numbers_and_half_precision_are_read_too(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+def test_large_numbers_and_half_precision_are_read_but_no_nan(tmp_path: Path, weights: dict[str, Tensor]) -> None:
     """Large numbers whose sum overflows are finite."""
     name = "feature_model.fusion.out_conv.bias"
     save_file({**weights, name: torch.full((16,), 3e38)}, tmp_path / "w.safetensors")
     assert float(load_network(tmp_path / "w.safetensors", FP32).state_dict()[name].max()) == pytest.approx(3e38)
+    save_file({**weights, name: torch.full((16,), torch.nan)}, tmp_path / "w.safetensors")
+    assert "not finite" in refused(tmp_path / "w.safetensors")
     save_file({name: tensor.half() for name, tensor in weights.items()}, tmp_path / "h.safetensors")
     network = load_network(tmp_path / "h.safetensors", FP32)
     assert all(tensor.dtype == FP32 for tensor in network.state_dict().values())
-
-
-def test_a_base_says_which_weights_it_has(tmp_path: Path) -> None:
-    base = SharpBase.load(write_tiny(tmp_path / "mine.pt"), precision="fp32", device="cpu")
-    assert (base.name, base.weights, base.precision) == ("sharp", "mine.pt", "fp32")
 
 
 def odd_tensors() -> dict[str, Tensor]:
@@ -262,8 +220,6 @@ def odd_tensors() -> dict[str, Tensor]:
     hiding.float = "x"  # type: ignore[method-assign,assignment]
     return {
         "int": torch.zeros(16, dtype=torch.int32),
-        "complex": torch.zeros(16, dtype=torch.complex64),
-        "bool": torch.zeros(16, dtype=torch.bool),
         "meta": torch.zeros(16, device="meta"),
         "sparse": torch.ones(16).to_sparse(),
         "hiding": hiding,
@@ -278,7 +234,7 @@ def test_tensors_of_odd_kinds_are_refused(tmp_path: Path, weights: dict[str, Ten
 
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
 def test_a_file_that_changes_later_changes_nothing(tmp_path: Path, suffix: str) -> None:
-    path = write_tiny(tmp_path / f"weights{suffix}")
+    path = write_tiny(tmp_path / f"weights{suffix}").rename(tmp_path / "weights.pt")  # its content tells its kind
     network = load_network(path, FP32)
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     size = path.stat().st_size

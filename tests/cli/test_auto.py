@@ -33,7 +33,7 @@ def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPat
     """A machine without SHARP, whose loading takes no time, and with weights of lite that belong to the test."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
-    monkeypatch.setattr("spackle.bases.lite.base.SHIPPED", lite)
+    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
     monkeypatch.setattr(SharpBase, "load", lambda path, **options: StandIn("sharp"))
     return lite
 

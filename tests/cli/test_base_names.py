@@ -30,7 +30,7 @@ def lite(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _shipped(tmp_path: Path, lite: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine without SHARP, and with these weights of lite."""
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setattr("spackle.bases.lite.base.SHIPPED", lite)
+    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ import socket
 import ssl
 import subprocess
 import sys
-import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -156,25 +155,21 @@ def test_a_later_call_goes_on_with_the_rest(site: Site, begun: Path) -> None:
     assert (steps[0], steps[-1]) == (BREAK, len(CONTENT))
 
 
-def test_a_date_will_do_to_go_on(site: Site, target: Path) -> None:
-    site.etag, site.headers = False, {"Last-Modified": "Mon, 15 Dec 2025 10:00:00 GMT"}
-    site.drops = [BREAK]
+@pytest.mark.parametrize(
+    ("headers", "sign"),
+    [
+        ({"ETag": None}, None),
+        ({"ETag": 'W/"weak"'}, None),
+        ({"ETag": None, "Last-Modified": "Mon, 15 Dec 2025 10:00:00 GMT"}, "Mon, 15 Dec 2025 10:00:00 GMT"),
+    ],
+)
+def test_without_a_sign_of_the_version_it_starts_over(
+    site: Site, target: Path, headers: dict[str, str | None], sign: str | None
+) -> None:
+    site.headers, site.drops = headers, [BREAK]
     is_whole(target, site, download(site.url, target))
-    assert ranges(site) == [None, f"bytes={BREAK}-"]
-    assert site.requests[1]["If-Range"] == site.headers["Last-Modified"]
-
-
-@pytest.mark.parametrize("tag", [None, 'W/"weak"'])
-def test_without_a_sign_of_the_version_it_starts_over(site: Site, target: Path, tag: str | None) -> None:
-    site.headers, site.drops = {"ETag": tag}, [BREAK]
-    is_whole(target, site, download(site.url, target))
-    assert ranges(site) == [None, None]
-
-
-def test_a_server_without_ranges_starts_over(site: Site, begun: Path) -> None:
-    site.ranges = False
-    is_whole(begun, site, download(site.url, begun))
-    assert ranges(site) == [f"bytes={BREAK}-"]
+    assert ranges(site) == [None, f"bytes={BREAK}-" if sign else None]
+    assert site.requests[1].get("If-Range") == sign
 
 
 @pytest.mark.parametrize("size", [len(CONTENT), BREAK, BREAK // 2, 2 * len(CONTENT)])
@@ -188,14 +183,11 @@ def test_a_file_that_changed_starts_over(site: Site, begun: Path, size: int, if_
 SPOILT: dict[str, Callable[[Path, Path], object]] = {
     "no version": lambda part, version: version.unlink(),
     "cut off": lambda part, version: version.write_text("{"),
-    "no fields": lambda part, version: version.write_text("[]"),
     "few fields": lambda part, version: version.write_text('{"size": "large"}'),
     "too deep": lambda part, version: version.write_text("[" * 100_000),
-    "endless": lambda part, version: version.write_text(version.read_text().replace(str(len(CONTENT)), "1e400")),
     "no tag": lambda part, version: version.write_text(re.sub('"etag": .*', '"etag": 5,', version.read_text())),
     "elsewhere": lambda part, version: version.write_text(version.read_text().replace("127.0.0.1", "127.0.0.2")),
     "no part": lambda part, version: part.unlink(),
-    "empty": lambda part, version: part.write_bytes(b""),
     "too long": lambda part, version: part.write_bytes(b"x" * (len(CONTENT) + 1)),
 }
 
@@ -249,23 +241,6 @@ def test_a_killed_download_leaves_no_file_and_the_next_one_finishes(site: Site, 
     assert ranges(site) == [None, f"bytes={kept}-"]
 
 
-def test_a_second_download_at_the_same_time_is_refused(site: Site, target: Path) -> None:
-    site.hang_after = BREAK
-    coming, records = threading.Event(), []
-    thread = threading.Thread(
-        target=lambda: records.append(download(site.url, target, lambda done, total: coming.set()))
-    )
-    thread.start()
-    try:
-        assert coming.wait(30)
-        refused(site.url, target, str(target), "another process", "wait")
-    finally:
-        site.go_on.set()
-        thread.join()
-    is_whole(target, site, records[0])
-    assert len(site.requests) == 1
-
-
 # What goes wrong for good
 
 
@@ -273,18 +248,15 @@ def test_a_second_download_at_the_same_time_is_refused(site: Site, target: Path)
     ("status", "headers", "words"),
     [
         (404, {}, ("HTTP 404", "check the address")),
-        (403, {}, ("HTTP 403",)),
         (416, {}, ("HTTP 416",)),
         (500, {}, ("HTTP 500", "later")),
         (206, {}, ("something else",)),
         (200, {"Content-Type": "text/html"}, ("something else",)),
         (200, {"Content-Encoding": "gzip"}, ("packs", "gzip", "another address")),
-        (200, {"Content-Encoding": "identity, br"}, ("packs", "br")),
-        (200, {"Content-Type": "text/html", "Content-Encoding": "gzip"}, ("something else",)),
         (200, {"Content-Length": None}, ("length",)),
-        (200, {"Content-Length": "many"}, ("length",)),
         (200, {"Content-Length": "0"}, ("empty",)),
-        (302, {"Location": "file:///etc/hostname"}, ("HTTP 302")),
+        (200, {"Content-Length": str(len(CONTENT) + 10)}, ("10 bytes early",)),
+        (302, {"Location": "file:///etc/hostname"}, ("HTTP 302",)),
         (302, {"Location": "ftp://127.0.0.1/a.pt"}, ("ftp://127.0.0.1/a.pt",)),
         (302, {"Location": "/weights.pt"}, ("HTTP 302",)),
     ],
@@ -294,21 +266,8 @@ def test_answers_that_are_no_file(
 ) -> None:
     site.status, site.headers = status, headers
     refused(site.url, target, site.url, *words)
-    assert names_in(target) == set()
-
-
-def test_a_rest_that_is_packed_is_refused(site: Site, begun: Path) -> None:
-    site.headers = {"Content-Encoding": "gzip"}
-    refused(site.url, begun, "packs")
-    site.headers = {"Content-Encoding": "Identity"}
-    is_whole(begun, site, download(site.url, begun))
-    assert ranges(site) == [f"bytes={BREAK}-"] * 2
-
-
-def test_a_file_that_never_gets_to_its_length(site: Site, target: Path) -> None:
-    site.headers = {"Content-Length": str(len(CONTENT) + 10)}
-    refused(site.url, target, site.url, "10 bytes early")
-    assert 1 < len(site.requests) < 10
+    assert bool(names_in(target)) is ("10 bytes early" in words)  # all that came is kept
+    assert len(site.requests) < 10
 
 
 def test_a_server_that_hangs(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,30 +306,13 @@ def test_https_is_not_given_up_on_the_way() -> None:
 
     with pytest.raises(InputError, match="not https"):
         redirect("https://a.org/w.pt", "http://a.org/w.pt")
-    for old, new in (
-        ("http://a.org", "https://b.org"),
-        ("http://a.org", "http://b.org"),
-        ("https://a.org", "https://b.org"),
-    ):
+    for old, new in (("http://a.org", "https://b.org"), ("https://a.org", "https://b.org")):
         request = redirect(old, new)
         assert request is not None
         assert request.full_url == new
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "",
-        "a.pt",
-        "file:///etc/hostname",
-        "ftp://a.org/w.pt",
-        "data:,x",
-        "http://",
-        "https://[/",
-        "http://a:b/",
-        "http://a:0/",
-    ],
-)
+@pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "http://", "https://[/", "http://a:b/", "http://a:0/"])
 def test_addresses_that_are_none(target: Path, url: str) -> None:
     refused(url, target, repr(url))
     refused(f"{url}\n", target)
@@ -380,11 +322,8 @@ def test_addresses_that_are_none(target: Path, url: str) -> None:
     "url",
     [
         "http://me:secret@127.0.0.1:1/w.pt",
-        "https://secret@127.0.0.1:1/w.pt",
         "ftp://me:secret@127.0.0.1:1/w.pt",
-        "http://me:secret@/w.pt",
         "http://me:secret@[/w.pt",
-        "http://me:secret@127.0.0.1:port/w.pt",
         "http://me:secret/more@127.0.0.1:1/w.pt",
         "me:secret@127.0.0.1:1/w.pt",
     ],
@@ -397,8 +336,9 @@ def test_a_password_in_an_address_is_refused_and_not_shown(target: Path, url: st
     assert names_in(target) == set()
 
 
-@pytest.mark.parametrize("scheme", ["http", "ftp"])
-@pytest.mark.parametrize("place", ["127.0.0.1:1", "127.0.0.1:port"])
+@pytest.mark.parametrize(
+    ("scheme", "place"), [("http", "127.0.0.1:1"), ("http", "127.0.0.1:port"), ("ftp", "127.0.0.1:1")]
+)
 def test_nor_is_one_that_a_server_sends_on_to(site: Site, target: Path, scheme: str, place: str) -> None:
     url = site.url.replace("weights.pt", "sharp@1.0/weights.pt")  # an @ in the path is no password
     assert download(url, target).url == url
@@ -465,29 +405,16 @@ def test_damage_is_noticed(site: Site, target: Path) -> None:
     target.unlink()
     with pytest.raises(InputError, match="No such file"):
         check_recorded(target)
-
-
-def test_files_of_your_own_have_no_record(target: Path) -> None:
     target.write_bytes(b"mine")
-    assert check_recorded(target) is None
-    for notes in ("[1]", '{"epochs": 3}'):
+    for notes in ("[1]", '{"epochs": 3}'):  # of a person's own, beside a file of their own
         target.with_name("weights.pt.json").write_text(notes)
         assert check_recorded(target) is None
 
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "{",
-        "\0",
-        '{"sha256": "00"}',
-        '{"sha256": "00", "url": "", "size": "large"}',
-        '{"sha256": "00", "url": "", "size": 1e400}',
-        '{"sha256": "00", "url": "", "size": NaN}',
-        "[" * 100_000,
-    ],
-    ids=["empty", "cut off", "no text", "few fields", "no size", "endless", "no number", "too deep"],
+    ["{", '{"sha256": "00"}', '{"sha256": "00", "url": "", "size": 1e400}', "[" * 100_000],
+    ids=["cut off", "few fields", "endless", "too deep"],
 )
 def test_a_record_that_makes_no_sense_is_not_passed_over(target: Path, text: str) -> None:
     target.write_bytes(b"mine")
@@ -536,9 +463,7 @@ def refuses(result: Run, *words: object) -> None:
 
 def test_get_tells_scripts_where_the_file_lies(site: Site, weights: Path) -> None:
     known = hashlib.sha256(CONTENT).hexdigest()
-    for digest, new in ((known, True), (known, False), (None, False)):
-        if digest is None:
-            (weights / f"{FILE}.json").unlink()
+    for digest, new in ((known, True), (known, False)):
         result = weights_command("get", "sharp", "--url", site.url, "--json")
         assert result.code == 0, result.err
         told = {"name": "sharp", "file": str(weights / FILE), "bytes": len(CONTENT)}
@@ -563,10 +488,6 @@ def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Pa
     forced = weights_command("get", "sharp", "--url", site.url, "--force")
     assert forced.err.count("research only") == 1
     assert len(site.requests) == 2
-
-
-def test_get_refuses_a_damaged_file_and_force_repairs_it(site: Site, weights: Path) -> None:
-    assert weights_command("get", "sharp", "--url", site.url).code == 0
     damage(weights / FILE)
     refuses(weights_command("get", "sharp", "--url", site.url), weights / FILE, "delete it")
     assert weights_command("get", "sharp", "--url", site.url, "--force").code == 0
@@ -646,12 +567,11 @@ def test_list_says_what_is_here(site: Site, weights: Path) -> None:
 
 
 def test_a_log_gets_a_line_for_each_tenth_and_a_terminal_a_bar(site: Site, weights: Path) -> None:
-    log = io.StringIO()
+    log, screen = io.StringIO(), io.StringIO()
     with Reporter(console=Console(file=log)).transfer("sharp") as step:
         for done in (0, 5, 10, 11, 19, 20, 95, 0, 50, 100):
             step(done, 100)
     assert [line.split()[1] for line in log.getvalue().splitlines()] == ["10", "20", "95", "0", "50"]
-    screen = io.StringIO()
     site.drops, site.ranges = [BREAK], False  # starts over on the way
     get_weights("sharp", None, Reporter(console=Console(file=screen, force_terminal=True, width=200)), url=site.url)
     assert "1.0 MB" in screen.getvalue()

@@ -24,6 +24,7 @@ from torch import Tensor
 from training_runs import run_two, state, trained
 
 from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.base import TunableSharp, normalised_camera
 from spackle.bases.sharp.checkpoint import (
     NOTE,
     PARTS,
@@ -35,7 +36,6 @@ from spackle.bases.sharp.checkpoint import (
     load_network,
 )
 from spackle.bases.sharp.layers import CONFIGS
-from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.camera import Camera
 from spackle.dataset import DatasetFiles
 from spackle.errors import InputError

@@ -18,7 +18,7 @@ from recipe import LiteData, LiteFiles
 from torch import nn
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.bases.lite.base import LiteBase
+from spackle.bases.lite import LiteBase
 from spackle.errors import InputError
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import RgbdFolder

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, pad, relu6
 from weights import load_encoder
 
-from spackle.bases.lite.network import STAGES, TAPS, Encoder, Size
+from spackle.bases.lite import STAGES, TAPS, Encoder, Size
 from spackle.errors import InputError
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it

@@ -22,7 +22,7 @@ from train import main
 from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, run_two, started, state
 from weights import EVEN, balanced, save_networks, start_decoder
 
-from spackle.bases.lite.network import LiteNet, load_networks
+from spackle.bases.lite import LiteNet, load_networks
 from spackle.training.recipe import load_recipe_as
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it

@@ -23,7 +23,7 @@ from spackle.app.complete import (
 )
 from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
-from spackle.bases.lite.base import LiteBase
+from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
 from spackle.bases.sharp import SharpBase
 from spackle.camera_path import spelled

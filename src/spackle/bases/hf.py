@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from spackle.bases.hf_models import (
+    SCALE_NOTES,
     SQUARE_ANTIALIAS,
     Meaning,
     Prepare,
@@ -30,7 +31,6 @@ from spackle.bases.hf_models import (
     by_settings,
     crop,
     meaning_of,
-    scale_note,
     to_depth_map,
 )
 from spackle.bases.lift import lift
@@ -40,13 +40,11 @@ from spackle.device import MemoryShort, Precision, memory_is_short, own_arithmet
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import LENSES, Photo, resize_photo
 
-LENS_SOURCE = "Depth Pro"  # the only kind of model that gives a lens
 SETTINGS = ["config.json", "preprocessor_config.json", "processor_config.json"]
 WEIGHTS = ["model.safetensors", "model-*.safetensors", "model.safetensors.index.json"]
 NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
 FIT = "give the weights that belong to its config.json"
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
-_PROBE = (64, 64)  # height and width of a picture that only has to reach every weight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +119,7 @@ class HfBase:
             raw, fov, window = self.model(photo.rgb)
         camera, lens_source = photo.camera, ""
         if fov is not None and photo.focal_source.startswith("default"):
-            camera, lens_source = self._camera(photo, fov), LENS_SOURCE
+            camera, lens_source = self._camera(photo, fov), "Depth Pro"  # the only kind that gives a lens
         focal = camera.focal[0] / photo.width
         depth = to_depth_map(crop(raw, window), self.model.meaning, focal, self.name, photo.path)
         if progress:
@@ -129,7 +127,7 @@ class HfBase:
         prediction = lift(photo.rgb, depth, camera)
         if progress:
             progress(2, 2)
-        notes = {**prediction.notes, "precision": self.precision, "depth_scale": scale_note(self.model.meaning)}
+        notes = {**prediction.notes, "precision": self.precision, "depth_scale": SCALE_NOTES[self.model.meaning]}
         if invalid := int((~depth.valid).sum()):
             notes["depth_invalid_pixels"] = invalid
         return dataclasses.replace(prediction, notes=notes, lens_source=lens_source)
@@ -219,7 +217,7 @@ def _matters(model: DepthModel, missing: list[str]) -> bool:
     for key in missing:
         if key in tensors and tensors[key].is_floating_point():
             tensors[key].fill_(torch.nan)
-    raw, fov, _ = model(torch.rand(*_PROBE, 3, generator=torch.Generator().manual_seed(0)))
+    raw, fov, _ = model(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
     return not bool(torch.isfinite(raw).all()) or (fov is not None and fov != fov)
 
 
@@ -240,12 +238,7 @@ def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
 
 @contextlib.contextmanager
 def _one_line(who: str, what: str, advice: str) -> Iterator[None]:
-    """Turn whatever transformers and torch raise over a stranger's files into one line.
-
-    Raises:
-        InputError: `who`, `what` went wrong, why, and the advice.
-        MemoryShort: memory was short.
-    """
+    """Turn whatever transformers and torch raise over a stranger's files into one line (or MemoryShort)."""
     try:
         yield
     except InputError:
@@ -263,26 +256,19 @@ def quiet() -> Iterator[None]:
     from huggingface_hub import utils
 
     own = getattr(sys.modules.get("transformers"), "utils", None)  # transformers has progress bars beside the hub's
-    bars: list[tuple[Any, Any]] = []
-    if not utils.are_progress_bars_disabled():
-        bars.append((utils.disable_progress_bars, utils.enable_progress_bars))
-    if own is not None and own.logging.is_progress_bar_enabled():
-        bars.append((own.logging.disable_progress_bar, own.logging.enable_progress_bar))
-    loggers = [logging.getLogger(name) for name in ("transformers", "huggingface_hub", "httpx")]
-    levels = [logger.level for logger in loggers]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            for logger in loggers:
-                logger.setLevel(logging.CRITICAL)
-            for disable, _ in bars:
-                disable()
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-        for _, enable in bars:
-            enable()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")
+        for logger in (logging.getLogger(name) for name in ("transformers", "huggingface_hub", "httpx")):
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+        if not utils.are_progress_bars_disabled():
+            stack.callback(utils.enable_progress_bars)
+            utils.disable_progress_bars()
+        if own is not None and own.logging.is_progress_bar_enabled():
+            stack.callback(own.logging.enable_progress_bar)
+            own.logging.disable_progress_bar()
+        yield
 
 
 def _read_settings(folder: Path, file: str, name: str) -> dict[str, Any]:

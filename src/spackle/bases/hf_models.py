@@ -40,6 +40,11 @@ UNFIT = {
 # step of the network's noise is not yet a depth edge. The smallest value is not stretched to FARTHEST_M: a wall
 # photographed from the front would become a valley. Both ends are linear in disparity, so planes stay planes.
 FARTHEST_M = 30.0
+SCALE_NOTES: dict[Meaning, str] = {  # for the report
+    "metres": "metric, by the model",
+    "relative disparity": f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m",
+    "canonical disparity": "metric, by the model",
+}
 CANONICAL_LIMITS = (1e-4, 1e4)  # in 1/m: Depth Pro's own
 FLAT = 1e-5  # relative spread below which all pixels say the same
 
@@ -65,13 +70,6 @@ def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
     if kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2":
         return "metres"  # DINOv2's own depth heads, for NYU and KITTI; MiDaS has other backbones
     return MEANINGS[kind]
-
-
-def scale_note(meaning: Meaning) -> str:
-    """What the report says of the depth's scale."""
-    if meaning == "relative disparity":
-        return f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m"
-    return "metric, by the model"
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:

@@ -17,7 +17,7 @@ from pathlib import Path
 from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import SETTINGS, WEIGHTS, HfBase
 from spackle.bases.lift import RgbdBase
-from spackle.bases.lite import base as lite
+from spackle.bases import lite
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
 from spackle.bases.sharp.base import SharpBase, check_windows

@@ -129,18 +129,15 @@ class KnownWeights:
 
 
 WEIGHTS = {
-    known.name: known
-    for known in (
-        KnownWeights(
-            name="sharp",
-            url="https://ml-site.cdn-apple.com/models/sharp/sharp_2572gikvuh.pt",
-            file="sharp_2572gikvuh.pt",
-            licence="Apple, research only",
-            notice=(
-                "SHARP's weights are Apple's, under the Apple Machine Learning Research Model licence:",
-                "for non-commercial scientific research only. Spackle's own licence does not cover them.",
-                "Read its terms: https://github.com/apple/ml-sharp/blob/main/LICENSE_MODEL",
-            ),
+    "sharp": KnownWeights(
+        name="sharp",
+        url="https://ml-site.cdn-apple.com/models/sharp/sharp_2572gikvuh.pt",
+        file="sharp_2572gikvuh.pt",
+        licence="Apple, research only",
+        notice=(
+            "SHARP's weights are Apple's, under the Apple Machine Learning Research Model licence:",
+            "for non-commercial scientific research only. Spackle's own licence does not cover them.",
+            "Read its terms: https://github.com/apple/ml-sharp/blob/main/LICENSE_MODEL",
         ),
     )
 }

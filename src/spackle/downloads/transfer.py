@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
@@ -137,26 +136,11 @@ class Version:
         return self.etag if self.etag and not self.etag.startswith("W/") else self.modified
 
 
-@dataclasses.dataclass(frozen=True)
-class Answer:
-    """A file on its way."""
+def _version(response: HTTPResponse, url: str, begun: Version | None, offset: int) -> Version:
+    """What the server sends: the rest of `begun`, that object, or a whole file of this version.
 
-    version: Version
-    start: int  # the byte of the file with which `blocks` begin
-    blocks: Iterator[bytes]  # to the file's end, or as far as the server got
-
-
-@contextlib.contextmanager
-def ask(url: str, begun: Version | None = None, offset: int = 0) -> Iterator[Answer]:
-    """Ask for a file, or its bytes from `offset` on if it is still the version `begun`; raises as `connect` does."""
-    headers = {}
-    if begun is not None and begun.validator is not None:
-        headers = {"Range": f"bytes={offset}-", "If-Range": begun.validator}
-    with connect(url, headers) as response:
-        yield _answer(response, url, begun, offset)
-
-
-def _answer(response: HTTPResponse, url: str, begun: Version | None, offset: int) -> Answer:
+    Raises Changed for another rest than from `offset` on, and InputError for what is no file.
+    """
     rest = begun if response.status == 206 else None
     if not rest and (response.status != 200 or response.headers.get_content_type() == "text/html"):
         raise InputError(f"{url}: the server answers with something else than a file: check the address in a browser")
@@ -167,13 +151,12 @@ def _answer(response: HTTPResponse, url: str, begun: Version | None, offset: int
     if rest:
         if not _continues(response, rest, offset):
             raise Changed
-        return Answer(rest, offset, _blocks(response, rest.size - offset))
-    size = response.length
-    if not size:
-        problem = "is empty there" if size == 0 else "comes without its length, so a part could pass for the whole"
+        return rest
+    if not response.length:
+        empty = response.length == 0
+        problem = "is empty there" if empty else "comes without its length, so a part could pass for the whole"
         raise InputError(f"{url}: the file {problem}: give another address")
-    version = Version(url, size, response.headers["ETag"], response.headers["Last-Modified"])
-    return Answer(version, 0, _blocks(response, size))
+    return Version(url, response.length, response.headers["ETag"], response.headers["Last-Modified"])
 
 
 def _continues(response: HTTPResponse, begun: Version, offset: int) -> bool:
@@ -242,18 +225,32 @@ def version_file(part: Path) -> Path:
 
 
 def _receive_once(url: str, part: Path, progress: Progress) -> tuple[int, str]:
-    begun = _begun(url, part)
-    offset = part.stat().st_size if begun else 0
-    if begun and offset == begun.size:  # killed before it was given its name
-        with open(part, "rb") as file:
-            return offset, digest(file).hexdigest()
-    with ask(url, begun, offset) as answer:
-        _check_room(answer, part)  # first: a file that is refused leaves nothing
-        if answer.start == 0:
+    begun, headers = _begun(url, part), {}
+    done = part.stat().st_size if begun else 0
+    if begun and begun.validator:
+        if done == begun.size:  # killed before it was given its name
+            with open(part, "rb") as file:
+                return done, digest(file).hexdigest()
+        headers = {"Range": f"bytes={done}-", "If-Range": begun.validator}
+    with connect(url, headers) as response:
+        version = _version(response, url, begun, done)
+        done = done if version is begun else 0
+        _check_room(version.size, done, part)  # first: a file that is refused leaves nothing
+        if done == 0:
             forget(part)
             part.touch()
-            write_json(dataclasses.asdict(answer.version), version_file(part))
-        return _append(answer, part, progress)
+            write_json(dataclasses.asdict(version), version_file(part))
+        with open(part, "r+b") as file:
+            sha256 = digest(file)
+            progress(done, version.size)
+            for block in _blocks(response, version.size - done):
+                file.write(block)
+                file.flush()
+                sha256.update(block)
+                done += len(block)
+                progress(done, version.size)
+            os.fsync(file.fileno())  # the file's name will promise that it is whole
+    return done, sha256.hexdigest()
 
 
 def _begun(url: str, part: Path) -> Version | None:
@@ -269,29 +266,14 @@ def _begun(url: str, part: Path) -> Version | None:
     return version if usable else None
 
 
-def _check_room(answer: Answer, part: Path) -> None:
+def _check_room(size: int, done: int, part: Path) -> None:
     usage = shutil.disk_usage(part.parent)
-    needed, free = answer.version.size - answer.start, usage.free
-    if answer.start == 0 and part.exists():  # it makes way
+    needed, free = size - done, usage.free
+    if done == 0 and part.exists():  # it makes way
         free += part.stat().st_size
     if usage.total and free < needed:  # some network folders say 0 of 0
         gigabytes = f"{needed / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free"
         raise InputError(f"{part.parent}: {gigabytes}: make room or choose another folder")
-
-
-def _append(answer: Answer, part: Path, progress: Progress) -> tuple[int, str]:
-    size, done = answer.version.size, answer.start
-    with open(part, "r+b") as file:
-        sha256 = digest(file)
-        progress(done, size)
-        for block in answer.blocks:
-            file.write(block)
-            file.flush()
-            sha256.update(block)
-            done += len(block)
-            progress(done, size)
-        os.fsync(file.fileno())  # the file's name will promise that it is whole
-    return done, sha256.hexdigest()
 
 
 def digest(file: BinaryIO) -> hashlib._Hash:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from spackle.device import Precision, pick_dtype
-from spackle.network_file import read_network
+from spackle.network_file import fill_network, read_tensors
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.hole_features import Cues
 from spackle.residual.seeds import Rim, Seeds
@@ -237,4 +237,5 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     Raises:
         InputError: a missing or broken file, or weights of another architecture.
     """
-    return read_network(ResidualNet(), path, "residual", "a .safetensors file, 'seeds' or 'none'")
+    tensors = read_tensors(path, "residual", "a .safetensors file, 'seeds' or 'none'")
+    return fill_network(ResidualNet(), tensors, path, "residual")

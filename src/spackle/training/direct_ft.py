@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from spackle.bases.sharp.base import TunableSharp, normalised_camera
 from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
-from spackle.bases.sharp.tuning import TunableSharp, normalised_camera
 from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import DatasetView
 from spackle.device import enough_memory

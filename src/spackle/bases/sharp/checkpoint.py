@@ -23,7 +23,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.bases.sharp.layers import CONFIGS, SharpConfig, set_precision
+from spackle.bases.sharp.layers import CONFIGS, GROUPS, SharpConfig, normed_residual, set_precision
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.device import enough_memory
 from spackle.downloads.transfer import digest
@@ -54,12 +54,18 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     token = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.cls_token")
     width = token.shape[-1] if token is not None and token.ndim else None
     config = next((config for config in CONFIGS.values() if config.embed == width), CONFIGS["full"])
-    network = _empty_network(config)
-    _check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, _shapes_of(network), path)
+    _check_shapes({name: tuple(tensor.shape) for name, tensor in tensors.items()}, expected_shapes(config), path)
+    with torch.device("meta"):
+        network = SharpNetwork(config)
     advice = ["try --precision bf16"] if dtype == torch.float32 else []  # it takes half as much
     try:
         with enough_memory(*advice):
-            _fill(network, tensors, dtype)
+            network.load_state_dict({name: tensors[name].float() for name in network.state_dict()}, assign=True)
+            network.eval().requires_grad_(False)
+            set_precision(network, dtype)  # reads what is on the disk still
+            for name, parameter in network.named_parameters():
+                if parameter.data_ptr() == tensors[name].data_ptr():  # not copied yet: the file may change later
+                    parameter.data = parameter.data.clone()
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read to its end: {reason_in_a_line(error)}") from error
     # A finite sum proves it at little cost; but a sum of finite numbers can overflow.
@@ -72,7 +78,8 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
 
 def expected_shapes(config: SharpConfig) -> Shapes:
     """Every name and shape that a checkpoint of this size has, 1,038 in the published one."""
-    return _shapes_of(_empty_network(config))
+    with torch.device("meta"):
+        return _shapes_of(SharpNetwork(config)) | unused_shapes(config)
 
 
 def _check_shapes(found: Shapes, expected: Shapes, path: str | os.PathLike[str]) -> None:
@@ -89,26 +96,8 @@ def _check_shapes(found: Shapes, expected: Shapes, path: str | os.PathLike[str])
         raise InputError(f"{path}: not SHARP's weights: of {len(expected)} tensors {'; '.join(problems)}")
 
 
-def _fill(network: SharpNetwork, tensors: Mapping[str, Tensor], dtype: torch.dtype) -> None:
-    """Give an empty network its numbers, in memory of its own and in the types that it computes in."""
-    network.load_state_dict({name: tensors[name].float() for name in network.state_dict()}, assign=True)
-    network.eval().requires_grad_(False)
-    set_precision(network, dtype)  # reads what is on the disk still
-    for name, parameter in network.named_parameters():
-        if parameter.data_ptr() == tensors[name].data_ptr():  # not copied yet: the file may change later
-            parameter.data = parameter.data.clone()
-
-
-def _empty_network(config: SharpConfig) -> SharpNetwork:
-    """Names and shapes without numbers."""
-    with torch.device("meta"):
-        return SharpNetwork(config)
-
-
-def _shapes_of(network: SharpNetwork) -> Shapes:
-    """What the checkpoint of a network holds, with what inference never uses."""
-    used = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    return used | unused_shapes(network.config)
+def _shapes_of(module: nn.Module, prefix: str = "") -> Shapes:
+    return {prefix + name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
 
 
 def _some(names: list[str]) -> str:
@@ -273,7 +262,7 @@ def _check_archive(path: str | os.PathLike[str]) -> None:
 
 
 def _is_plain(value: object) -> bool:
-    """A dense tensor of floats with nothing attached: a file can give a tensor attributes that hide its methods."""
+    """Whether it is a dense tensor of floats without attributes, which could hide its methods."""
     if type(value) not in (Tensor, torch.nn.Parameter) or vars(value):
         return False
     assert isinstance(value, Tensor)
@@ -287,38 +276,28 @@ def unused_shapes(config: SharpConfig) -> Shapes:
     These are the transformers' classifiers, and the U-Net that maps two depths to a scale in training.
     """
     shapes: Shapes = {}
-    for encoder in ("patch_encoder", "image_encoder"):
-        name = f"monodepth_model.monodepth_predictor.encoder.{encoder}.head"
+    for kind in ("patch_encoder", "image_encoder"):
+        name = f"monodepth_model.monodepth_predictor.encoder.{kind}.head"
         shapes |= {f"{name}.weight": (config.classes, config.embed), f"{name}.bias": (config.classes,)}
-    steps, width = 4, 16  # halvings of the U-Net, and its channels at full size
-    widths = [width << level for level in range(steps + 1)]
-    unet = _conv("encoder.conv_in.0", 2, width, 3) | _norm("encoder.conv_in.1", width)
-    for level in range(steps):
-        unet |= _level(f"encoder.convs_down.{level}", widths[level], widths[level + 1])
-    for level in range(steps):
-        wide, narrow = widths[steps - level], widths[steps - level - 1]
-        unet |= _level(f"decoder.convs_up.{level}", 2 * wide if level else wide, narrow)
-    unet |= _norm("decoder.conv_out.0", 2 * width) | _conv("decoder.conv_out.2", 2 * width, width, 1)
-    unet |= _norm("decoder.conv_out.3", width) | _conv("conv_out", width, 1, 1)
-    return shapes | {f"depth_alignment.scale_map_estimator.{name}": shape for name, shape in unet.items()}
+    width = 16  # the U-Net's channels at full size, doubled with each of four halvings
+    with torch.device("meta"):
+        into = nn.Sequential(nn.Conv2d(2, width, 3), nn.GroupNorm(GROUPS, width))
+        down = nn.ModuleList(_level(width << n, width << n + 1) for n in range(4))
+        # All but the first also see what the encoder made at their size.
+        up = nn.ModuleList(_level(width << (5 - n if n else 4), width << 3 - n) for n in range(4))
+        norms = nn.GroupNorm(GROUPS, 2 * width), nn.GroupNorm(GROUPS, width)
+        out = nn.Sequential(norms[0], nn.ReLU(), nn.Conv2d(2 * width, width, 1), norms[1])
+        encoder = nn.ModuleDict({"conv_in": into, "convs_down": down})
+        decoder = nn.ModuleDict({"convs_up": up, "conv_out": out})
+        unet = nn.ModuleDict({"encoder": encoder, "decoder": decoder, "conv_out": nn.Conv2d(width, 1, 1)})
+    return shapes | _shapes_of(unet, "depth_alignment.scale_map_estimator.")
 
 
-def _level(name: str, dim_in: int, dim_out: int) -> Shapes:
+def _level(dim_in: int, dim_out: int) -> nn.Sequential:
     """Two residual blocks behind a change of size, which has no parameters."""
-    shapes = _conv(f"{name}.1.shortcut", dim_in, dim_out, 1)
-    hidden = dim_out // 2
-    for block, dim in ((f"{name}.1.residual", dim_in), (f"{name}.2.residual", dim_out)):
-        shapes |= _norm(f"{block}.0", dim) | _conv(f"{block}.2", dim, hidden, 3)
-        shapes |= _norm(f"{block}.3", hidden) | _conv(f"{block}.5", hidden, dim_out, 3)
-    return shapes
-
-
-def _conv(name: str, dim_in: int, dim_out: int, size: int) -> Shapes:
-    return {f"{name}.weight": (dim_out, dim_in, size, size), f"{name}.bias": (dim_out,)}
-
-
-def _norm(name: str, dim: int) -> Shapes:
-    return {f"{name}.weight": (dim,), f"{name}.bias": (dim,)}
+    first = normed_residual(dim_in, dim_out)
+    first.shortcut = nn.Conv2d(dim_in, dim_out, 1)
+    return nn.Sequential(nn.Identity(), first, normed_residual(dim_out, dim_out))
 
 
 def deterministic_weights(shapes: Shapes) -> dict[str, Tensor]:

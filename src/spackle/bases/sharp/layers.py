@@ -1,4 +1,7 @@
-"""SHARP's sizes, its precision, and the blocks that its decoders share (after Ranftl 2021, dense prediction)."""
+"""SHARP's sizes, its precision, its decoders' blocks (after Ranftl 2021, dense prediction) and its encoder.
+
+The encoder is a vision transformer over windows of three sizes of the picture. Modules are named as in the checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
+
+from spackle.bases.protocol import Progress
 
 LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it
 STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
@@ -123,16 +129,11 @@ def plain_residual(dim: int) -> Residual:
     return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
 
 
-def normed_residual(dim: int) -> Residual:
+def normed_residual(dim: int, out: int) -> Residual:
     """The same with group norms, and half the width between them."""
-    return Residual(
-        GroupNorm(GROUPS, dim),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(dim, dim // 2, 3, padding=1),
-        GroupNorm(GROUPS, dim // 2),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(dim // 2, dim, 3, padding=1),
-    )
+    first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
+    norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
+    return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
 
 
 class Fusion(nn.Module):
@@ -171,3 +172,192 @@ class Decoder(nn.Module):
             features = fuse(projected) if features is None else fuse(features, projected)
         assert features is not None
         return features
+
+
+NORM_EPS = 1e-6
+MLP_RATIO = 4
+
+
+class VisionTransformer(nn.Module):
+    """ViT with a class token, learned positions and scaled residuals (DINOv2's), without its classifier.
+
+    The stream of tokens stays in float32: each block adds little to much, which bfloat16 would round away.
+    """
+
+    def __init__(self, config: SharpConfig) -> None:
+        super().__init__()
+        self.grid = config.grid
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
+        self.patch_embed = PatchEmbed(config)
+        self.blocks = nn.ModuleList(TransformerBlock(config) for _ in range(config.depth))
+        self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
+
+    def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
+        """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw ones after the blocks `taps`."""
+        tokens = self.patch_embed(windows)
+        tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
+        tapped = []
+        for index, block in enumerate(self.blocks):
+            tokens = block(tokens)
+            if index in taps:
+                tapped.append(self._to_map(tokens))
+        return self._to_map(self.norm(tokens)), tapped
+
+    def _to_map(self, tokens: Tensor) -> Tensor:
+        """[B, 1 + G², C] to [B, C, G, G], without the class token."""
+        return tokens[:, 1:].reshape(len(tokens), self.grid, self.grid, -1).permute(0, 3, 1, 2)
+
+
+class PatchEmbed(nn.Module):
+    """Windows [B, 3, S, S] to tokens [B, G², C]."""
+
+    def __init__(self, config: SharpConfig) -> None:
+        super().__init__()
+        self.proj = ExactConv(3, config.embed, config.patch, stride=config.patch)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        tokens: Tensor = self.proj(windows)
+        return tokens.flatten(2).transpose(1, 2)
+
+
+class TransformerBlock(nn.Module):
+    """Attention, then a perceptron, each added to the stream; tokens [B, T, C] float32."""
+
+    def __init__(self, config: SharpConfig) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(config.embed, eps=NORM_EPS)
+        self.attn = Attention(config.embed, config.heads)
+        self.ls1 = LayerScale(config.embed)
+        self.norm2 = nn.LayerNorm(config.embed, eps=NORM_EPS)
+        self.mlp = Mlp(config.embed)
+        self.ls2 = LayerScale(config.embed)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
+        out: Tensor = tokens + self.ls2(self.mlp(self.norm2(tokens)))
+        return out
+
+
+class Attention(nn.Module):
+    """Self-attention of several heads."""
+
+    def __init__(self, embed: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(embed, 3 * embed)
+        self.proj = nn.Linear(embed, embed)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        batch, count, width = tokens.shape
+        qkv: Tensor = self.qkv(lower(tokens, self.qkv))
+        query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
+        attended = scaled_dot_product_attention(query, key, value)
+        projected: Tensor = self.proj(attended.transpose(1, 2).flatten(2))
+        return projected
+
+
+class Mlp(nn.Module):
+    """Two linear maps with a GELU between them."""
+
+    def __init__(self, embed: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(embed, MLP_RATIO * embed)
+        self.fc2 = nn.Linear(MLP_RATIO * embed, embed)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        out: Tensor = self.fc2(gelu(self.fc1(lower(tokens, self.fc1))))
+        return out
+
+
+class LayerScale(nn.Module):
+    """One learned factor for each channel; float32 comes out."""
+
+    def __init__(self, embed: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(embed))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return tokens * self.gamma
+
+
+# Windows a side over the picture at its full size, which overlap by a quarter, and at half of it, by a half.
+# A quarter of it is one window.
+FULL_WINDOWS, HALF_WINDOWS = 5, 3
+WINDOWS = FULL_WINDOWS**2 + HALF_WINDOWS**2 + 1
+
+
+class SlidingPyramid(nn.Module):
+    """Feature maps of five scales, [1, C, side/2, …] to [1, C, side/32, …]."""
+
+    def __init__(self, config: SharpConfig) -> None:
+        super().__init__()
+        self.taps = config.taps
+        self.window = config.window
+        self.full_trim, self.half_trim = config.grid // 8, config.grid // 4  # tokens: half an overlap
+        self.patch_encoder = VisionTransformer(config)
+        self.image_encoder = VisionTransformer(config)
+        fine, embed, dims = config.depth_width, config.embed, config.pyramid
+        self.upsample_latent0 = _project_and_double(embed, dims[0], fine, 3)
+        self.upsample_latent1 = _project_and_double(embed, dims[0], dims[0], 2)
+        self.upsample0 = _project_and_double(embed, dims[1], dims[1], 1)
+        self.upsample1 = _project_and_double(embed, dims[2], dims[2], 1)
+        self.upsample2 = _project_and_double(embed, dims[3], dims[3], 1)
+        self.upsample_lowres = nn.ConvTranspose2d(embed, dims[3], 2, stride=2)
+        self.fuse_lowres = nn.Conv2d(2 * dims[3], dims[3], 1)
+
+    def forward(self, image: Tensor, batch: int, progress: Progress | None = None) -> list[Tensor]:
+        """Feature maps, fine to coarse, of a picture [1, 3, side, side] in -1..1, `batch` windows at a time."""
+        half, quarter = (interpolate(image, scale_factor=f, mode="bilinear") for f in (0.5, 0.25))
+        windows = torch.cat([cut(image, self.window, FULL_WINDOWS), cut(half, self.window, HALF_WINDOWS), quarter])
+        maps, latents = self._encode(windows, batch, progress)
+        full, middle, whole = torch.split(maps, [FULL_WINDOWS**2, HALF_WINDOWS**2, 1])
+        whole = self.upsample2(whole)
+        lowres = self.upsample_lowres(lower(self.image_encoder(quarter)[0], self.upsample_lowres))
+        return [
+            self.upsample_latent0(merge(latents[0], self.full_trim)),
+            self.upsample_latent1(merge(latents[1], self.full_trim)),
+            self.upsample0(merge(full, self.full_trim)),
+            self.upsample1(merge(middle, self.half_trim)),
+            self.fuse_lowres(torch.cat([whole, lowres], dim=1)),
+        ]
+
+    def _encode(self, windows: Tensor, batch: int, progress: Progress | None) -> tuple[Tensor, list[Tensor]]:
+        """Features of all windows, and the tapped ones of the full size's, a few windows at a time."""
+        found: list[list[Tensor]] = [[] for _ in range(1 + len(self.taps))]
+        for start in range(0, len(windows), batch):
+            features, tapped = self.patch_encoder(windows[start : start + batch], self.taps)
+            kept = max(0, FULL_WINDOWS**2 - start)  # taps are wanted of the full size alone
+            for into, part in zip(found, [features, *(tap[:kept] for tap in tapped)], strict=True):
+                into.append(lower(part, self.fuse_lowres))
+            if progress:
+                progress(min(start + batch, len(windows)), len(windows))
+        features, *latents = (torch.cat(parts) for parts in found)
+        return features, latents
+
+
+def cut(image: Tensor, window: int, count: int) -> Tensor:
+    """count² evenly overlapping windows [count², C, window, window] of [1, C, S, S], in row-major order."""
+    stride = (image.shape[-1] - window) // (count - 1)
+    rows = image.unfold(2, window, stride).unfold(3, window, stride)  # [1, C, count, count, window, window]
+    return rows[0].permute(1, 2, 0, 3, 4).flatten(0, 1)
+
+
+def merge(maps: Tensor, trim: int) -> Tensor:
+    """The inverse of `cut` for feature maps [n², C, G, G]: each gives up `trim` cells where it meets a neighbour."""
+    count = int(len(maps) ** 0.5)
+    size = maps.shape[-1]
+    spans = [slice(trim if i else 0, size - trim if i < count - 1 else size) for i in range(count)]
+    rows = []
+    for i, vertical in enumerate(spans):
+        tiles = [maps[i * count + j, :, vertical, horizontal] for j, horizontal in enumerate(spans)]
+        rows.append(torch.cat(tiles, dim=2))
+    return torch.cat(rows, dim=1)[None]
+
+
+def _project_and_double(dim_in: int, dim_middle: int, dim_out: int, doublings: int) -> nn.Sequential:
+    """A projection, then transposed convolutions that double the size, all without bias."""
+    layers: list[nn.Module] = [nn.Conv2d(dim_in, dim_middle, 1, bias=False)]
+    for index in range(doublings):
+        layers.append(nn.ConvTranspose2d(dim_out if index else dim_middle, dim_out, 2, stride=2, bias=False))
+    return nn.Sequential(*layers)

@@ -10,8 +10,16 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
 from spackle.bases.protocol import Progress
-from spackle.bases.sharp.encoder import SlidingPyramid
-from spackle.bases.sharp.layers import LAYERS, STRIDE, Decoder, ExactConv, Fusion, SharpConfig, normed_residual
+from spackle.bases.sharp.layers import (
+    LAYERS,
+    STRIDE,
+    Decoder,
+    ExactConv,
+    Fusion,
+    SharpConfig,
+    SlidingPyramid,
+    normed_residual,
+)
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
 
@@ -158,10 +166,8 @@ class GaussianDecoder(nn.Module):
 
 
 def _head(width: int, out: int) -> nn.Sequential:
-    last = nn.Conv2d(width, out, 1)
-    return nn.Sequential(
-        normed_residual(width), normed_residual(width), nn.ReLU(inplace=True), last, nn.ReLU(inplace=True)
-    )
+    blocks, last = [normed_residual(width, width) for _ in range(2)], nn.Conv2d(width, out, 1)
+    return nn.Sequential(*blocks, nn.ReLU(inplace=True), last, nn.ReLU(inplace=True))
 
 
 NEAREST, FARTHEST = 1.0, 100.0  # depths are scaled so that the nearest is 1, and cut off at 100
@@ -198,7 +204,7 @@ def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     Means are (x·z, y·z, z), where x and y run from -1 to 1 over the picture.
     """
     height, width = deltas.shape[-2:]
-    x, y = (_centers(n, deltas) for n in (width, height))
+    x, y = ((2 * torch.arange(n, device=deltas.device) + 1) / n - 1 for n in (width, height))  # of the cells' centres
     inverse = softplus(_inverse_softplus(start.disparity) + Z_GAIN * deltas[2])
     z = 1.0 / (inverse + FARTHEST_INVERSE)
     means = torch.stack([z * (x + XY_GAIN * deltas[0]), z * (y[:, None] + XY_GAIN * deltas[1]), z])
@@ -212,11 +218,6 @@ def compose(start: InitialGaussians, deltas: Tensor) -> Gaussians:
     return Gaussians(
         _rows(means * start.unscale), _rows(quats), _rows(scales * start.unscale), opacities.flatten(), _rows(colors)
     )
-
-
-def _centers(count: int, like: Tensor) -> Tensor:
-    """Cell centres in -1..1."""
-    return ((2 * torch.arange(count, device=like.device) + 1) / count - 1).to(like.dtype)
 
 
 def _inverse_softplus(y: Tensor) -> Tensor:

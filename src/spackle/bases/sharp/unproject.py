@@ -35,18 +35,16 @@ def stretch_gaussians(gaussians: Gaussians, stretch: tuple[float, float, float])
     """
     quats, scales = gaussians.quats.detach(), gaussians.scales.detach()
     plain = any(t.device.type != "cpu" or t.dtype != torch.float32 for t in (quats, scales))
-    quats, scales = (plain_stretch if plain else _fast_stretch)(quats, scales, stretch)
+    if plain:
+        quats, scales = plain_stretch(quats, scales, stretch)
+    else:
+        source = quats.contiguous().numpy(), scales.contiguous().numpy()
+        result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
+        factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
+        run_chunks(lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN)
+        quats, scales = torch.from_numpy(result[0]), torch.from_numpy(result[1])
     means = gaussians.means.detach()
     return Gaussians(means * _vector(stretch, means), quats, scales, gaussians.opacities, gaussians.colors)
-
-
-def _fast_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
-    """`plain_stretch` for float32 on the CPU, compiled and in all threads."""
-    source = quats.contiguous().numpy(), scales.contiguous().numpy()
-    result = np.empty((len(quats), 4), np.float32), np.empty((len(quats), 3), np.float32)
-    factors = float(stretch[0]), float(stretch[1]), float(stretch[2])
-    run_chunks(lambda start, stop: stretch_chunk(start, stop, *source, factors, *result), len(quats), GRAIN)
-    return torch.from_numpy(result[0]), torch.from_numpy(result[1])
 
 
 def plain_stretch(quats: Tensor, scales: Tensor, stretch: tuple[float, float, float]) -> tuple[Tensor, Tensor]:

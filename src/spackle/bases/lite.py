@@ -1,40 +1,42 @@
-"""The networks of the lite base and their file: an EfficientNet-Lite's features, and a small decoder."""
+"""The lite base: rough depth from the photo alone, by two small networks that come with the package.
+
+Each is an EfficientNet-Lite's features and a small decoder.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad, relu, relu6
 
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.lift import lift
+from spackle.bases.protocol import NEAREST_M, BasePrediction, Progress, nearest
+from spackle.device import own_arithmetic, pick_device
 from spackle.errors import InputError
+from spackle.image import Photo, resize_photo
 from spackle.network_file import fill_network, read_tensors
 
 STRIDE = 32  # both sides of the input are multiples of it
 Size = Literal["lite0", "lite2"]
-# Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation):
-# blocks, kernel, stride, expansion, channels.
-STAGES: dict[Size, tuple[tuple[int, int, int, int, int], ...]] = {
-    "lite0": (
-        (1, 3, 1, 1, 16),
-        (2, 3, 2, 6, 24),
-        (2, 5, 2, 6, 40),
-        (3, 3, 2, 6, 80),
-        (3, 5, 1, 6, 112),
-        (4, 5, 2, 6, 192),
-        (1, 3, 1, 6, 320),
-    ),
-    "lite2": (
-        (1, 3, 1, 1, 16),
-        (3, 3, 2, 6, 24),
-        (3, 5, 2, 6, 48),
-        (4, 3, 2, 6, 88),
-        (4, 5, 1, 6, 120),
-        (5, 5, 2, 6, 208),
-        (1, 3, 1, 6, 352),
-    ),
+# Stages of EfficientNet (Tan and Le 2019; Google's Lite variants have no squeeze-and-excitation).
+BLOCKS = ((3, 1, 1), (3, 2, 6), (5, 2, 6), (3, 2, 6), (5, 1, 6), (5, 2, 6), (3, 1, 6))  # kernel, stride, expansion
+DEPTHS: dict[Size, tuple[int, ...]] = {"lite0": (1, 2, 2, 3, 3, 4, 1), "lite2": (1, 3, 3, 4, 4, 5, 1)}  # in blocks
+WIDTHS: dict[Size, tuple[int, ...]] = {
+    "lite0": (16, 24, 40, 80, 112, 192, 320),
+    "lite2": (16, 24, 48, 88, 120, 208, 352),
+}
+# Blocks, kernel, stride, expansion, channels.
+STAGES = {
+    size: tuple((n, *block, c) for n, block, c in zip(depths, BLOCKS, WIDTHS[size], strict=True))
+    for size, depths in DEPTHS.items()
 }
 STEM = 32
 TAPS = (0, 1, 2, 4, 6)  # stages whose features the decoder sees: 1/2, 1/4, 1/8, 1/16 and 1/32 of the input
@@ -191,3 +193,114 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         elif scale is not None and tensor.dim() == 4 and scale.shape == tensor.shape[:1]:
             values[name] = tensor.float() * scale[:, None, None, None]
     return values
+
+
+SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
+FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
+
+
+@dataclasses.dataclass(frozen=True)
+class InputScale:
+    """A size at which a network sees a photo."""
+
+    pixels: int  # of what the network sees of it, nearly
+    network: int = 0  # which of the networks that a file has
+    mirrored: bool = True  # whether it sees the mirror image, too
+    tilt: bool = True  # whether it has a say in how the whole lies, and not in outlines alone
+
+
+# One after the other; both have learned from up to 256×320. Small shows them more of a thing at once, large its
+# outlines: the mean of what they say errs less than the best alone. The largest costs most, its mirror gains nothing.
+INPUT_SCALES = (
+    InputScale(64 * 96),
+    InputScale(96 * 128),
+    InputScale(192 * 256),
+    InputScale(192 * 256, network=1),
+    InputScale(256 * 320),
+    InputScale(448 * 608, mirrored=False, tilt=False),
+)
+COARSE = (3, 4)  # how the whole lies is what is left of an output in so many cells, the longer side having more
+
+
+class LiteBase:
+    """Small networks' depth, lifted as a measured one is: plausible parallax, not measurement."""
+
+    name = "lite"
+
+    def __init__(self, networks: Sequence[LiteNet], device: torch.device) -> None:
+        self.networks = [network.to(device) for network in networks]
+        self.device = device
+
+    @classmethod
+    def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
+        """Read the networks in a file that lite's training wrote, the package's own by default.
+
+        Args:
+            path: the file; those of its networks are asked that `INPUT_SCALES` counts.
+            device: cpu or a CUDA device; where None, CUDA if it is there.
+
+        Raises:
+            InputError: a file or device that cannot be used.
+        """
+        target = pick_device(device)
+        return cls(load_networks(path or SHIPPED), target)
+
+    def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        """Gaussians of the pixels of the photo at its working size, as `lift` makes them."""
+        photo = resize_photo(photo)
+        inverse_depth = self.inverse_depth(photo.rgb)
+        depth = NEAREST_M / (inverse_depth / nearest(inverse_depth.flatten())).clamp(1 / FARTHEST, 1)
+        known = torch.ones_like(depth, dtype=torch.bool)
+        if progress:
+            progress(1, 2)
+        prediction = lift(photo.rgb, DepthMap(depth, known, None, None, "disparity", photo.path), photo.camera)
+        if progress:
+            progress(2, 2)
+        notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
+        return dataclasses.replace(prediction, notes=notes)
+
+    def inverse_depth(self, rgb: Tensor) -> Tensor:
+        """What the networks say of a photo [H, W, 3], sRGB in 0..1, at all `INPUT_SCALES`: the mean logarithm.
+
+        Returns [h, w] float32 inverse depth up to a factor, on the processor; about 224×304, of the photo's shape.
+        """
+        scales = [scale for scale in INPUT_SCALES if scale.network < len(self.networks)]
+        return merged(self.at_scales(rgb, scales), [scale.tilt for scale in scales]).exp()
+
+    @torch.no_grad()
+    def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
+        """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n scales, as fine as the last."""
+        picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
+        outputs = [self._ask(picture, scale) for scale in scales]
+        finest = outputs[-1].shape
+        return torch.cat([interpolate(scale[None, None], size=finest, mode="bilinear") for scale in outputs])[
+            :, 0
+        ].cpu()
+
+    def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
+        """[h/2, w/2] log inverse depth of a photo [1, 3, H, W] that is seen at (h, w)."""
+        size = network_size(picture.shape[2], picture.shape[3], scale.pixels)
+        seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
+        ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
+        with own_arithmetic(self.device):
+            outputs = self.networks[scale.network](ways.contiguous(memory_format=torch.channels_last))
+        straight, *mirrored = outputs.float()
+        return torch.stack([straight, *(one.flip(-1) for one in mirrored)]).mean(0)
+
+
+def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:
+    """[h, w] the mean of outputs [n, h, w], but what is coarse in it is the mean of those that have a say in it."""
+    cells = COARSE if outputs.shape[1] <= outputs.shape[2] else COARSE[::-1]
+    coarse = interpolate(interpolate(outputs[None], size=cells, mode="area"), size=outputs.shape[1:], mode="bicubic")[0]
+    return (outputs - coarse).mean(0) + coarse[torch.tensor(tilt)].mean(0)
+
+
+def network_size(height: int, width: int, pixels: int) -> tuple[int, int]:
+    """(height, width) of what the network sees of a photo: nearly its shape, nearly `pixels`."""
+    return scaled_size(height, width, math.sqrt(pixels / (height * width)))
+
+
+def scaled_size(height: int, width: int, scale: float) -> tuple[int, int]:
+    """(height, width) times nearly `scale`, as a network takes it."""
+    tall, wide = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (height, width))
+    return tall, wide
