@@ -14,10 +14,10 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from spackle.bases import lite
 from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import SETTINGS, WEIGHTS, HfBase
 from spackle.bases.lift import RgbdBase
-from spackle.bases import lite
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
 from spackle.bases.sharp.base import SharpBase, check_windows
