@@ -67,7 +67,7 @@ def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) ->
     losses: list[float] = []
     callbacks = Callbacks(
         step=lambda step, numbers: losses.append(numbers["loss"]),
-        validated=lambda progress: None,
+        validated=lambda progress, sheet: None,
         saved=lambda progress: None,
         stop=lambda: False,
     )

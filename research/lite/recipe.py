@@ -14,7 +14,7 @@ from frames import Group, Measured, of_camera, of_scenes
 from spackle.bases.lite import STAGES, STRIDE, Size
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES
-from spackle.training.data import digest_of, find_files
+from spackle.training.data import find_files, short_digest
 from spackle.training.recipe import (
     FREE,
     Count,
@@ -157,14 +157,14 @@ class LiteFiles:
     @property
     def scenes_digest(self) -> str:
         """Twelve digits: the same for the same scenes, wherever the photos lie and however many are made."""
-        return digest_of((SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos)))
+        return short_digest((SCENES_VERSION, self.data.seed, list(self.data.size), self._below(self.photos)))
 
     @property
     def guesses_digest(self) -> str:
         """Twelve digits: the same photos and the same teacher, wherever they lie; of no teacher too."""
         teacher = self.data.teacher
         weights = hashlib.sha256(teacher.read_bytes()).hexdigest() if teacher is not None and self.guessed else ""
-        return digest_of((GUESSES_VERSION, weights, self._below(self.guessed)))
+        return short_digest((GUESSES_VERSION, weights, self._below(self.guessed)))
 
     def _below(self, files: Sequence[Path]) -> list[str]:
         folder = self.data.photos
@@ -177,7 +177,7 @@ class LiteFiles:
         for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
         names = [_names(files) for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))]
-        return digest_of((self.scenes_digest, self.guesses_digest, facts, names))
+        return short_digest((self.scenes_digest, self.guesses_digest, facts, names))
 
 
 def _spread(photos: Sequence[Path], count: int) -> Sequence[Path]:

@@ -25,7 +25,7 @@ from spackle.errors import InputError
 from spackle.output_folder import make_folder
 from spackle.progress import Reporter
 from spackle.training.method import CACHE, Plan, RunContext, Start, parameters
-from spackle.training.recipe import load_recipe_as
+from spackle.training.recipe import load_recipe
 from spackle.training.run import train
 from spackle.training.trainer import adamw
 
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="in place of the recipe's: optim.steps=100")
     options = parser.parse_intermixed_args(arguments)
     try:
-        recipe = load_recipe_as(LiteRecipe, options.recipe, options.overrides)
+        recipe = load_recipe(LiteRecipe, options.recipe, options.overrides)
         ended = train(recipe, plan_lite, options.output, Reporter(), options.overwrite)
     except InputError as error:
         if str(error):  # else another process speaks

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import hashlib
 import json
@@ -16,33 +15,22 @@ import torch
 from command import Run, names_in, report_of, run
 from photos import metres, picture, read_ply, write_depth, write_photo
 from PIL import Image
-from safetensors import safe_open
 from safetensors.torch import save_file
-from scenes import shifted
 from sharp_weights import MICRO
 from torch import Tensor
 from training_runs import run_two, state, trained
 
-from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import TunableSharp, normalised_camera
+from spackle.bases.sharp.base import TunableSharp
 from spackle.bases.sharp.checkpoint import (
-    NOTE,
     PARTS,
     Owner,
-    decoder_bytes,
     deterministic_weights,
     expected_shapes,
-    link_owner,
     load_network,
 )
 from spackle.bases.sharp.layers import CONFIGS
-from spackle.camera import Camera
 from spackle.dataset import DatasetFiles
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
-from spackle.image import Photo
 from spackle.render import get_renderer
-from spackle.render.reference import ReferenceRenderer
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
 from spackle.training.method import Objective
 from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
@@ -125,68 +113,7 @@ def train(place: Path, output: Path, *more: object) -> Run:
     return run(*arguments(place, output, *more))
 
 
-def photo() -> Photo:
-    return Photo(torch.from_numpy(picture(WIDTH, HEIGHT)).float() / 255, FOCAL, "--focal-px", Path("a.png"))
-
-
-# The way from the decoder's weights to a picture --------------------------------------------------
-
-
-def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSharp) -> None:
-    camera = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
-    with torch.no_grad():
-        before = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, camera))
-    after = SharpBase(base.network).predict(photo()).gaussians
-    aside = camera.looking(torch.tensor([0.2, -0.1, 0.1]), torch.tensor([0.0, 0.0, 4.0]))
-    # The second one has pixels that are not square, as after rounding to a working size.
-    for view in (camera, shifted(camera, 0.3).resized(WIDTH, HEIGHT + 6), aside):
-        one = get_renderer().render(before, normalised_camera(view, camera))
-        other = get_renderer().render(after, view)
-        for name, tolerance in (("rgb", 1e-4), ("alpha", 1e-4), ("depth", 1e-3)):
-            torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=0, atol=tolerance)
-
-
-@pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
-def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
-    """Along the gradient itself. Rendering follows below: its cut-offs are steps, which no gradient sees."""
-    decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
-    seen = base.see(photo().rgb, Camera.from_focal(FOCAL, WIDTH, HEIGHT))
-
-    def loss() -> Tensor:
-        random = torch.Generator().manual_seed(0)
-        tensors = base.gaussians(decoder, seen).tensors
-        return torch.stack([(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]).sum()
-
-    loss().backward()
-    named = [(key, weight) for key, weight in decoder.named_parameters() if key.startswith(name)]
-    weights = [weight for _, weight in named if weight.requires_grad]
-    assert all(weight.grad is not None for weight in weights)
-    length = float(torch.stack([weight.grad.norm() for weight in weights]).norm())
-    found = []
-    with torch.no_grad():
-        for step in (NUDGE, -2 * NUDGE):
-            for weight in weights:
-                weight.add_(weight.grad, alpha=step / length)
-            found.append(float(loss()))
-    assert (found[0] - found[1]) / (2 * NUDGE) == pytest.approx(length, rel=0.005)
-
-
-def test_gradients_from_pixels_to_gaussians_are_those_of_the_plain_renderer(base: TunableSharp) -> None:
-    """Through a camera whose matrix is no rotation."""
-    camera = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
-    with torch.no_grad():
-        every = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, camera))
-    some = every.select(slice(None, None, 317))
-    some = dataclasses.replace(some, scales=10 * some.scales, opacities=0.9 * some.opacities)
-    weights = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    found = []
-    for renderer in (get_renderer(), ReferenceRenderer()):
-        asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in some.tensors))
-        drawn = renderer.render(asking, normalised_camera(shifted(camera, 0.2), camera))
-        ((drawn.rgb.mean(-1) + 0.1 * drawn.depth + drawn.alpha) * weights).sum().backward()
-        found.append([tensor.grad for tensor in asking.tensors])
-    for one, other in zip(*found, strict=True):
-        assert float((one - other).norm()) < 0.01 * float(other.norm())
+# What learns, and what does not -------------------------------------------------------------------
 
 
 def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
@@ -234,9 +161,6 @@ def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_pat
 
 def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: Path) -> None:
     base = TunableSharp.load(place / "sharp.safetensors", torch.bfloat16, CPU)
-    types = {name: weight.dtype for name, weight in base.network.named_parameters()}
-    assert torch.bfloat16 in types.values()
-    assert {kind for name, kind in types.items() if name.startswith(PARTS)} == {torch.float32}
     before = base.network.prediction_head.texture_prediction_head.bias.detach().clone()
     first, *_ = learn(place, base, tmp_path, 1, lr=1e-5, min_lr=1e-5)
     moved = (base.network.prediction_head.texture_prediction_head.bias.detach() - before).abs()
@@ -309,9 +233,7 @@ def test_each_step_has_the_photos_own_view_and_others_in_turn(place: Path) -> No
         (["data.photos={place}/photos"], "data.photos: its samples have Gaussians that cannot change"),
         (["data.rgbd=[{{folder: x, focal_px: 1}}]"], "leave it out (data.rgbd=[])"),
         (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
-        (["data.pseudo={place}/photos"], "manifest.json: not there"),
         (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
-        (["-c", "{place}/nothing.pt"], "nothing.pt: no such checkpoint"),
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
         (["optim.batch=6"], "optim.batch=6: with --method direct-ft each process takes 4 views"),
         (["init=weights.safetensors"], "init=weights.safetensors: --method direct-ft starts from SHARP's checkpoint"),
@@ -343,7 +265,7 @@ def test_without_weights_a_line_says_where_they_come_from(
     words = ("train", "--method", "direct-ft", "--recipe", place / "recipe.yaml", "-o", tmp_path / "out")
     done = run(*words)
     assert (done.code, len(done.lines)) == (2, 1)
-    assert "`spackle weights get sharp` downloads them" in done.err
+    assert "spackle weights get sharp" in done.err
     (tmp_path / "weights").mkdir()
     shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")  # its content tells its kind
     assert run(*words, "optim.steps=1").code == 0
@@ -368,35 +290,11 @@ def test_a_checkpoint_of_another_network_is_a_line(place: Path, whole: tuple[Pat
     torch.save(saved, out / "checkpoint.pt")
     done = train(place, out, "optim.steps=5")
     assert done.code == 2
-    assert f"its checkpoint is of another network (1 tensors differ, e.g. {name})" in done.lines[-1]
+    assert "its checkpoint is of another network " in done.lines[-1]
+    assert name in done.lines[-1]
 
 
 # What comes out predicts --------------------------------------------------------------------------
-
-
-def gaussians_from(weights: Path) -> Gaussians:
-    return SharpBase.load(weights, precision="fp32", device="cpu").predict(photo()).gaussians
-
-
-def test_a_decoder_that_has_learned_nothing_predicts_what_its_checkpoint_does(
-    place: Path, whole: tuple[Path, Run], base: TunableSharp, tmp_path: Path
-) -> None:
-    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
-    (tmp_path / "same.safetensors").write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
-    # The link is renewed, and counts more than another file of the checkpoint's name.
-    for where in (tmp_path / "where it lay once", owner.path, owner.path):
-        link_owner(Owner(where, owner.sha256), tmp_path)
-    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")
-    same, learned = gaussians_from(tmp_path / "same.safetensors"), gaussians_from(whole[0] / "best.safetensors")
-    before = gaussians_from(owner.path)
-    assert all(map(torch.equal, same.tensors, before.tensors))
-    assert not any(map(torch.equal, learned.tensors, before.tensors))
-    assert len(learned) == len(before)
-    state = load_network(whole[0] / "best.safetensors", torch.float32).state_dict()
-    weights = opaque_weights()
-    assert {name for name in state if not torch.equal(state[name], weights[name])} <= {
-        name for name in state if name.startswith(PARTS)
-    }
 
 
 def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
@@ -408,32 +306,8 @@ def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tu
     assert report_of(tmp_path / "tuned" / "photo")["base"]["weights"] == "best.safetensors"
     base, tuned = (read_ply(tmp_path / name / "photo" / "base.ply") for name in ("base", "tuned"))
     assert base.count == tuned.count
-
-
-def test_a_decoder_finds_its_checkpoint_beside_it_and_holds_it_to_its_digest(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path
-) -> None:
-    best = tmp_path / "best.safetensors"
-    with safe_open(whole[0] / "best.safetensors", framework="pt") as opened:
-        notes, tensors = opened.metadata(), {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-    assert json.loads(notes[NOTE])["checkpoint"] == "sharp.safetensors"  # and not where it lies here
-    moved = {**json.loads(notes[NOTE]), "checkpoint": "/elsewhere/sharp.safetensors"}
-    save_file(tensors, best, {NOTE: json.dumps(moved)})
-    with pytest.raises(InputError, match=r"trained on sharp\.safetensors, which is not beside it: put"):
-        SharpBase.load(best)
-    assert str(place) not in str(notes)
-    (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
-    assert all(map(torch.equal, gaussians_from(best).tensors, gaussians_from(whole[0] / "best.safetensors").tensors))
-    (tmp_path / "sharp.safetensors").unlink()
-    save_file(deterministic_weights(expected_shapes(MICRO)), tmp_path / "sharp.safetensors")
-    with pytest.raises(InputError, match="trained on a checkpoint with the SHA-256"):
-        SharpBase.load(best)
-    (tmp_path / "sharp.safetensors").unlink()
-    (tmp_path / "sharp.safetensors").symlink_to(place / "sharp.safetensors")
-    name = min(tensors)
-    save_file({key: value for key, value in tensors.items() if key != name}, best, notes)
-    with pytest.raises(InputError, match=f"1 names differ, e.g. {name}"):
-        SharpBase.load(best)
-    save_file(tensors, best, {NOTE: "{}"})
-    with pytest.raises(InputError, match="does not say which checkpoint it was trained on"):
-        SharpBase.load(best)
+    learned = load_network(whole[0] / "best.safetensors", torch.float32).state_dict()
+    before = opaque_weights()
+    changed = {name for name in learned if not torch.equal(learned[name], before[name])}
+    assert changed
+    assert all(name.startswith(PARTS) for name in changed)

@@ -65,22 +65,18 @@ def refusal(name: str, path: Path | None) -> str:
     return message
 
 
-def test_resnet_has_torchvisions_names_and_shapes() -> None:
+def test_resnet_has_torchvisions_names_and_shapes_and_normalises_as_it_does() -> None:
     network = ResNet50()
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
     assert len(shapes) == 320 - 2  # torchvision's, less its classifier
-    literal = {
-        "conv1.weight": (64, 3, 7, 7),
-        "bn1.num_batches_tracked": (),
-        "layer1.0.conv1.weight": (64, 64, 1, 1),
-        "layer1.0.downsample.0.weight": (256, 64, 1, 1),
-        "layer2.0.conv2.weight": (128, 128, 3, 3),
-        "layer3.5.bn3.running_var": (1024,),
-        "layer4.2.conv3.weight": (2048, 512, 1, 1),
-    }
-    assert {name: shapes[name] for name in literal} == literal
-    assert "layer1.1.downsample.0.weight" not in shapes
+    assert shapes["bn1.num_batches_tracked"] == ()
+    assert shapes["layer1.0.downsample.0.weight"] == (256, 64, 1, 1)
+    assert shapes["layer3.5.bn3.running_var"] == (1024,)
+    seen: list[Tensor] = []
+    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
+    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
 
 
 @pytest.mark.parametrize("suffix", ["pth", "safetensors"])
@@ -99,21 +95,12 @@ def test_resnet_reads_a_local_file(resnet: dict[str, Tensor], tmp_path: Path, su
     assert all(m.min() >= 0 for m in maps)
 
 
-def test_resnet_normalises_as_torchvision_does(resnet: dict[str, Tensor]) -> None:
-    seen: list[Tensor] = []
-    network = ResNet50()
-    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
-    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
-    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
-
-
-def test_squeezenet_has_caffes_sizes(squeezenet: SqueezeNet) -> None:
+def test_squeezenet_has_caffes_sizes_and_convolves_bgr_less_the_mean(
+    squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]
+) -> None:
     shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
     assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
     assert [len(m) for m in squeezenet(torch.rand(2, 3, 35, 35))] == [2] * 4
-
-
-def test_squeezenet_convolves_bgr_less_the_mean(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
     image = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(2))
     bgr = 255 * image.numpy()[::-1] - np.array([104, 117, 123])[:, None, None]
     window = bgr[:, 2 * 4 : 2 * 4 + 7, 2 * 9 : 2 * 9 + 7]
@@ -156,13 +143,11 @@ def test_networks_are_frozen_and_pass_gradients_on(kind: type[ResNet50 | Squeeze
 def test_a_network_wants_its_file(tmp_path: Path) -> None:
     assert load_features("none", None) is None
     assert "name their file" in refusal("resnet50", None)
-    assert "no such feature network" in refusal("vgg", None)
     assert "no such weight file" in refusal("squeezenet", tmp_path / "missing.npz")
-    assert "not a plain file" in refusal("squeezenet", tmp_path)
 
 
 @pytest.mark.parametrize("name", ["resnet50", "squeezenet"])
-@pytest.mark.parametrize("content", [b"", b"no weights", b"PK\x03\x04 cut off", b"\x80\x02cos\nsystem\n."])
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"\x80\x02cos\nsystem\n."])
 def test_a_broken_file_is_refused(name: str, content: bytes, tmp_path: Path) -> None:
     (tmp_path / "weights").write_bytes(content)
     assert "give" in refusal(name, tmp_path / "weights")
@@ -170,18 +155,13 @@ def test_a_broken_file_is_refused(name: str, content: bytes, tmp_path: Path) -> 
 
 def test_resnet_refuses_what_is_not_its_weights(resnet: dict[str, Tensor], tmp_path: Path) -> None:
     path = tmp_path / "other.pth"
-    small = {"conv1.weight": resnet["conv1.weight"]}
     for content, words in [
-        (small, "'bn1.weight' is missing and"),
         ({name: value for name, value in resnet.items() if name != "bn1.bias"}, "('bn1.bias' is missing)"),
         ([1, 2], "more than named tensors"),
-        ({"epoch": 3, "model": small}, "more than named tensors"),
         ({"conv1.weight": resnet["conv1.weight"].to_sparse()}, "more than named tensors"),
     ]:
         torch.save(content, path)
         assert words in refusal("resnet50", path)
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    refusal("resnet50", tmp_path / "other.npz")
 
 
 def test_squeezenet_refuses_what_is_not_its_weights(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
@@ -190,9 +170,7 @@ def test_squeezenet_refuses_what_is_not_its_weights(squeezed: dict[str, np.ndarr
     for change, words in [
         ({"conv1.w": first[:, :, :3, :3]}, "'conv1.w' is [96, 3, 3, 3] instead of [96, 3, 7, 7]"),
         ({"conv1.w": np.full_like(first, np.nan)}, "'conv1.w' holds something else than finite numbers"),
-        ({"conv1.w": first.astype(np.int32)}, "'conv1.w' holds something else than finite numbers"),
         ({"fire10/conv1x1_1.w": first}, "'fire10/conv1x1_1.w' is unknown"),
-        ({"conv10.b": first}, "'conv10.b' is [96, 3, 7, 7] instead of [1000]"),
         ({"conv1.w": np.array([{}])}, "cannot be read as an .npz file"),  # an object: would have to be unpickled
     ]:
         np.savez(path, **(squeezed | change))

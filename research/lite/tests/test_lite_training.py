@@ -23,7 +23,7 @@ from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, 
 from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite import LiteNet, load_networks
-from spackle.training.recipe import load_recipe_as
+from spackle.training.recipe import load_recipe
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
@@ -39,8 +39,8 @@ data:
   validation_stereo: %(place)s/others
   made: 3
   size: [64, 96]
-optim: {steps: 4, batch: 2, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
-run: {validate_every: 4, save_every: 2, log_every: 1}
+optim: {steps: 10, batch: 2, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
+run: {validate_every: 10, save_every: 2, log_every: 1}
 encoder: random
 """
 
@@ -59,7 +59,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(place: Path) -> tuple[Path, Run]:
-    """A run of four steps in one go."""
+    """A run of ten steps in one go."""
     return place / "whole", train(place, place / "whole")
 
 
@@ -85,18 +85,18 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> 
     assert "to learn from: 3 made, 2 stereo, 4 rgbd; to be judged by: 2 kitchen, 1 stereo" in done.lines
     assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
     report = json.loads((folder / "run.json").read_text())
-    assert (report["method"], report["ended"], report["step"], report["aim"]) == ("lite", "steps", 4, "abs_rel")
+    assert (report["method"], report["ended"], report["step"], report["aim"]) == ("lite", "steps", 10, "abs_rel")
     (found,) = report["history"]
     assert found.keys() >= {"loss", "factor", "line", "steps", "abs_rel", "delta", "ramp_abs_rel", "kitchen/delta"}
     # Each group counts as much as another, however many frames it has.
     assert found["abs_rel"] == pytest.approx((found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2)
     assert report["best"] == found["abs_rel"]
-    (line,) = [line for line in done.lines if line.startswith("step 4: ")]
+    (line,) = [line for line in done.lines if line.startswith("step 10: ")]
     assert line.startswith(
-        f"step 4: validation abs_rel {found['abs_rel']:.4f} (the best so far), a vertical ramp has 0."
+        f"step 10: validation abs_rel {found['abs_rel']:.4f} (the best so far), a vertical ramp has 0."
     )
     assert sum(report["parameters"].values()) == sum(weight.numel() for weight in LiteNet().parameters())
-    with Image.open(folder / "pictures" / "0000004.png") as sheet:
+    with Image.open(folder / "pictures" / "0000010.png") as sheet:
         assert sheet.size == (3 * 64, 3 * 48)
     average = state(folder).average
     for name in ("best", "last"):
@@ -306,7 +306,7 @@ def test_pictures_that_make_a_loss_that_is_no_number_are_named(
 
 
 def test_the_projects_recipe_can_be_read_and_learns_from_all_there_is() -> None:
-    recipe = load_recipe_as(LiteRecipe, LITE / "lite.yaml")
+    recipe = load_recipe(LiteRecipe, LITE / "lite.yaml")
     data, shares = recipe.data, recipe.data.shares
     assert all((data.photos, data.stereo, data.rgbd, shares.made, shares.stereo, shares.rgbd))
     assert shares.made + shares.stereo + shares.rgbd + shares.guessed == pytest.approx(1)

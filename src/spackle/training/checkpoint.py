@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
-from torch import Tensor, nn
+from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import atomic_path
@@ -59,8 +58,7 @@ class Checkpoint:
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
     """Write checkpoint.pt; the one before it stays as checkpoint.previous.pt.
 
-    Raises:
-        InputError: where it cannot be written, or the disk is full; what was there stays.
+    InputError where it cannot be written, or the disk is full; what was there stays.
     """
     progress = dataclasses.asdict(checkpoint.progress)
     state = {**vars(checkpoint), "progress": {**progress, "history": list(progress["history"])}}
@@ -76,8 +74,7 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
 def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
     """The last whole checkpoint of a folder or None, and what is wrong with a newer one, if anything.
 
-    Raises:
-        InputError: there are checkpoints, but none can be read.
+    InputError for checkpoints of which none can be read.
     """
     problem = None
     for path in (folder / NEWEST, folder / PREVIOUS):
@@ -106,13 +103,6 @@ def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, diges
     else:
         return
     raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
-
-
-def export_weights(network: nn.Module, path: Path) -> None:
-    """Write weights with half precision, as `load_residual` reads them; InputError where that cannot be."""
-    tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors))
 
 
 def remove_run(folder: Path) -> None:

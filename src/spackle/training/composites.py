@@ -30,7 +30,7 @@ def composite(rng: np.random.Generator, photos: Photos, height: int, width: int)
         if not AREA[0] < share < AREA[1]:
             continue
         inside = shape > 0.5
-        depth = float(inverse_depth[inside].max()) * _between(rng, *NEARER)
+        depth = float(inverse_depth[inside].max()) * rng.uniform(*NEARER)
         if depth > 1 / NEAREST_M:
             continue
         plane = depth * (1 + _tilt(rng, height, width, 0.1))
@@ -43,7 +43,7 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
     """A part of a photo [h, w, 3] at a random scale, by chance mirrored, [height, width, 3]."""
     rows, columns = photo.shape[:2]
     smallest = max(height / rows, width / columns)
-    scale = smallest * _between(rng, 1.0, 1.5)
+    scale = smallest * rng.uniform(1.0, 1.5)
     size = max(height, math.ceil(rows * scale)), max(width, math.ceil(columns * scale))
     resized = interpolate(photo.permute(2, 0, 1)[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
     top, left = (int(rng.integers(0, have - want + 1)) for have, want in zip(size, (height, width), strict=True))
@@ -53,11 +53,11 @@ def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int
 
 def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
     """A wall, and by chance the ground in front of it or a second wall beside it."""
-    far = 1.0 / _between(rng, *BACKGROUND_M)
+    far = 1.0 / rng.uniform(*BACKGROUND_M)
     plane = far * (1 + _tilt(rng, height, width, 0.3))
     if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon
         rows = (torch.arange(height) + 0.5) / height
-        ground = far * _between(rng, 1.5, 4.0) * (rows - _between(rng, 0.2, 0.6))[:, None].clamp_min(0)
+        ground = far * rng.uniform(1.5, 4.0) * (rows - rng.uniform(0.2, 0.6))[:, None].clamp_min(0)
         plane = torch.maximum(plane, ground.expand(height, width))
     if rng.random() < 0.3:
         plane = torch.maximum(plane, far * (1 + _tilt(rng, height, width, 1.0)))
@@ -67,30 +67,30 @@ def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
 def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
     """A linear ramp [H, W] of random direction, within ±most."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    a, b = (_between(rng, -most, most) / 2 for _ in range(2))
+    a, b = (rng.uniform(-most, most) / 2 for _ in range(2))
     return a * x + b * y
 
 
 def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
     """An outline [H, W] in 0..1, soft over about a pixel as a camera's edges are."""
     height, width = picture.shape[:2]
-    cloud = _noise(rng, height, width, _between(rng, 0.1, 0.35))
+    cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    cy, cx = _between(rng, 0.1, 1.0) * height, _between(rng, 0.0, 1.0) * width
+    cy, cx = rng.uniform(0.1, 1.0) * height, rng.uniform(0.0, 1.0) * width
     kind = rng.random()
     if kind < 0.35:  # what resembles the colour at a point: outlines that follow those of real things
         smooth = avg_pool2d(picture.permute(2, 0, 1)[None], 9, stride=1, padding=4, count_include_pad=False)[0]
         color = smooth[:, min(int(cy), height - 1), min(int(cx), width - 1)]
-        unlike = ((smooth - color[:, None, None]) ** 2).sum(0) / _between(rng, 0.01, 0.04)
-        away = ((x - cx) ** 2 + (y - cy) ** 2) / (_between(rng, 0.15, 0.5) * width) ** 2
+        unlike = ((smooth - color[:, None, None]) ** 2).sum(0) / rng.uniform(0.01, 0.04)
+        away = ((x - cx) ** 2 + (y - cy) ** 2) / (rng.uniform(0.15, 0.5) * width) ** 2
         field = 1 - unlike - away + 0.1 * cloud
     elif kind < 0.75:  # a blob
-        ry, rx = (_between(rng, 0.08, 0.4) * side for side in (height, width))
-        field = 1 - ((x - cx) / rx) ** 2 - ((y - cy) / ry) ** 2 + _between(rng, 0.0, 0.8) * cloud
+        ry, rx = (rng.uniform(0.08, 0.4) * side for side in (height, width))
+        field = 1 - ((x - cx) / rx) ** 2 - ((y - cy) / ry) ** 2 + rng.uniform(0.0, 0.8) * cloud
     else:  # a bar: poles, legs and frames
-        angle = _between(rng, -0.4, 0.4) + (math.pi / 2 if rng.random() < 0.25 else 0.0)
+        angle = rng.uniform(-0.4, 0.4) + (math.pi / 2 if rng.random() < 0.25 else 0.0)
         across = ((x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)).abs()
-        field = 1 - across / (_between(rng, 0.008, 0.06) * width) + 0.2 * cloud
+        field = 1 - across / (rng.uniform(0.008, 0.06) * width) + 0.2 * cloud
     soft = (field > 0).float()[None, None]
     return avg_pool2d(soft, 3, stride=1, padding=1, count_include_pad=False)[0, 0]
 
@@ -100,7 +100,3 @@ def _noise(rng: np.random.Generator, height: int, width: int, size: float) -> Te
     rows, columns = max(2, round(height / (size * width))), max(2, round(1 / size))
     coarse = torch.from_numpy(rng.standard_normal((1, 1, rows, columns)).astype(np.float32))
     return interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[0, 0]
-
-
-def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(rng.uniform(low, high))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,57 +19,11 @@ from spackle.image import PHOTO_SUFFIXES
 from spackle.render import Renderer
 from spackle.training.recipe import DataRecipe, plain
 from spackle.training.sample import Sample, random_crops, save_sample
-from spackle.training.sources import Composites, PseudoViews, RgbdFrames, Source, StereoPairs
+from spackle.training.sources import PseudoViews, View, composite_view, frame_view, right_view, stereo_view
 
 TRAIN, VALIDATION = "train", "validation"
 SAMPLES_VERSION = 2  # goes up whenever the same recipe would make other samples
 Step = Callable[[int, int], None]  # (done, of how many)
-
-
-@dataclasses.dataclass(frozen=True)
-class Cache:
-    """A folder of samples, numbered by the view that they are crops of."""
-
-    folder: Path
-    sources: Sequence[Source]
-    shares: Sequence[float]  # of each source
-    seed: int
-    crops: int  # of a view, at most
-    cells: int  # along a crop's side
-
-    def fill(self, views: int, progress: Step, warn: Callable[[str], None]) -> list[Path]:
-        """Make what is missing of the first views, warning of bad photos; returns the samples' files in order."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        files: list[Path] = []
-        for index in range(views):
-            files += self._view(index, warn)
-            progress(index + 1, views)
-        return files
-
-    def _view(self, index: int, warn: Callable[[str], None]) -> list[Path]:
-        marker = self.folder / f"{index:06d}.done"
-        try:
-            files = [self._file(index, number) for number in range(int(marker.read_text()))]
-            if all(file.is_file() for file in files):
-                return files
-        except (FileNotFoundError, ValueError):
-            pass
-        rng = np.random.default_rng([self.seed, index])
-        source = self.sources[rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares))]
-        crops: list[Sample] = []
-        try:
-            crops = random_crops(source.view(rng), rng, self.crops, self.cells)
-        except (InputError, ValueError) as error:
-            warn(f"view {index} ({source.name}) passed over: {error}")
-        files = [self._file(index, number) for number in range(len(crops))]
-        for crop, file in zip(crops, files, strict=True):
-            save_sample(crop, file)
-        with atomic_path(marker) as temporary:
-            temporary.write_text(f"{len(crops)}\n")
-        return files
-
-    def _file(self, index: int, number: int) -> Path:
-        return self.folder / f"{index:06d}-{number}.safetensors"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,42 +40,41 @@ class Supply:
     """Where samples come from: the files that were found for a recipe."""
 
     data: DataRecipe
-    sources: Sequence[Source]
+    sources: Sequence[View]
     shares: Sequence[float]
     names: Sequence[str]  # of all files, relative to their folders
 
     @staticmethod
     def of(data: DataRecipe, renderer: Renderer) -> Supply:
-        """Look for a recipe's files.
-
-        Raises:
-            InputError: a folder that is missing or without such files, or no data at all.
-        """
-        sources: list[Source] = []
+        """Look for a recipe's files; InputError for a folder that is missing or without such files, or no data."""
+        sources: list[View] = []
         shares: list[float] = []
         names: list[str] = []
+        drawn: dict[str, Any] = {"disparity": data.disparity, "renderer": renderer}
 
-        def add(source: Source, share: float, folder: Path, files: Sequence[Path]) -> None:
+        def add(name: str, share: float, folder: Path, files: Sequence[Path], view: View) -> None:
             if share > 0:
-                sources.append(source)
+                sources.append(view)
                 shares.append(share)
-                names.extend([source.name, *(file.relative_to(folder).as_posix() for file in files)])
+                names.extend([name, *(file.relative_to(folder).as_posix() for file in files)])
 
         if data.photos is not None:
             photos = find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
-            add(Composites(photos, renderer, data.disparity), data.shares.composites, data.photos, photos)
+            view = partial(composite_view, photos=photos, **drawn)
+            add("composites", data.shares.composites, data.photos, photos, view)
         found = [find_files(frames.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for frames in data.rgbd]
         for camera, frames in zip(data.rgbd, found, strict=True):
             share = data.shares.rgbd * len(frames) / sum(map(len, found))  # every frame counts alike
-            source = RgbdFrames(frames, renderer, data.disparity, camera.focal_px, camera.unit_m)
-            add(source, share, camera.folder, frames)
+            view = partial(frame_view, frames=frames, focal_px=camera.focal_px, unit_m=camera.unit_m, **drawn)
+            add("rgbd", share, camera.folder, frames, view)
         if data.stereo is not None:
             scenes = [file.parent for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
-            for reverse, share, name in ((True, data.shares.stereo, "stereo"), (False, data.shares.pairs, "pairs")):
-                add(StereoPairs(scenes, renderer, data.disparity, reverse, name), share, data.stereo, scenes)
+            add("stereo", data.shares.stereo, data.stereo, scenes, partial(stereo_view, folders=scenes, **drawn))
+            view = partial(right_view, folders=scenes, renderer=renderer)
+            add("pairs", data.shares.pairs, data.stereo, scenes, view)
         if data.pseudo is not None and data.shares.pseudo > 0:
             views = PseudoViews(data.pseudo)
-            add(views, data.shares.pseudo, data.pseudo, ())
+            add("pseudo", data.shares.pseudo, data.pseudo, (), views.view)
             names.append(views.digest)
         if not sources:
             raise InputError(
@@ -136,7 +91,7 @@ class Supply:
             facts.pop(name)
         for camera in facts["rgbd"]:
             camera.pop("folder")
-        return digest_of((SAMPLES_VERSION, facts, list(self.shares), list(self.names)))
+        return short_digest((SAMPLES_VERSION, facts, list(self.shares), list(self.names)))
 
     def samples(self, folder: Path, progress: Step, warn: Callable[[str], None]) -> SampleFiles:
         """The samples in a folder, which many recipes may share; what is missing is made.
@@ -144,35 +99,59 @@ class Supply:
         Args:
             folder: for a folder of the digest's name, with train/ and validation/ in it.
             progress: called with the views that are there, of how many.
-            warn: called with each view that was passed over, and why.
+            warn: called with the reason for each view that gives no sample.
 
         Raises:
             InputError: where nothing can be written, or no view has a hole to learn from.
         """
-        data, digest = self.data, self.digest
+        data, place = self.data, folder / self.digest
+        # Other seeds, other views: no view is in both.
+        validated = self.fill(place / VALIDATION, 2 * data.seed + 1, data.validation_views, progress, warn)
+        learned = self.fill(place / TRAIN, 2 * data.seed, data.views, progress, warn)
+        return SampleFiles(learned, validated, self.digest)
 
-        def fill(name: str, seed: int, views: int) -> list[Path]:
-            place = folder / digest / name
-            # Other seeds, other views: no view is in both.
-            files = Cache(place, self.sources, self.shares, seed, data.crops, data.cells).fill(views, progress, warn)
-            if not files:
-                raise InputError(
-                    f"{place}: none of {views} views gave a sample: photos must be readable, larger than "
-                    f"{2 * data.cells} pixels each way, and seen from aside (data.disparity)"
-                )
-            return files
+    def fill(self, folder: Path, seed: int, views: int, progress: Step, warn: Callable[[str], None]) -> list[Path]:
+        """Make what is missing of a folder's first views; returns the samples' files in order; as `samples`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        files: list[Path] = []
+        for index in range(views):
+            files += self._view(folder, seed, index, warn)
+            progress(index + 1, views)
+        if not files:
+            raise InputError(
+                f"{folder}: none of {views} views gave a sample: photos must be readable, larger than "
+                f"{2 * self.data.cells} pixels each way, and seen from aside (data.disparity)"
+            )
+        return files
 
-        validated = fill(VALIDATION, 2 * data.seed + 1, data.validation_views)
-        learned = fill(TRAIN, 2 * data.seed, data.views)
-        return SampleFiles(learned, validated, digest)
+    def _view(self, folder: Path, seed: int, index: int, warn: Callable[[str], None]) -> list[Path]:
+        """The files of a view's crops; a marker, written last, holds their number."""
+        marker = folder / f"{index:06d}.done"
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            files = _crop_files(folder, index, int(marker.read_text()))
+            if all(file.is_file() for file in files):
+                return files
+        rng = np.random.default_rng([seed, index])
+        source = self.sources[rng.choice(len(self.sources), p=np.array(self.shares) / sum(self.shares))]
+        crops: list[Sample] = []
+        try:
+            crops = random_crops(source(rng), rng, self.data.crops, self.data.cells)
+        except (InputError, ValueError) as error:
+            warn(str(error))
+        files = _crop_files(folder, index, len(crops))
+        for crop, file in zip(crops, files, strict=True):
+            save_sample(crop, file)
+        with atomic_path(marker) as temporary:
+            temporary.write_text(f"{len(crops)}\n")
+        return files
+
+
+def _crop_files(folder: Path, index: int, count: int) -> list[Path]:
+    return [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]
 
 
 def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
-    """All files below a folder whose names end so, in order.
-
-    Raises:
-        InputError: no folder, or no such file in it.
-    """
+    """All files below a folder whose names end so, in order; InputError for no folder, or no such file in it."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
     found = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(endings) and file.is_file())
@@ -182,6 +161,6 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
     return found
 
 
-def digest_of(value: object) -> str:
+def short_digest(value: object) -> str:
     """Twelve hexadecimal digits that tell one recipe's data from another's."""
     return hashlib.sha256(repr(value).encode()).hexdigest()[:12]

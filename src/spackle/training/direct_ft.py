@@ -28,7 +28,7 @@ from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.render import Renderer
-from spackle.training.data import digest_of
+from spackle.training.data import short_digest
 from spackle.training.method import (
     PICTURED,
     Objective,
@@ -37,8 +37,8 @@ from spackle.training.method import (
     Start,
     ViewBatch,
     ViewMethod,
+    facts_of,
     load_objective,
-    parameters,
 )
 from spackle.training.recipe import DataRecipe, Recipe
 from spackle.training.sources import PseudoViews
@@ -61,9 +61,8 @@ class PseudoPhotos:
     def of(data: DataRecipe, location: Path, weights_sha256: str) -> PseudoPhotos:
         """Divide a dataset at a place by whole photos, in a random order of `data.seed`.
 
-        Raises:
-            InputError: no finished dataset, one that teaches nothing, one of another base or of other weights than
-                those that learn, or one with a single photo.
+        InputError for no finished dataset, or one that teaches nothing, is of another base or of other weights than
+        those that learn, or has a single photo.
         """
         files = PseudoViews(location).files
         base = files.manifest.config.get("base", {})
@@ -83,7 +82,7 @@ class PseudoPhotos:
         order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
         held = min(max(1, data.validation_views // per_photo), photos // 2)
         learned = order[held:][: max(1, data.views // per_photo)]
-        digest = digest_of((files.manifest.digest, learned, order[:held]))
+        digest = short_digest((files.manifest.digest, learned, order[:held]))
         return PseudoPhotos(files, tuple(learned), tuple(order[:held]), digest)
 
     def views(self, place: int, indices: Sequence[int] | None = None) -> list[DatasetView]:
@@ -107,14 +106,12 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     with enough_memory(*advice):
         gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
-    hole = torch.stack([view.mask for view in views])
     return ViewBatch(
         rgb=torch.stack([rendering.rgb for rendering in drawn]),
         alpha=torch.stack([rendering.alpha for rendering in drawn]),
         base_rgb=torch.stack([view.rendering.rgb for view in views]),
         target=torch.stack([view.target for view in views]),
-        hole=hole,
-        valid=torch.ones_like(hole),
+        hole=torch.stack([view.mask for view in views]),
     )
 
 
@@ -135,20 +132,13 @@ class DirectFt(ViewMethod):
         self.items, self.validation_items = len(photos.learned), len(photos.validation)
         self.items_a_step = views // VIEWS_AT_ONCE
 
-    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
-        """Views of one photo, drawn with what the decoder says; InputError where they cannot be read."""
-        return self._render(network, self._drawn(step, *items))
-
-    def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
-        """All views of one photo, likewise."""
+    def complete(self, network: nn.Module, items: Sequence[int], step: int | None = None) -> ViewBatch:
+        """Drawn views of one photo, for validation all of them; InputError where they cannot be read."""
         (item,) = items
-        return self._render(network, self.photos.views(self.photos.validation[item]))
-
-    def _render(self, decoder: nn.Module, views: Sequence[DatasetView]) -> ViewBatch:
-        return render_photo(decoder, self.base, views, self.objective.renderer)
+        views = self.photos.views(self.photos.validation[item]) if step is None else self._drawn(step, item)
+        return render_photo(network, self.base, views, self.objective.renderer)
 
     def _drawn(self, step: int, item: int) -> list[DatasetView]:
-        """The views that a step takes of a photo: nothing but the arguments decides."""
         return self.photos.drawn(self.photos.learned[item], np.random.default_rng([self.seed, step, item]))
 
     @torch.no_grad()
@@ -157,11 +147,12 @@ class DirectFt(ViewMethod):
         places, rows = self.photos.validation, []
         for place in places[:: max(1, 2 * len(places) // PICTURED)][: PICTURED // 2]:
             widest = int(np.argmax(self.photos.files.samples[place][1].holes))
-            done = self._render(network, self.photos.views(place, (0, widest)))
+            views = self.photos.views(place, (0, widest))
+            done = render_photo(network, self.base, views, self.objective.renderer)
             rows += [torch.cat(row, dim=1) for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
         shown = [_reduced(row, len(self.columns.split(","))) for row in rows]
-        widest = max(row.shape[1] for row in shown)
-        return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1])) for row in shown])
+        across = max(row.shape[1] for row in shown)
+        return torch.cat([pad(row, (0, 0, 0, across - row.shape[1])) for row in shown])
 
     def keep(self, step: int, items: Sequence[int], folder: Path) -> None:
         """Write which photos and views a step had, a file each."""
@@ -188,14 +179,9 @@ def _reduced(row: Tensor, pictures: int) -> Tensor:
 
 
 def plan_direct_ft(context: RunContext[Recipe], checkpoint: Path | None) -> Plan:
-    """Find a checkpoint and a dataset that belong together; the network is not loaded yet.
+    """Find a checkpoint (None: the downloaded one) and a dataset that belong together; load no network yet.
 
-    Args:
-        context: whose recipe has no data but data.pseudo.
-        checkpoint: SHARP's; the downloaded one where None.
-
-    Raises:
-        InputError: a recipe, checkpoint or dataset that cannot be used.
+    InputError for a recipe, checkpoint or dataset that cannot be used.
     """
     objective, recipe, least = load_objective(context), context.recipe, VIEWS_AT_ONCE * context.ranks.count
     if recipe.optim.batch % least:
@@ -205,30 +191,7 @@ def plan_direct_ft(context: RunContext[Recipe], checkpoint: Path | None) -> Plan
         )
     if recipe.init is not None:
         raise InputError(f"init={recipe.init}: --method direct-ft starts from SHARP's checkpoint: leave it out")
-    data = _only_dataset(recipe.data)
-    owner = _find_owner(checkpoint)
-    photos = PseudoPhotos.of(recipe.data, data, owner.sha256)
-
-    def start() -> Start:
-        base = TunableSharp.load(owner.path, objective.precision, objective.device)
-        decoder = base.network.gaussian_decoder().let_learn()
-        counts = parameters(base.network)
-        method = DirectFt(base, owner, photos, objective, recipe.optim.batch, recipe.run.seed)
-        context.reporter.say(
-            f"{method.items} photos to learn from, {method.validation_items} to be judged by; "
-            f"{counts['learn']:,} weights of SHARP learn, {counts['stay']:,} stay"
-        )
-        samples = {"train": method.items, "validation": method.validation_items, "digest": photos.digest}
-        weights = {"file": owner.path.name, "sha256": owner.sha256}
-        features = objective.features.name if objective.features else "none"
-        facts = {"features": features, "samples": samples, "parameters": counts, "checkpoint": weights}
-        return Start(method, decoder, facts)
-
-    return Plan(DirectFt.name, photos.digest, start)
-
-
-def _only_dataset(data: DataRecipe) -> Path:
-    """The dataset that a recipe names; InputError where it names none, or other sources."""
+    data = recipe.data
     for key, value in (("photos", data.photos), ("rgbd", data.rgbd), ("stereo", data.stereo)):
         if value:
             raise InputError(
@@ -240,7 +203,21 @@ def _only_dataset(data: DataRecipe) -> Path:
             "data.pseudo: missing, and --method direct-ft learns from nothing else: "
             "give a dataset of `spackle dataset build --base sharp`"
         )
-    return data.pseudo
+    owner = _find_owner(checkpoint)
+    photos = PseudoPhotos.of(data, data.pseudo, owner.sha256)
+
+    def start() -> Start:
+        base = TunableSharp.load(owner.path, objective.precision, objective.device)
+        decoder = base.network.gaussian_decoder().let_learn()
+        method = DirectFt(base, owner, photos, objective, recipe.optim.batch, recipe.run.seed)
+        facts = facts_of(method, base.network)
+        context.reporter.say(
+            f"{method.items} photos to learn from, {method.validation_items} to be judged by; "
+            f"{facts['parameters']['learn']:,} weights of SHARP learn, {facts['parameters']['stay']:,} stay"
+        )
+        return Start(method, decoder, {**facts, "checkpoint": {"file": owner.path.name, "sha256": owner.sha256}})
+
+    return Plan(DirectFt.name, photos.digest, start)
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -31,21 +31,13 @@ COUNTER = "num_batches_tracked"
 SQUEEZENET_HEAD: Shapes = {"conv10.w": (1000, 512, 1, 1), "conv10.b": (1000,)}
 
 
-class FeatureNet(Protocol):
-    """A frozen network as the losses see it."""
+class FeatureNet(nn.Module):
+    """[B, 3, H, W] sRGB 0..1 to feature maps [B, C, h, w], fine to coarse; gradients go to the images alone."""
 
-    @property
-    def name(self) -> str:
-        """What it is called in a report."""
+    name: str  # as reports have it
 
-    def __call__(self, images: Tensor) -> list[Tensor]:
-        """[B, 3, H, W] sRGB 0..1 to feature maps [B, C, h, w], fine to coarse; gradients go to the images alone."""
-
-
-class _Frozen(nn.Module):
-    """Never trained: normalisation by stored statistics whatever is asked."""
-
-    def train(self, mode: bool = True) -> _Frozen:
+    def train(self, mode: bool = True) -> FeatureNet:
+        """Stay as it is: a frozen network normalises by its stored statistics."""
         return super().train(False)
 
 
@@ -66,7 +58,7 @@ class Bottleneck(nn.Module):
         return torch.relu(self.bn3(self.conv3(y)) + self.downsample(x))
 
 
-class ResNet50(_Frozen):
+class ResNet50(FeatureNet):
     """The paper's feature extractor, without its classifier; tensors are named as torchvision names them.
 
     Called with [B, 3, H, W] sRGB 0..1, sides of 32 pixels or more; gives the ends of layer1 to layer4: 256, 512, 1024,
@@ -105,7 +97,7 @@ class Fire(nn.Module):
         return torch.cat([self.conv1x1_2(x), self.conv3x3_2(x)], dim=1).relu()
 
 
-class SqueezeNet(_Frozen):
+class SqueezeNet(FeatureNet):
     """SqueezeNet 1.0 as Caffe computes it, without its classifier.
 
     Called with [B, 3, H, W] sRGB 0..1, sides of 35 pixels or more; gives conv1, fire4, fire8, fire9: 96, 256, 512, 512
@@ -146,8 +138,6 @@ def load_features(
     """
     if name == "none":
         return None
-    if name not in ("resnet50", "squeezenet"):
-        raise InputError(f"{name}: no such feature network: give resnet50, squeezenet or none")
     if path is None:
         raise InputError(f"{name}: its weights are not given: name their file, or choose none")
     check_file(path, "weight file")

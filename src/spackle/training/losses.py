@@ -5,14 +5,13 @@ They compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H
 the `hole` [B, H, W] bool, and with `base_rgb` [B, H, W, 3], the same view of the base alone, outside of it. Each is a
 mean over the pixels of an image that it speaks about, then over the images of the batch: a small hole counts as much as
 a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean of the
-losses of its images, however processes divide them. Where `valid` says that the target is unknown it may be anything,
-NaN too: it has no part in a loss, nor in a gradient.
+losses of its images, however processes divide them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
@@ -25,22 +24,11 @@ NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhe
 TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
 
 
-@dataclass(frozen=True)
-class LossWeights:
-    """How much each term counts; the defaults are the paper's."""
-
-    color: float = 10.0
-    alpha: float = 0.5
-    perceptual: float = 1.0
-    preserve: float = 5.0
-
-
-PAPER_WEIGHTS = LossWeights()
+PAPER_WEIGHTS = {"color": 10.0, "alpha": 0.5, "perceptual": 1.0, "preserve": 5.0}  # how much each term counts
 
 
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels."""
-    # Cleared before abs: the gradient of an unknown (NaN) difference would be NaN times zero.
     apart = torch.where(hole[..., None], rgb - target, 0).abs()
     return _mean_of_images(apart.mean(-1), hole)
 
@@ -68,7 +56,6 @@ def perceptual_loss(
     *,
     dilation: int = 21,
     size: int | None = 512,
-    valid: Tensor | None = None,
 ) -> Tensor:
     """[] feature reconstruction and Gram statistics near the hole.
 
@@ -87,14 +74,11 @@ def perceptual_loss(
         rgb, target, hole: as above.
         dilation: side of the max-pool in pixels of `hole`, odd; 1 grows nothing.
         size: the longer side of the images that the network sees; None leaves them as they are.
-        valid: [B, H, W] bool, where the target is known; elsewhere both images show the prediction, and nothing counts.
 
     Raises:
         ValueError: an even dilation.
     """
-    if valid is not None:
-        hole, target = hole & valid, torch.where(valid[..., None], target, rgb.detach())
-    near = dilate(hole, dilation) if valid is None else dilate(hole, dilation) & valid
+    near = dilate(hole, dilation)
     if not near.any():
         return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
     ours = features(_resized(torch.where(near[..., None], rgb, target), size))
@@ -112,8 +96,7 @@ def total_loss(
     hole: Tensor,
     *,
     features: FeatureNet | None = None,
-    weights: LossWeights = PAPER_WEIGHTS,
-    valid: Tensor | None = None,
+    weights: Mapping[str, float] = PAPER_WEIGHTS,
     dilation: int = 21,
     size: int | None = 512,
 ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -122,23 +105,20 @@ def total_loss(
     Args:
         rgb, alpha, target, base_rgb, hole: as above.
         features: None leaves the perceptual term out.
-        weights: one number for each term.
-        valid: [B, H, W] bool, where the target is known; colour and perceptual terms look at hole & valid. Opacity
-            needs no target: it is asked for in the whole hole.
+        weights: one number for each term, by its name.
         dilation, size: as in `perceptual_loss`.
 
     Returns:
-        [] the loss, and its terms by the names of `LossWeights`, each [], unweighted and detached.
+        [] the loss, and its terms by name, each [], unweighted and detached.
     """
-    known = hole if valid is None else hole & valid
     terms = {
-        "color": color_loss(rgb, target, known),
+        "color": color_loss(rgb, target, hole),
         "alpha": alpha_loss(alpha, hole),
         "preserve": preserve_loss(rgb, base_rgb, hole),
     }
     if features is not None:
-        terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size, valid=valid)
-    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+        terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size)
+    total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
     return total, {name: term.detach() for name, term in terms.items()}
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -25,11 +25,9 @@ from spackle.training.losses import hole_psnr, total_loss
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import AnyRecipe, LossRecipe, Recipe
 
-T = TypeVar("T")
 PICTURED = 6  # views in the picture
-DECIBELS = ("hole_psnr", "seen_psnr")
+DECIBELS = {"hole_psnr": "in the hole", "seen_psnr": "to the base outside of it"}
 MEASURES = ("loss", "color", "alpha", "preserve", "perceptual", *DECIBELS, "har_before", "har_after")
-PLACES = {"hole_psnr": "in the hole", "seen_psnr": "to the base outside of it"}
 
 
 class Method(abc.ABC):
@@ -48,10 +46,9 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def loss(self, network: nn.Module, step: int, items: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss [] of items to learn from, with gradients, and its terms []; the same for the same step.
+        """The loss [] of items to learn from, with gradients, and its terms []; InputError for one that is broken.
 
-        Raises:
-            InputError: an item that cannot be read.
+        The same for the same step.
         """
 
     @abc.abstractmethod
@@ -75,29 +72,6 @@ class Method(abc.ABC):
         """Write weights as the rest of the package reads them; InputError where that cannot be."""
 
 
-@torch.no_grad()
-def validate(network: nn.Module, method: Method, device: torch.device, ranks: Ranks) -> dict[str, float]:
-    """Means of the method's measures over its validation items, the same in all processes; none of what no item has.
-
-    The processes share the items and add up their sums on `device`. InputError for an item that cannot be read.
-    """
-    totals, counts = dict.fromkeys(method.measures, 0.0), dict.fromkeys(method.measures, 0)
-    mine = range(ranks.rank, method.validation_items, ranks.count)
-    for part in chunks(mine, method.at_once):
-        for name, values in method.measure(network, part).items():
-            totals[name] += sum(values)
-            counts[name] += len(values)
-    sums = ranks.sum([*totals.values(), *counts.values()], device)
-    pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
-    return {name: total / count for name, total, count in pairs if count}
-
-
-def chunks(values: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    """`size` of them at a time, the last ones perhaps fewer."""
-    for start in range(0, len(values), size):
-        yield values[start : start + size]
-
-
 @dataclasses.dataclass(frozen=True)
 class ViewBatch:
     """Completed views and their truth, stacked."""
@@ -107,7 +81,6 @@ class ViewBatch:
     base_rgb: Tensor  # [B, H, W, 3] of the base alone
     target: Tensor  # [B, H, W, 3]
     hole: Tensor  # [B, H, W] bool
-    valid: Tensor  # [B, H, W] bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,14 +95,9 @@ class Objective:
 
     def total(self, batch: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [], and its terms [] unweighted; where the feature network is."""
-        rgb, alpha, base_rgb, target, hole, valid = (
-            getattr(batch, field.name).to(self.device) for field in dataclasses.fields(batch)
-        )
-        recipe = self.loss
-        return total_loss(
-            rgb, alpha, target, base_rgb, hole, valid=valid,
-            features=self.features, weights=recipe.weights, dilation=recipe.dilation, size=recipe.feature_size,
-        )  # fmt: skip
+        views = {name: tensor.to(self.device) for name, tensor in vars(batch).items()}
+        weights, dilation, size = vars(self.loss), self.loss.dilation, self.loss.feature_size
+        return total_loss(**views, features=self.features, weights=weights, dilation=dilation, size=size)
 
 
 class ViewMethod(Method):
@@ -141,25 +109,21 @@ class ViewMethod(Method):
         self.objective = objective
 
     @abc.abstractmethod
-    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
-        """Views of items to learn from, with gradients; the same for the same step. InputError as for `loss`."""
-
-    @abc.abstractmethod
-    def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
-        """Views of validation items; InputError likewise."""
+    def complete(self, network: nn.Module, items: Sequence[int], step: int | None = None) -> ViewBatch:
+        """Views of the items that a step learns from, or of validation items (no step); InputError as for `loss`."""
 
     def loss(self, network: nn.Module, step: int, items: Sequence[int]) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [] and its terms []; InputError where an item cannot be read."""
-        return self.objective.total(self.complete(network, step, items))
+        return self.objective.total(self.complete(network, items, step))
 
     def measure(self, network: nn.Module, items: Sequence[int]) -> dict[str, list[float]]:
         """Of each view: loss and its terms; hole_psnr and seen_psnr in dB, inside of the hole against the target and
         outside of it against the base, where they are not infinite; har_before and har_after, the share of hole pixels.
         """
-        done = self.complete_validation(network, items)
+        done = self.complete(network, items)
         loss, terms = self.objective.total(done)
         decibels = {
-            "hole_psnr": map(hole_psnr, done.rgb, done.target, done.hole & done.valid),
+            "hole_psnr": map(hole_psnr, done.rgb, done.target, done.hole),
             "seen_psnr": map(hole_psnr, done.rgb, done.base_rgb, ~done.hole),
         }
         return {
@@ -171,7 +135,7 @@ class ViewMethod(Method):
 
     def describe(self, found: Mapping[str, float]) -> str:
         """Decibels, where there are any, and holes."""
-        psnr = "".join(f", {found[name]:.2f} dB {place}" for name, place in PLACES.items() if name in found)
+        psnr = "".join(f", {found[name]:.2f} dB {place}" for name, place in DECIBELS.items() if name in found)
         return f"{psnr}, holes {found['har_before']:.1%} -> {found['har_after']:.2%}"
 
 
@@ -219,6 +183,13 @@ def load_objective(context: RunContext[Recipe]) -> Objective:
     loss = context.recipe.loss
     features = load_features(loss.features if loss.perceptual else "none", loss.features_path, context.device)
     return Objective(loss, features, get_renderer(), context.precision, context.device)
+
+
+def facts_of(method: ViewMethod, network: nn.Module) -> dict[str, Any]:
+    """What it learns from and how much of `network`, the whole, learns, for run.json."""
+    features = method.objective.features
+    samples = {"train": method.items, "validation": method.validation_items, "digest": method.digest}
+    return {"features": features.name if features else "none", "samples": samples, "parameters": parameters(network)}
 
 
 def parameters(network: nn.Module) -> dict[str, int]:

@@ -34,10 +34,6 @@ class Ranks:
         if self.count > 1:
             dist.barrier()
 
-    def mean(self, numbers: Sequence[float], device: torch.device) -> list[float]:
-        """Each number's mean over the processes, the same in all of them."""
-        return [total / self.count for total in self.sum(numbers, device)]
-
     def sum(self, numbers: Sequence[float], device: torch.device) -> list[float]:
         """Each number's sum over the processes, the same in all of them."""
         if self.count == 1:

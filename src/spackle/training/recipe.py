@@ -9,7 +9,7 @@ import dataclasses
 import math
 import os
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Protocol, TypeVar, Union
@@ -19,7 +19,6 @@ from spackle.device import Precision
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 from spackle.residual.hole_features import CELL
-from spackle.training.losses import LossWeights
 
 PACKAGED = Path(__file__).parent / "recipes"
 POSITIVE = 1e-12
@@ -102,11 +101,6 @@ class LossRecipe:
     features_path: Place = None
     feature_size: Annotated[int, Range(64, 4096)] | None = 512  # the longer side of what it sees; None: the crop's own
     dilation: Annotated[int, Range(1, 1001)] = 21  # pixels
-
-    @property
-    def weights(self) -> LossWeights:
-        """The weights alone."""
-        return LossWeights(self.color, self.alpha, self.perceptual, self.preserve)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,34 +197,24 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def differences(stored: Mapping[str, Any], recipe: Any) -> list[str]:
-    """The keys in which a plain recipe and another one are different runs."""
-    one, other = _flat(stored), _flat(plain(recipe))
-    keys = sorted(key for key in {*one, *other} if one.get(key) != other.get(key))
-    free = set(_free_keys(type(recipe)))
-    return [key for key in keys if key not in free]
+def differences(stored: Mapping[str, Any], recipe: Any, where: str = "") -> list[str]:
+    """The keys in which a plain recipe and another one are different runs; `where` goes before each."""
+    kinds = typing.get_type_hints(type(recipe), include_extras=True)
+    found = [where + name for name, value in stored.items() if name not in kinds and value is not None]
+    for name, kind in kinds.items():
+        one, other = stored.get(name), getattr(recipe, name)
+        if dataclasses.is_dataclass(other):
+            found += differences(one or {}, other, f"{where}{name}.")
+        elif FREE not in _bare(kind)[1] and one != plain(other):
+            found.append(where + name)
+    return sorted(found)
 
 
-def _flat(value: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, item in value.items():
-        found |= _flat(item, f"{where}{name}.") if isinstance(item, dict) else {where + name: item}
-    return found
-
-
-def _free_keys(kind: type, where: str = "") -> Iterator[str]:
-    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
-        inner, marks = _bare(hint)
-        if dataclasses.is_dataclass(inner):
-            yield from _free_keys(typing.cast(type, inner), f"{where}{name}.")
-        elif FREE in marks:
-            yield where + name
-
-
-def load_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Recipe:
-    """Read a recipe of the residual or of direct-ft; what the file leaves out is as `Recipe` has it.
+def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
+    """Read a recipe; what the file leaves out is as in `kind`.
 
     Args:
+        kind: `Recipe`, or another dataclass of such values.
         path: a YAML file, or the name of a packaged one such as "cpu". Relative paths in it are relative to the
             working directory.
         overrides: `key=value` each, such as optim.steps=100 or data.rgbd.0.folder=kitchen; values are YAML.
@@ -243,11 +227,6 @@ def load_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
         path = PACKAGED / f"{os.fspath(path)}.yaml"
     elif os.sep not in os.fspath(path) and not os.path.exists(path):
         raise InputError(f"{path}: no such recipe; there are {', '.join(names)}, or give a YAML file")
-    return load_recipe_as(Recipe, path, overrides)
-
-
-def load_recipe_as(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
-    """Read a file as `load_recipe` does into another dataclass of such values."""
     check_file(path, "recipe")
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -295,30 +274,24 @@ def _set(raw: Any, keys: Sequence[str], value: Any, override: str) -> None:
             raise InputError(f"{override}: {'.'.join(keys[: depth + 1])} has no parts")
 
 
-def _bare(kind: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type without its annotations and without null, and the annotations."""
-    marks: tuple[Any, ...] = ()
-    while True:
-        if typing.get_origin(kind) is Annotated:
+def _bare(kind: Any) -> tuple[Any, tuple[Any, ...], bool]:
+    """A type without its annotations and without null, the annotations, and whether null is allowed."""
+    marks, optional = (), False
+    while (origin := typing.get_origin(kind)) in (Annotated, Union, UnionType):
+        if origin is Annotated:
             kind, *more = typing.get_args(kind)
-            marks += tuple(more)
-        elif _optional(kind):
-            (kind,) = (choice for choice in typing.get_args(kind) if choice is not NoneType)
+            marks = (*marks, *more)
         else:
-            return kind, marks
-
-
-def _optional(kind: Any) -> bool:
-    if typing.get_origin(kind) is Annotated:
-        kind = typing.get_args(kind)[0]
-    return typing.get_origin(kind) in (Union, UnionType) and NoneType in typing.get_args(kind)
+            (kind,) = (choice for choice in typing.get_args(kind) if choice is not NoneType)
+            optional = True
+    return kind, marks, optional
 
 
 def _build(kind: Any, value: Any, key: str, file: str) -> Any:
     """A value of a type out of what YAML gave, or InputError with file, key and what is allowed."""
-    if value is None and _optional(kind):
+    inner, marks, optional = _bare(kind)
+    if value is None and optional:
         return None
-    inner, marks = _bare(kind)
     if dataclasses.is_dataclass(inner):
         return _build_fields(inner, value, key, file)
     if typing.get_origin(inner) is tuple and isinstance(value, list):
@@ -369,7 +342,7 @@ def _number(value: Any, kind: type) -> float | int | None:
 
 def _allowed(kind: Any) -> str:
     """What a key takes, in words."""
-    inner, marks = _bare(kind)
+    inner, marks, optional = _bare(kind)
     if typing.get_origin(inner) is tuple:
         first, second = typing.get_args(inner)
         return "a list" if second is ... else f"a list of two numbers, each {_bare(first)[1][0]}"
@@ -379,7 +352,7 @@ def _allowed(kind: Any) -> str:
         words = "a path"
     else:
         words = f"{'a whole number' if inner is int else 'a number'} {marks[0]}"
-    return f"{words}, or null" if _optional(kind) else words
+    return f"{words}, or null" if optional else words
 
 
 def _refused(key: str, value: Any, allowed: str, file: str) -> InputError:

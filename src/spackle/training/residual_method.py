@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
 import torch
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.gaussians import Gaussians
+from spackle.formats import atomic_path
 from spackle.output_folder import make_folder
-from spackle.progress import Reporter
 from spackle.render import Renderer
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import Cues
 from spackle.residual.network import ResidualNet, load_residual, network_input
-from spackle.training.checkpoint import export_weights
 from spackle.training.data import SampleFiles, Supply
 from spackle.training.method import (
     CACHE,
@@ -28,8 +28,8 @@ from spackle.training.method import (
     Start,
     ViewBatch,
     ViewMethod,
+    facts_of,
     load_objective,
-    parameters,
 )
 from spackle.training.recipe import Recipe
 from spackle.training.sample import Sample, load_sample
@@ -42,34 +42,24 @@ def complete_samples(
 ) -> ViewBatch:
     """Run the network on samples of one size, and render them with what it adds.
 
-    Args:
-        network: a `ResidualNet`, by itself or wrapped, on any device; the only thing that gets gradients.
-        samples: of the same height and width.
-        renderer: draws base and aux Gaussians together, in the tiles that aux Gaussians can touch.
-        precision: what the network's convolutions compute in.
+    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
     """
     features = torch.cat([network_input(sample.cues, sample.seeds, sample.rim) for sample in samples])
     place, features = features.device, features.to(next(network.parameters()).device)
     with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
         deltas = network(features.contiguous(memory_format=torch.channels_last))
-    views = [
-        renderer.render([sample.base, aux_of(sample, field)], sample.camera, tiles=sample.tiles, onto=sample.rendering)
-        for sample, field in zip(samples, deltas.float().to(place), strict=True)
-    ]
+    views = []
+    for sample, field in zip(samples, deltas.float().to(place), strict=True):
+        cells = training_cells(sample.cues)
+        aux = compose(sample.seeds.select(cells), field.permute(1, 2, 0)[cells], sample.camera)
+        views.append(renderer.render([sample.base, aux], sample.camera, tiles=sample.tiles, onto=sample.rendering))
     return ViewBatch(
         rgb=torch.stack([view.rgb for view in views]),
         alpha=torch.stack([view.alpha for view in views]),
         base_rgb=torch.stack([sample.rendering.rgb for sample in samples]),
         target=torch.stack([sample.target for sample in samples]),
         hole=torch.stack([sample.hole for sample in samples]),
-        valid=torch.stack([sample.valid for sample in samples]),
     )
-
-
-def aux_of(sample: Sample, deltas: Tensor) -> Gaussians:
-    """The aux Gaussians that deltas [14, h, w] make of a sample's seeds."""
-    cells = training_cells(sample.cues)
-    return compose(sample.seeds.select(cells), deltas.permute(1, 2, 0)[cells], sample.camera)
 
 
 def training_cells(cues: Cues, least: int = MIN_AUX) -> Tensor:
@@ -97,23 +87,18 @@ class ResidualMethod(ViewMethod):
         self.items, self.validation_items = len(samples.train), len(samples.validation)
         self.items_a_step, self.at_once = batch, batch // processes
 
-    def complete(self, network: nn.Module, step: int, items: Sequence[int]) -> ViewBatch:
-        """Samples to learn from, completed; InputError where one cannot be read."""
-        return self._complete(network, [load_sample(self.samples.train[item]) for item in items])
-
-    def complete_validation(self, network: nn.Module, items: Sequence[int]) -> ViewBatch:
-        """Validation samples, likewise."""
-        return self._complete(network, [load_sample(self.samples.validation[item]) for item in items])
-
-    def _complete(self, network: nn.Module, samples: Sequence[Sample]) -> ViewBatch:
+    def complete(self, network: nn.Module, items: Sequence[int], step: int | None = None) -> ViewBatch:
+        """Completed samples; InputError where one cannot be read."""
+        files = self.samples.validation if step is None else self.samples.train
+        samples = [load_sample(files[item]) for item in items]
         return complete_samples(network, samples, self.objective.renderer, self.objective.precision)
 
     @torch.no_grad()
     def picture(self, network: nn.Module) -> Tensor:
         """[n·H, 4·W, 3] sRGB: for each sample the base, the seeds alone, the completed view and the truth."""
-        files, rows = self.samples.validation, []
-        samples = [load_sample(file) for file in files[:: max(1, len(files) // PICTURED)][:PICTURED]]
-        for sample, rgb in zip(samples, self._complete(network, samples).rgb, strict=True):
+        items, rows = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED], []
+        for item, rgb in zip(items, self.complete(network, items).rgb, strict=True):
+            sample = load_sample(self.samples.validation[item])
             seeds = compose(sample.seeds.select(sample.cues.mask), None, sample.camera)
             sets = [sample.base, seeds]
             alone = self.objective.renderer.render(sets, sample.camera, tiles=sample.tiles, onto=sample.rendering)
@@ -127,61 +112,43 @@ class ResidualMethod(ViewMethod):
 
     def export(self, network: nn.Module, path: Path) -> None:
         """Weights in half precision, for `spackle predict --residual`."""
-        export_weights(network, path)
+        tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(save(tensors))
 
 
 def plan_residual(context: RunContext[Recipe]) -> Plan:
     """Find a recipe's files, make no sample yet; InputError where they cannot be used."""
-    objective = load_objective(context)
-    network = _first_network(context.recipe).requires_grad_()
-    supply = Supply.of(context.recipe.data, objective.renderer)
+    objective, recipe, ranks, say = load_objective(context), context.recipe, context.ranks, context.reporter.say
+    if recipe.init is not None:
+        network = load_residual(recipe.init)
+    else:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(recipe.run.seed)
+            network = ResidualNet()
+    network.requires_grad_()
+    supply = Supply.of(recipe.data, objective.renderer)
 
     def start() -> Start:
-        samples = _make_samples(context, supply)
-        method = ResidualMethod(samples, objective, context.recipe.optim.batch, context.ranks.count)
-        counts = {"train": method.items, "validation": method.validation_items, "digest": samples.digest}
-        features = objective.features.name if objective.features else "none"
-        return Start(method, network, {"features": features, "samples": counts, "parameters": parameters(network)})
+        if not ranks.first:  # the first process makes the samples, the others find them
+            ranks.wait()
+        folder, skipped = recipe.data.cache or context.output / CACHE, Counter[str]()
+
+        def skip(reason: str) -> None:
+            if not skipped[reason]:
+                say(f"passed over: {reason}")
+            skipped[reason] += 1
+
+        make_folder(folder)
+        say(f"samples of {recipe.data.views + recipe.data.validation_views} views in {folder}")
+        with context.reporter.stage("samples", {}) as step:
+            samples = supply.samples(folder, step, skip)
+        if skipped:
+            say(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
+        say(f"{len(samples.train)} samples to learn from, {len(samples.validation)} to be judged by")
+        if ranks.first:
+            ranks.wait()
+        method = ResidualMethod(samples, objective, recipe.optim.batch, ranks.count)
+        return Start(method, network, facts_of(method, network))
 
     return Plan(ResidualMethod.name, supply.digest, start)
-
-
-def _first_network(recipe: Recipe) -> ResidualNet:
-    """The weights that a run starts from, by its seed or from a file."""
-    if recipe.init is not None:
-        return load_residual(recipe.init)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(recipe.run.seed)
-        return ResidualNet()
-
-
-def _make_samples(context: RunContext[Recipe], supply: Supply) -> SampleFiles:
-    """The first process makes the samples, the others find them."""
-    reporter, folder = context.reporter, context.recipe.data.cache or context.output / CACHE
-    skipped = _Skipped(reporter)
-    if not context.ranks.first:
-        context.ranks.wait()
-        return supply.samples(folder, lambda done, total: None, skipped.add)
-    make_folder(folder)
-    reporter.say(f"samples of {supply.data.views + supply.data.validation_views} views in {folder}")
-    with reporter.stage("samples", {}) as step:
-        samples = supply.samples(folder, step, skipped.add)
-    if skipped.views:
-        reporter.say(f"{skipped.views} views were passed over, for {len(skipped.reasons)} reasons (above)")
-    reporter.say(f"{len(samples.train)} samples to learn from, {len(samples.validation)} to be judged by")
-    context.ranks.wait()
-    return samples
-
-
-class _Skipped:
-    """Views that could not be made; each reason is reported once."""
-
-    def __init__(self, reporter: Reporter) -> None:
-        self.reporter, self.views, self.reasons = reporter, 0, set[str]()
-
-    def add(self, line: str) -> None:
-        reason = line.partition("passed over: ")[2]
-        self.views += 1
-        if reason not in self.reasons:
-            self.reasons.add(reason)
-            self.reporter.say(f"passed over: {reason}")

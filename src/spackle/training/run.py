@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import torch
 from rich.console import Console
+from torch import Tensor
 
-from spackle.errors import InputError
+from spackle.device import pick_device
+from spackle.errors import InputError, reason_in_a_line
 from spackle.machine import hardware, versions, without_nan
 from spackle.output_folder import alone_in, results_folder, write_report
 from spackle.progress import Reporter
@@ -32,9 +35,9 @@ from spackle.training.checkpoint import (
 from spackle.training.direct_ft import plan_direct_ft
 from spackle.training.method import Plan, RunContext, Start
 from spackle.training.ranks import joined_ranks
-from spackle.training.recipe import AnyRecipe, load_recipe, plain
+from spackle.training.recipe import AnyRecipe, Recipe, load_recipe, plain
 from spackle.training.residual_method import plan_residual
-from spackle.training.trainer import Callbacks, Logs, Trainer, open_logs
+from spackle.training.trainer import Callbacks, Trainer
 
 R = TypeVar("R", bound=AnyRecipe)
 MethodName = Literal["residual", "direct-ft"]
@@ -64,12 +67,11 @@ def train_recipe(
         method: what learns.
         checkpoint: weights of SHARP, where it is SHARP that learns.
 
-    Raises:
-        InputError: a recipe, file or folder that cannot be used, a loss that is no number.
+    InputError for a recipe, file or folder that cannot be used, and for a loss that is not finite.
     """
     if method != "direct-ft" and checkpoint is not None:
         raise InputError(f"-c {checkpoint}: --method {method} learns without a base: leave the option out")
-    recipe = load_recipe(path, overrides)
+    recipe = load_recipe(Recipe, path, overrides)
     if method == "direct-ft":
         return train(recipe, lambda context: plan_direct_ft(context, checkpoint), output, reporter, overwrite)
     return train(recipe, plan_residual, output, reporter, overwrite)
@@ -93,11 +95,7 @@ def train(
     Raises:
         InputError: a file or folder that cannot be used, a loss that is no number.
     """
-    kind, gpu = recipe.run.device, torch.cuda.is_available()
-    if kind == "cuda" and not gpu:
-        raise InputError("run.device=cuda: torch finds no GPU here; use run.device=cpu")
-    if kind == "auto":
-        kind = "cuda" if gpu else "cpu"
+    kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
     with joined_ranks(kind) as ranks, contextlib.ExitStack() as stack:
         if recipe.optim.batch % ranks.count:
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {ranks.count} processes")
@@ -109,7 +107,12 @@ def train(
             reporter = Reporter(console=Console(quiet=True))
         context = RunContext(recipe, output, reporter, ranks, device)
         plan = make_plan(context)
-        found = None if overwrite else _find_checkpoint(context, plan)
+        found, problem = (None, None) if overwrite else load_checkpoint(output)
+        if found:
+            check_same_run(found, plan.method, recipe, plan.digest, output)
+            if problem:
+                reporter.say(f"{problem}: going on from the one before it")
+            reporter.say(f"{output}: going on from step {found.progress.step}")
         start = plan.start()
         ranks.wait()  # nobody looks for checkpoints any more
         if overwrite and ranks.first:
@@ -117,24 +120,48 @@ def train(
         return _run(context, start, found)
 
 
-def _find_checkpoint(context: RunContext[Any], plan: Plan) -> Checkpoint | None:
-    """The one to go on from; InputError where the folder holds another run."""
-    output, say = context.output, context.reporter.say
-    checkpoint, problem = load_checkpoint(output)
-    if checkpoint is None:
-        return None
-    check_same_run(checkpoint, plan.method, context.recipe, plan.digest, output)
-    if problem:
-        say(f"{problem}: going on from the one before it")
-    say(f"{output}: going on from step {checkpoint.progress.step}")
-    return checkpoint
+class Logs:
+    """TensorBoard's event files in a folder; without a folder, nothing."""
+
+    def __init__(self, folder: Path | None = None, purge_step: int = 0) -> None:
+        """ImportError where tensorboard is not installed; what an earlier start logged after a step is hidden."""
+        self.folder, self.writer = folder, None
+        if folder is not None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of protobuf's, about itself
+                import tensorboard  # noqa: F401  # torch's own import of it fails with other words
+                from torch.utils.tensorboard import SummaryWriter
+            self.writer = SummaryWriter(str(folder), purge_step=purge_step)
+
+    def numbers(self, group: str, values: Mapping[str, float], step: int) -> None:
+        """Points of the curves GROUP/NAME."""
+        for name, value in values.items():
+            self.write("add_scalar", f"{group}/{name}", value, step)
+
+    def write(self, method: str, *arguments: object, **options: object) -> None:
+        """Call a method of torch's writer, if there is one; InputError for a disk that is full."""
+        if self.writer is None:
+            return
+        try:
+            getattr(self.writer, method)(*arguments, **options)
+        except OSError as error:  # raised where the next number comes, for its thread cannot
+            raise InputError(f"{self.folder}: cannot write the logs: {reason_in_a_line(error)}") from error
+
+    def close(self) -> None:
+        """Write what is still in memory."""
+        self.write("close")
 
 
 def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) -> str:
     """The training loop with everything that it talks to: bars, logs, signals and run.json."""
     recipe, ranks, say, output = context.recipe, context.ranks, context.reporter.say, context.output
     method, first = start.method, checkpoint.progress.step if checkpoint else 0
-    logs = open_logs(output / LOGS, first, say) if ranks.first else Logs()
+    logs = Logs()
+    if ranks.first:
+        try:
+            logs = Logs(output / LOGS, first)
+        except ImportError:
+            say("no TensorBoard logs: pip install 'spackle-nvs[train]'")
     facts = {
         "method": method.name,
         "aim": method.aim,
@@ -149,8 +176,14 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
     def write(progress: Progress, ended: str | None = None) -> None:
         write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), output / RUN)
 
-    def validated(progress: Progress) -> None:
+    def stepped(step: int, numbers: Mapping[str, float]) -> None:
+        logs.numbers("train", numbers, step)
+        tell(step, f"loss {numbers['loss']:.4f}")
+
+    def validated(progress: Progress, sheet: Tensor) -> None:
         found, aim = progress.history[-1], method.aim
+        logs.numbers("validation", {name: value for name, value in found.items() if name != "step"}, progress.step)
+        logs.write("add_image", method.columns, sheet.clamp(0, 1), progress.step, dataformats="HWC")
         best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
         say(f"step {progress.step}: validation {aim} {found[aim]:.4f} ({best}){method.describe(found)}")
         write(progress)
@@ -160,10 +193,8 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         context.reporter.steps("train", first, recipe.optim.steps) as tell,
         asked_to_stop(alone=ranks.count == 1) as stop,
     ):
-        callbacks = Callbacks(lambda step, numbers: tell(step, f"loss {numbers['loss']:.4f}"), validated, write, stop)
-        trainer = Trainer(
-            recipe, method, start.network, context.device, output, callbacks, logs, ranks, start.optimizer
-        )
+        callbacks = Callbacks(stepped, validated, write, stop)
+        trainer = Trainer(recipe, method, start.network, context.device, output, callbacks, ranks, start.optimizer)
         if checkpoint:
             trainer.resume(checkpoint)
         why = trainer.run()

@@ -42,20 +42,17 @@ class Sample:
     cues: Cues  # likewise
     rim: Rim  # likewise
     target: Tensor  # [H, W, 3] sRGB
-    valid: Tensor  # [H, W] bool: where the target is known
 
     @staticmethod
-    def of(
-        base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, target: Tensor, valid: Tensor
-    ) -> Sample:
-        """A whole view: frozen Gaussians and their rendering from `camera`; `photo_camera` is that of the base's photo.
+    def of(base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, target: Tensor) -> Sample:
+        """A whole view: frozen Gaussians, their rendering from `camera`, and the truth `target` [H, W, 3] sRGB.
 
-        The truth is `target` [H, W, 3] sRGB where `valid` [H, W] says so.
+        `photo_camera` is that of the base's photo.
         """
         rendering, cues = rendering.detach(), Cues.of(rendering)
         seeds = make_seeds(cues, camera, photo_camera)
         rim = Rim.of(cues, seeds, camera, photo_camera)
-        return Sample(camera, base.detach(), rendering, seeds, cues, rim, target, valid)
+        return Sample(camera, base.detach(), rendering, seeds, cues, rim, target)
 
     @property
     def hole(self) -> Tensor:
@@ -77,21 +74,19 @@ class Sample:
         K[0, 2] -= left
         K[1, 2] -= top
         view = self.rendering
+
+        def part(grid: Seeds | Cues | Rim) -> dict[str, Tensor]:
+            return {name: value[cells].clone() for name, value in vars(grid).items() if name != "unit"}
+
+        seeds = part(self.seeds)
         return Sample(
             camera=dataclasses.replace(self.camera, K=K, width=CELL * width, height=CELL * height),
             base=self.base,
             rendering=Rendering(view.rgb[pixels].clone(), view.depth[pixels].clone(), view.alpha[pixels].clone()),
-            seeds=dataclasses.replace(
-                self.seeds,
-                uv=self.seeds.uv[cells] - torch.tensor([left, top]).to(self.seeds.uv),
-                inverse_depth=self.seeds.inverse_depth[cells].clone(),
-                slope=self.seeds.slope[cells].clone(),
-                rgb=self.seeds.rgb[cells].clone(),
-            ),
-            cues=Cues(*(getattr(self.cues, f.name)[cells].clone() for f in dataclasses.fields(Cues))),
-            rim=Rim(*(getattr(self.rim, f.name)[cells].clone() for f in dataclasses.fields(Rim))),
+            seeds=Seeds(seeds.pop("uv") - torch.tensor([left, top]).to(self.seeds.uv), **seeds, unit=self.seeds.unit),
+            cues=Cues(**part(self.cues)),
+            rim=Rim(**part(self.rim)),
             target=self.target[pixels].clone(),
-            valid=self.valid[pixels].clone(),
         )._with_near_base()
 
     def _with_near_base(self) -> Sample:
@@ -137,30 +132,24 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
 
 def save_sample(sample: Sample, path: Path) -> None:
     """Write a sample, whole or not at all; colours of the truth with 8 bits."""
-    camera, seeds = sample.camera, sample.seeds
+    camera = sample.camera
     tensors: dict[str, Tensor] = {
         "camera.K": camera.K,
         "camera.world_to_camera": camera.world_to_camera,
         "camera.size": torch.tensor([camera.width, camera.height]),
         "target": (sample.target * 255).round().to(torch.uint8),
-        "valid": sample.valid,
-        "seeds.unit": torch.tensor(seeds.unit, dtype=torch.float64),
     }
-    for part in ("base", "rendering", "cues", "rim"):
+    for part in ("base", "rendering", "cues", "rim", "seeds"):
         value = getattr(sample, part)
         tensors |= {f"{part}.{f.name}": getattr(value, f.name) for f in dataclasses.fields(value)}
-    tensors |= {f"seeds.{name}": getattr(seeds, name) for name in ("uv", "inverse_depth", "slope", "rgb")}
+    tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
     tensors |= {name: tensors[name].half() for name in tensors if name in HALVED}
     with atomic_path(path) as temporary:
         temporary.write_bytes(save({name: tensor.contiguous() for name, tensor in tensors.items()}))
 
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
-    """Read a sample.
-
-    Raises:
-        InputError: a missing or broken file.
-    """
+    """Read a sample; InputError for a missing or broken file."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
@@ -170,16 +159,16 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
             return {key[len(name) + 1 :]: value for key, value in tensors.items() if key.startswith(name + ".")}
 
         lens, seeds = part("camera"), part("seeds")
+        unit = float(seeds.pop("unit"))
         width, height = lens["size"].tolist()
         return Sample(
             camera=Camera(lens["K"], lens["world_to_camera"], width, height),
             base=Gaussians(**part("base")),
             rendering=Rendering(**part("rendering")),
-            seeds=Seeds(seeds["uv"], seeds["inverse_depth"], seeds["slope"], seeds["rgb"], float(seeds["unit"])),
+            seeds=Seeds(**seeds, unit=unit),
             cues=Cues(**part("cues")),
             rim=Rim(**part("rim")),
             target=tensors["target"].float() / 255,
-            valid=tensors["valid"],
         )
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: no training sample, or damaged: delete it, and it is made anew") from error

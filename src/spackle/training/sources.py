@@ -8,9 +8,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,22 +32,21 @@ from spackle.training.sample import Sample
 TOLERANCE = 0.02  # how far behind what the virtual camera sees a Gaussian may lie and still count as seen, relative
 
 
-def reverse_view(prediction: BasePrediction, seen: Tensor, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
+def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
     """Keep the Gaussians that a virtual camera sees, and look at them from the photo's own camera.
 
     The virtual camera plays the part of the photo's, and the photo that of the novel view.
 
     Args:
-        prediction: the photo's Gaussians and camera.
-        seen: [N] bool, which of them the virtual camera `viewer` sees: see `seen_from`.
+        prediction: what `lift` makes of a photo: a Gaussian a pixel, then the backing.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
     """
-    camera = prediction.camera
-    kept = prediction.gaussians.select(seen)
-    rendering = renderer.render(kept, camera)
-    return Sample.of(kept, rendering, camera, viewer, photo, torch.ones_like(rendering.alpha, dtype=torch.bool))
+    camera, gaussians = prediction.camera, prediction.gaussians
+    seen = with_backing(seen_from(gaussians, viewer, renderer), gaussians.means[:, 2], camera.height, camera.width)
+    kept = gaussians.select(seen)
+    return Sample.of(kept, renderer.render(kept, camera), camera, viewer, photo)
 
 
 def seen_from(gaussians: Gaussians, viewer: Camera, renderer: Renderer) -> Tensor:
@@ -67,15 +65,10 @@ def seen_from(gaussians: Gaussians, viewer: Camera, renderer: Renderer) -> Tenso
 
 
 def with_backing(seen: Tensor, z: Tensor, height: int, width: int) -> Tensor:
-    """Which Gaussians of an RGB-D base are seen, a backing one counting as the pixel that it backs.
+    """`seen` [N] of a lifted photo's Gaussians with depths `z` [N], a backing one counting as the pixel that it backs.
 
-    A backing Gaussian lies behind its surface on purpose, so its own depth says nothing.
-
-    Args:
-        seen: [N] as `seen_from` gives it.
-        z: [N] depths in the photo's camera: H·W pixels, then the backing (see `spackle.bases.lift.lift`).
-        height: of the photo in pixels.
-        width: likewise.
+    A backing Gaussian lies behind its surface on purpose, so its own depth says nothing. The photo's height · width
+    pixels come first, then the backing (see `spackle.bases.lift.lift`).
     """
     pixels, rows, columns = height * width, height // 2, width // 2
 
@@ -93,87 +86,59 @@ FRAMES = 24  # of a path, one of which is the virtual camera
 UNCOMPLETED = "none"  # the inpainter that leaves its holes open
 
 
-class Source(Protocol):
-    """A supply of views."""
-
-    @property
-    def name(self) -> str:
-        """What it is called in messages."""
-
-    def view(self, rng: np.random.Generator) -> Sample:
-        """A view, the same for the same state of `rng`; InputError for a file that cannot be used."""
+View = Callable[[np.random.Generator], Sample]  # one of a source's views; InputError for a file that cannot be used
 
 
-@dataclasses.dataclass(frozen=True)
-class Composites:
+def composite_view(
+    rng: np.random.Generator, photos: Sequence[Path], disparity: tuple[float, float], renderer: Renderer
+) -> Sample:
     """`reverse_view` of photos without depth, cut-outs of some in front of others."""
-
-    photos: Sequence[Path]
-    renderer: Renderer
-    disparity: tuple[float, float]
-    name: str = "composites"
-
-    def view(self, rng: np.random.Generator) -> Sample:
-        height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
-        rgb, inverse_depth = composite(rng, self._photo, height, width)
-        focal = film_to_pixels(float(rng.uniform(*FOCAL_MM)), width, height)
-        every = torch.ones_like(inverse_depth, dtype=torch.bool)
-        depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
-        return _reverse(rng, rgb, depth, Camera.from_focal(focal, width, height), self.disparity, self.renderer)
-
-    def _photo(self, rng: np.random.Generator) -> Tensor:
-        return load_photo(self.photos[int(rng.integers(len(self.photos)))]).rgb
+    height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
+    rgb, inverse_depth = composite(rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width)
+    focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
+    every = torch.ones_like(inverse_depth, dtype=torch.bool)
+    depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
+    return _reverse(rng, rgb, depth, Camera.from_focal(focal, width, height), disparity, renderer)
 
 
-@dataclasses.dataclass(frozen=True)
-class RgbdFrames:
-    """`reverse_view` of photos that a depth camera took: NAME.color.jpg and NAME.depth.png."""
-
-    frames: Sequence[Path]  # the colour files
-    renderer: Renderer
-    disparity: tuple[float, float]
-    focal_px: float
-    unit_m: float  # of the depth map's numbers; 0 and 65535 are unknown
-    name: str = "rgbd"
-
-    def view(self, rng: np.random.Generator) -> Sample:
-        color = self.frames[int(rng.integers(len(self.frames)))]
-        rgb, depth = load_frame(color, self.unit_m)
-        camera = Camera.from_focal(self.focal_px, rgb.shape[1], rgb.shape[0])
-        return _reverse(rng, rgb, depth, camera, self.disparity, self.renderer)
+def frame_view(
+    rng: np.random.Generator,
+    frames: Sequence[Path],
+    focal_px: float,
+    unit_m: float,
+    disparity: tuple[float, float],
+    renderer: Renderer,
+) -> Sample:
+    """`reverse_view` of a depth camera's photo, one of `frames`: see `load_frame`."""
+    rgb, depth = load_frame(_chosen(rng, frames), unit_m)
+    camera = Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
+    return _reverse(rng, rgb, depth, camera, disparity, renderer)
 
 
-@dataclasses.dataclass(frozen=True)
-class StereoPairs:
-    """The left photo of a pair, and either `reverse_view` of it or the true right one."""
+def stereo_view(
+    rng: np.random.Generator, folders: Sequence[Path], disparity: tuple[float, float], renderer: Renderer
+) -> Sample:
+    """`reverse_view` of the left photo of a stereo pair, one of `folders`: see `load_pair`."""
+    left, _, depth, camera, _ = load_pair(_chosen(rng, folders))
+    return _reverse(rng, left, depth, camera, disparity, renderer)
 
-    folders: Sequence[Path]  # each with a scene.json, see `load_depth`
-    renderer: Renderer
-    disparity: tuple[float, float]
-    reverse: bool
-    name: str = "stereo"
 
-    def view(self, rng: np.random.Generator) -> Sample:
-        folder = self.folders[int(rng.integers(len(self.folders)))]
-        left, right, depth, camera, beside = load_pair(folder)
-        if self.reverse:
-            return _reverse(rng, left, depth, camera, self.disparity, self.renderer)
-        base = lift(left, depth, camera).gaussians
-        rendering = self.renderer.render(base, beside)
-        return Sample.of(base, rendering, beside, camera, right, torch.ones_like(rendering.alpha, dtype=torch.bool))
+def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
+    """The left photo of a stereo pair seen from the right one's place, which is the truth."""
+    left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
+    base = lift(left, depth, camera).gaussians
+    return Sample.of(base, renderer.render(base, beside), beside, camera, right)
+
+
+def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
+    return files[int(rng.integers(len(files)))]
 
 
 class PseudoViews:
     """Random views with holes and their completed targets of a pseudo-supervised dataset (appendix, "Dataset")."""
 
-    name = "pseudo"
-
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Read the manifest.
-
-        Raises:
-            InputError: no finished dataset, one without holes, or one whose targets nobody has completed.
-        """
+        """Read the manifest; InputError for no finished dataset, or one without holes or without completed targets."""
         self.files = DatasetFiles(location)
         config = self.files.manifest.config
         if config.get("inpainter", {}).get("name") == UNCOMPLETED:
@@ -193,12 +158,11 @@ class PseudoViews:
         return self.files.manifest.digest
 
     def view(self, rng: np.random.Generator) -> Sample:
-        """As `Source` has it; its rendering is the stored one."""
+        """A view as it is stored, rendering and all; InputError for a file that cannot be used."""
         photo, index = self._open[int(rng.integers(len(self._open)))]
         found = self.files.group(photo).view(index, with_base=True)
         assert found.base is not None
-        known = torch.ones_like(found.mask)
-        return Sample.of(found.base, found.rendering, found.camera, found.photo_camera, found.target, known)
+        return Sample.of(found.base, found.rendering, found.camera, found.photo_camera, found.target)
 
 
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
@@ -215,8 +179,7 @@ def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
 def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     """A stereo pair: left and right photo [H, W, 3] sRGB, the left one's depth, both cameras.
 
-    Raises:
-        InputError: a file that is missing or broken.
+    InputError for a file that is missing or broken.
     """
     try:
         scene = folder / "scene.json"
@@ -251,7 +214,5 @@ def _reverse(
     prediction = lift(rgb, depth, camera)
     kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
-    viewer = trajectory(kind, camera, float(rng.uniform(*disparity)), reach, FRAMES)[rng.integers(FRAMES)]
-    seen = seen_from(prediction.gaussians, viewer, renderer)
-    seen = with_backing(seen, prediction.gaussians.means[:, 2], camera.height, camera.width)
-    return reverse_view(prediction, seen, rgb, viewer, renderer)
+    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
+    return reverse_view(prediction, rgb, viewer, renderer)

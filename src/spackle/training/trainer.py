@@ -8,8 +8,7 @@ import dataclasses
 import functools
 import math
 import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from torch.optim import AdamW, Optimizer
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats import save_png
 from spackle.training.checkpoint import BAD, BEST, LAST, PICTURES, Checkpoint, Progress, save_checkpoint
-from spackle.training.method import Method, chunks, validate
+from spackle.training.method import Method
 from spackle.training.ranks import Ranks
 from spackle.training.recipe import AnyRecipe, OptimRecipe, plain
 
@@ -33,53 +32,9 @@ class Callbacks:
     """Functions that the trainer calls."""
 
     step: Callable[[int, dict[str, float]], None]  # steps done, and their mean numbers since it was last called
-    validated: Callable[[Progress], None]
+    validated: Callable[[Progress, Tensor], None]  # and a picture [H, W, 3] sRGB of what the weights do
     saved: Callable[[Progress], None]  # a checkpoint is on the disk
     stop: Callable[[], bool]  # whether somebody wants it to end after this step
-
-
-class Logs:
-    """TensorBoard's event files in a folder; without a folder, nothing."""
-
-    def __init__(self, folder: Path | None = None, purge_step: int = 0) -> None:
-        """ImportError where tensorboard is not installed; what an earlier start logged after a step is hidden."""
-        self.folder, self.writer = folder, None
-        if folder is not None:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of protobuf's, about itself
-                import tensorboard  # noqa: F401  # torch's own import of it fails with other words
-                from torch.utils.tensorboard import SummaryWriter
-            self.writer = SummaryWriter(str(folder), purge_step=purge_step)
-
-    def numbers(self, group: str, values: Mapping[str, float], step: int) -> None:
-        """Points of the curves GROUP/NAME."""
-        for name, value in values.items():
-            self._write("add_scalar", f"{group}/{name}", value, step)
-
-    def picture(self, name: str, rgb: Tensor, step: int) -> None:
-        """An image [H, W, 3] sRGB."""
-        self._write("add_image", name, rgb.clamp(0, 1), step, dataformats="HWC")
-
-    def close(self) -> None:
-        """Write what is still in memory."""
-        self._write("close")
-
-    def _write(self, method: str, *arguments: object, **options: object) -> None:
-        if self.writer is None:
-            return
-        try:
-            getattr(self.writer, method)(*arguments, **options)
-        except OSError as error:  # raised where the next number comes, for its thread cannot
-            raise InputError(f"{self.folder}: cannot write the logs: {reason_in_a_line(error)}") from error
-
-
-def open_logs(folder: Path, step: int, say: Callable[[str], None]) -> Logs:
-    """Logs in a folder, from a step on; says so where tensorboard is missing, and keeps none."""
-    try:
-        return Logs(folder, step)
-    except ImportError:
-        say("no TensorBoard logs: pip install 'spackle-nvs[train]'")
-        return Logs()
 
 
 EMA_START = 10  # the average forgets the first, bad weights this quickly: decay (s + 1) / (s + 10)
@@ -96,7 +51,6 @@ class Trainer:
         device: torch.device,
         folder: Path,
         callbacks: Callbacks,
-        logs: Logs | None = None,
         ranks: Ranks | None = None,
         optimizer: Optimizer | None = None,
     ) -> None:
@@ -109,12 +63,11 @@ class Trainer:
             device: where it learns.
             folder: for results; exists.
             callbacks: called as the run goes on.
-            logs: for the curves.
             ranks: this process among those that share the gradients; the first one writes.
             optimizer: of the network's weights; a group's "lr_scale" is a factor on the learning rate. None: AdamW.
         """
         self.recipe, self.method, self.folder, self.device = recipe, method, folder, device
-        self.callbacks, self.logs, self.ranks = callbacks, logs or Logs(), ranks or Ranks()
+        self.callbacks, self.ranks = callbacks, ranks or Ranks()
         self.network: nn.Module = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         # Gradients are averaged over the processes while they are computed.
@@ -124,67 +77,63 @@ class Trainer:
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on where a checkpoint was written; InputError, naming the folder, where it is of another network."""
-        expected = {name: tensor.shape for name, tensor in self.network.state_dict().items()}
-        for tensors in (checkpoint.network, checkpoint.average):
-            found = {name: tensor.shape for name, tensor in tensors.items()}
-            if wrong := sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name)):
-                raise InputError(
-                    f"{self.folder}: its checkpoint is of another network ({len(wrong)} tensors differ, e.g. "
-                    f"{wrong[0]}): choose another with -o, or --overwrite to start anew"
-                )
-        self.network.load_state_dict(checkpoint.network)
-        self.average.load_state_dict(checkpoint.average)
-        self.optimizer.load_state_dict(checkpoint.optimizer)
+        try:
+            self.network.load_state_dict(checkpoint.network)
+            self.average.load_state_dict(checkpoint.average)
+            self.optimizer.load_state_dict(checkpoint.optimizer)
+        except (RuntimeError, ValueError) as error:
+            raise InputError(
+                f"{self.folder}: its checkpoint is of another network ({reason_in_a_line(error)}): "
+                "choose another with -o, or --overwrite to start anew"
+            ) from error
         self.progress, self.on_disk = checkpoint.progress, checkpoint.progress.step
 
     def run(self) -> str:
         """Train until the steps are done ("steps"), nothing improves ("patience") or a callback asks ("stopped").
 
-        Raises:
-            InputError: an item that cannot be read, a loss that is no number, a file that cannot be written.
+        InputError for an item that cannot be read, a loss that is not finite, a file that cannot be written.
         """
         run, last, since = self.recipe.run, self.recipe.optim.steps, time.perf_counter()
         before, stopped, recent = self.progress.seconds, False, list[dict[str, float]]()
-        while (why := self._ended(stopped)) is None:
+        while self.progress.step < last and self.progress.stale < run.patience and not stopped:
             numbers = self.step(self.progress.step)
             stopped = numbers.pop("stop") > 0
             recent.append(numbers)
             step, seconds = self.progress.step + 1, before + time.perf_counter() - since
             self.progress = dataclasses.replace(self.progress, step=step, seconds=seconds)
             if step % run.log_every == 0 or step == last:
-                self._log(recent)
+                means = {name: sum(each[name] for each in recent) / len(recent) for name in numbers}
+                self.callbacks.step(step, means)
                 recent = []
             if step % run.validate_every == 0 or step == last:
                 self.validate()
             if step % run.save_every == 0:
                 self.save()
         self.save()
-        return why
-
-    def _ended(self, stopped: bool) -> str | None:
-        if self.progress.step >= self.recipe.optim.steps:
+        if self.progress.step >= last:
             return "steps"
-        if self.progress.stale >= self.recipe.run.patience:
-            return "patience"
-        return "stopped" if stopped else None
+        return "patience" if self.progress.stale >= run.patience else "stopped"
 
     def step(self, step: int) -> dict[str, float]:
         """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0."""
         method, ranks, optim = self.method, self.ranks, self.recipe.optim
         items = samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
         mine: dict[str, float] = {}
-        parts = list(chunks(items, method.at_once))
+        parts = [items[start : start + method.at_once] for start in range(0, len(items), method.at_once)]
         self.optimizer.zero_grad(set_to_none=True)
         for part in parts:
             share = len(part) / len(items)
-            with self._adding_up(last=part is parts[-1]):
+            # Processes put their gradients together in the last part of a step alone.
+            later = ranks.count > 1 and part is not parts[-1]
+            with self.wrapped.no_sync() if later else contextlib.nullcontext():  # type: ignore[operator]
                 loss, terms = method.loss(self.wrapped, step, part)
                 (share * loss).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": loss.detach(), **terms}.items():
                 mine[name] = mine.get(name, 0.0) + share * float(value)
         mine["gradient"] = float(clip_grad_norm_(self.network.parameters(), optim.clip))
         mine["stop"] = float(self.callbacks.stop())
-        numbers = dict(zip(mine, ranks.mean(list(mine.values()), self.device), strict=True))
+        sums = ranks.sum(list(mine.values()), self.device)
+        numbers = {name: total / ranks.count for name, total in zip(mine, sums, strict=True)}
         if not (math.isfinite(numbers["loss"]) and math.isfinite(numbers["gradient"])):
             self._reject(step, items, mine["loss"], numbers)
 
@@ -196,12 +145,6 @@ class Trainer:
             for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
         return {**numbers, "lr": rate}
-
-    def _adding_up(self, last: bool) -> contextlib.AbstractContextManager[None]:
-        """Around each part of a step: the processes put their gradients together in the last one alone."""
-        if last or not isinstance(self.wrapped, DistributedDataParallel):
-            return contextlib.nullcontext()
-        return self.wrapped.no_sync()
 
     def _reject(self, step: int, items: Sequence[int], loss: float, numbers: dict[str, float]) -> None:
         """Keep what made a loss that is no number, and end the run; nothing has learned from it."""
@@ -219,27 +162,35 @@ class Trainer:
             f"are there; lower optim.lr, or {self.method.remedy}"
         )
 
-    def _log(self, recent: Sequence[dict[str, float]]) -> None:
-        if self.ranks.first:
-            means = {name: sum(numbers[name] for numbers in recent) / len(recent) for name in recent[0]}
-            self.logs.numbers("train", means, self.progress.step)
-            self.callbacks.step(self.progress.step, means)
-
     def validate(self) -> None:
         """Validate the averaged weights, keep them where they are the best so far, and draw what they do."""
-        found = validate(self.average, self.method, self.device, self.ranks)
-        step = self.progress.step
+        found, step = self._measured(), self.progress.step
         self.progress = self.progress.validated({"step": step, **found}, self.method.aim, self.recipe.run.min_delta)
         if not self.ranks.first:
             return
-        self.logs.numbers("validation", found, step)
         sheet = self.method.picture(self.average)
-        self.logs.picture(self.method.columns, sheet, step)
         (self.folder / PICTURES).mkdir(exist_ok=True)
         save_png(sheet, self.folder / PICTURES / f"{step:07d}.png")
         if self.progress.stale == 0:
             self.method.export(self.average, self.folder / BEST)
-        self.callbacks.validated(self.progress)
+        self.callbacks.validated(self.progress, sheet)
+
+    @torch.no_grad()
+    def _measured(self) -> dict[str, float]:
+        """Means of the method's measures over its validation items, the same in all processes, which share the items.
+
+        A measure that no item has is missing.
+        """
+        method, ranks = self.method, self.ranks
+        totals, counts = dict.fromkeys(method.measures, 0.0), dict.fromkeys(method.measures, 0)
+        mine = range(ranks.rank, method.validation_items, ranks.count)
+        for start in range(0, len(mine), method.at_once):
+            for name, values in method.measure(self.average, mine[start : start + method.at_once]).items():
+                totals[name] += sum(values)
+                counts[name] += len(values)
+        sums = ranks.sum([*totals.values(), *counts.values()], self.device)
+        pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
+        return {name: total / count for name, total, count in pairs if count}
 
     def save(self) -> None:
         """Write a checkpoint and the averaged weights; the first process alone does."""
