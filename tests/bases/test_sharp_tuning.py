@@ -19,6 +19,7 @@ from sharp_weights import MICRO
 from torch import Tensor
 
 from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.base import TunableSharp, normalised_camera
 from spackle.bases.sharp.checkpoint import (
     NOTE,
     PARTS,
@@ -29,7 +30,6 @@ from spackle.bases.sharp.checkpoint import (
     link_owner,
 )
 from spackle.bases.sharp.layers import CONFIGS
-from spackle.bases.sharp.base import TunableSharp, normalised_camera
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
