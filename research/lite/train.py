@@ -41,7 +41,7 @@ def plan_lite(context: RunContext[LiteRecipe]) -> Plan:
 
 def _start(context: RunContext[LiteRecipe], network: LiteNet, files: LiteFiles) -> Start:
     """Make the scenes that are missing, and read the frames."""
-    recipe, say, shares = context.recipe, context.reporter.say, context.recipe.data.shares
+    recipe, say, shares = context.recipe, context.reporter.log, context.recipe.data.shares
     freeze(network, recipe.optim.frozen)
     sources: list[Source] = []
     parts: list[float] = []
@@ -59,7 +59,7 @@ def _start(context: RunContext[LiteRecipe], network: LiteNet, files: LiteFiles) 
     counts = {"made": recipe.data.made if files.photos else 0, "stereo": len(files.stereo), "rgbd": len(files.rgbd)}
     counts |= {"guessed": len(files.guessed)} if files.guessed else {}
     judged = {name: len(frames) for name, frames in groups.items()}
-    say(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
+    log(f"to learn from: {_listed(counts)}; to be judged by: {_listed(judged)}")
 
     height, width = recipe.data.size
     judge = DepthJudge(recipe.loss, height * width, context.precision, context.device)
@@ -86,9 +86,9 @@ def _make_guesses(context: RunContext[LiteRecipe], files: LiteFiles) -> GuessedP
     guesses = GuessedPhotos(folder, files.guessed)
     if context.ranks.first:
         make_folder(folder)
-        reporter.say(f"guesses of {len(files.guessed)} photos in {folder}")
+        reporter.log(f"guesses of {len(files.guessed)} photos in {folder}")
         with reporter.stage("guesses", {}) as step:
-            guesses.fill(LiteBase.load(data.teacher, device=str(context.device)), step, reporter.say)
+            guesses.fill(LiteBase.load(data.teacher, device=str(context.device)), step, reporter.log)
     context.ranks.wait()
     return guesses
 
@@ -100,9 +100,9 @@ def _make_scenes(context: RunContext[LiteRecipe], files: LiteFiles) -> Synthetic
     scenes = SyntheticScenes(folder, files.photos, data.size, data.seed, data.made)
     if context.ranks.first:
         make_folder(folder)
-        reporter.say(f"{data.made} synthetic scenes in {folder}")
+        reporter.log(f"{data.made} synthetic scenes in {folder}")
         with reporter.stage("synthetic scenes", {}) as step:
-            scenes.fill(step, reporter.say)
+            scenes.fill(step, reporter.log)
     context.ranks.wait()
     return scenes
 

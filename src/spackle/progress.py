@@ -44,14 +44,14 @@ class Reporter:
         if self.as_json:
             print(json.dumps(values, allow_nan=False, default=str), flush=True)  # paths are given as text
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """One line for everybody."""
         self.console.print(escape(" ".join(line.splitlines())), soft_wrap=True)  # names may hold line breaks
 
     def detail(self, line: str) -> None:
         """One line for those who asked for more."""
         if self.verbose:
-            self.say(line)
+            self.log(line)
 
     @contextlib.contextmanager
     def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
@@ -79,7 +79,7 @@ class Reporter:
 
             def tell(done: int, remark: str) -> None:
                 left = (time.monotonic() - begin) / max(1, done - start) * (total - done)
-                self.say(f"{name}: {done} of {total}, {remark}, {timedelta(seconds=round(left))} left")
+                self.log(f"{name}: {done} of {total}, {remark}, {timedelta(seconds=round(left))} left")
 
             yield tell
 
@@ -103,7 +103,7 @@ class Reporter:
                 nonlocal said
                 if (tenth := done * 10 // total) != said and done < total:
                     said = tenth
-                    self.say(f"{name}: {decimal(done)} of {decimal(total)}")
+                    self.log(f"{name}: {decimal(done)} of {decimal(total)}")
 
             yield tell
 

@@ -539,7 +539,7 @@ def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(
-            Reporter, "say", lambda self, line: interrupt() if "1.0 MB" in line else print(line, file=sys.stderr)
+            Reporter, "log", lambda self, line: interrupt() if "1.0 MB" in line else print(line, file=sys.stderr)
         )
         result = weights_command("get", "sharp", "--url", site.url)
     assert result.code == 130

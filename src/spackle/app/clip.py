@@ -90,7 +90,7 @@ def predict_clip(
             clip = read_clip(path, completer.path.frames, step)
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
-            reporter.say(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
+            reporter.log(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
         run = _Run(clip, focal, completer, reporter)
         (folder / "report.json").unlink(missing_ok=True)  # a report means that the video is complete
         with reporter.stage("frames", seconds) as step:
@@ -101,7 +101,7 @@ def predict_clip(
     calm = ""
     if figures["carried"] is not None:
         calm = f", flicker in holes {figures['alone']:.1f} -> {figures['carried']:.1f}"
-    reporter.say(
+    reporter.log(
         f"{path.name}: {report['clip']['frames']} frames, holes {holes['before']:.2%} -> {holes['after']:.3%}{calm}, "
         f"{report['seconds']['total']:.1f} s -> {folder}"
     )
@@ -145,7 +145,7 @@ class _Run:
                 step(index + 1, len(self._clip))
         self._sound = writer.sound
         if self._clip.audio and not self._sound:
-            self._reporter.say(
+            self._reporter.log(
                 f"{self._clip.path.name}: its sound ({self._clip.audio}) does not go into an mp4: left out"
             )
 
@@ -164,13 +164,13 @@ class _Run:
 
     def _predict(self, photo: Photo) -> BasePrediction:
         """A frame's Gaussians, by the base that the first frame got."""
-        prediction, choice = self._base.load(photo, log=self._reporter.say).predict()
+        prediction, choice = self._base.load(photo, log=self._reporter.log).predict()
         if self._first is None:
             self._base, self._first = self._base.only(choice), (photo, prediction, choice)
             name, focal = self._clip.path.name, prediction.camera.focal[0]
             if choice.note:
-                self._reporter.say(f"{name}: {choice.note}")
-            self._reporter.say(
+                self._reporter.log(f"{name}: {choice.note}")
+            self._reporter.log(
                 f"{name}: {len(self._clip)} frames, {len(prediction.gaussians):,} Gaussians from {choice.base} "
                 f"for each, focal length {focal:.0f} px ({prediction.lens_source or photo.focal_source})"
             )

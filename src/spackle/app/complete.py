@@ -83,7 +83,7 @@ class PhotoCompleter:
             InputError: a photo or depth map that cannot be used.
         """
         with reporter.stage("prepare", seconds):
-            base = self.base.load(photo, log=reporter.say)
+            base = self.base.load(photo, log=reporter.log)
         with reporter.stage("base", seconds) as step:
             prediction, choice = base.predict(step)
         photo = resize_photo(photo)
@@ -99,15 +99,15 @@ class PhotoCompleter:
         """Say which base predicted, the focal length, and how much depth was filled."""
         name = photo.path.name
         if choice.note:
-            reporter.say(f"{name}: {choice.note}")
-        reporter.say(
+            reporter.log(f"{name}: {choice.note}")
+        reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
         )
         if missing := float(prediction.notes.get("depth_filled", 0)):
-            reporter.say(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+            reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
         if self.settings.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
-            reporter.say(
+            reporter.log(
                 f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}"
             )
 

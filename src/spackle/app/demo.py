@@ -50,7 +50,7 @@ def _demo_of(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, An
     with reporter.stage("base", seconds):
         prediction = lift(pair.left, pair.depth, pair.left_camera)
     missing = float(prediction.notes["depth_filled"])
-    reporter.say(
+    reporter.log(
         f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
     )
     base, camera = prediction.gaussians, prediction.camera
@@ -79,11 +79,11 @@ def _demo_of(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, An
     }
     write_report(report, output / "report.json")
     reporter.console.print(_table(scores))
-    reporter.say(
+    reporter.log(
         f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "
         f"{holes['before']:.1%} -> {holes['after']:.2%}; {time.perf_counter() - start:.0f} s"
     )
-    reporter.say(f"Look at {output / 'comparison.png'} and {output / 'video.mp4'}")
+    reporter.log(f"Look at {output / 'comparison.png'} and {output / 'video.mp4'}")
     reporter.result({"folder": output, **report})
     return report
 

@@ -47,7 +47,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
     with open(scene, "rb") as file:
         elements = read_header(file, scene).elements
     if rest := sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields):
-        reporter.say(
+        reporter.log(
             f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
         )
     for output, writer in zip(outputs, writers, strict=True):
@@ -77,14 +77,14 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
     factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"
     if 0.95 < size / before < 1.05:
         factor = "as large as"
-    reporter.say(f"{output}: {len(scene.gaussians):,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
+    reporter.log(f"{output}: {len(scene.gaussians):,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
     result = {"file": output, "gaussians": len(scene.gaussians), "bytes": size, "seconds": round(seconds, 3)}
     far = 0
     if output.name.lower().endswith(".spz"):
         bits, far = spz_grid(scene.gaussians)
         if far:
             reach = f"{LARGEST / 2**bits:,.0f} m"
-            reporter.say(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
+            reporter.log(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
     reporter.result({**result, "drawn_nearer": far})
 
 

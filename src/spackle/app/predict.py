@@ -85,7 +85,7 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
             try:
                 request = request_of(path, options.base.depth, shared)
                 if path != photos and not options.overwrite and is_done(output / name, wanted, request):
-                    reporter.say(f"{path.name}: done already (--overwrite does it again)")
+                    reporter.log(f"{path.name}: done already (--overwrite does it again)")
                     reporter.result({"folder": output / name, "done_already": True})
                     continue
                 predict_one(path, output / name, options, completer, reporter, request)
@@ -93,10 +93,10 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
                 if path == photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
                     raise
                 failed += 1
-                reporter.say(f"error: {error}")
+                reporter.log(f"error: {error}")
                 reporter.result({"folder": output / name, "error": str(error)})
     if failed:
-        reporter.say(f"{failed} of {len(found)} photos failed")
+        reporter.log(f"{failed} of {len(found)} photos failed")
     return failed
 
 
@@ -140,7 +140,7 @@ def predict_one(
         write_report(report, folder / "report.json")
     before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))
     aux, weights, total = report["aux"], completer.residual.weights, report["seconds"]["total"]
-    reporter.say(
+    reporter.log(
         f"{path.name}: {aux['gaussians']:,} aux Gaussians ({aux['share']:.1%}, {weights}), "
         f"holes {before:.2%} -> {after:.3%}, {total:.1f} s -> {folder}"
     )
@@ -264,7 +264,7 @@ def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, report
     by_sharp = isinstance(before, dict) and before.get("name") == SharpBase.name
     if by_sharp and base.named == AUTO and done.choice.base == LiteBase.name:
         file = base.files.get("checkpoint")
-        reporter.say(
+        reporter.log(
             f"{done.photo.path.name}: warning: {folder} was made by sharp and is made again by lite: "
             f"{done.choice.why}{'' if file is None else f' ({file})'}"
         )

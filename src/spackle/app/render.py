@@ -83,10 +83,10 @@ def render_scene(
             save_video(frames(), target, path.video.rate, path.video.loop)
     result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds["video"]}
     if problem:
-        reporter.say(f"{path.cameras}: {problem}: pictures only, no video")
+        reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
         return
-    reporter.say(
+    reporter.log(
         f"{scene.name}: {len(gaussians):,} Gaussians, {len(cameras)} frames in {seconds['video']:.1f} s -> {target}"
     )
     reporter.result({"file": target, **result})
@@ -112,7 +112,7 @@ def _fly(
     except ValueError as error:
         raise InputError(f"{scene}: no camera path: {error}: give views with --cameras") from error
     if stored is None and focal_px is None:
-        reporter.say(
+        reporter.log(
             f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at {camera.width}×{camera.height} "
             "(--focal-px, --size)"
         )

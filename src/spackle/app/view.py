@@ -120,7 +120,7 @@ def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller
         with teller.stage("page", seconds):
             return page_scene(name, scene.base, scene.aux, scene.camera, completer.path.disparity)
     except InputError as error:
-        Reporter.say(teller, f"error: {error}")  # the page is told as the job ends
+        Reporter.log(teller, f"error: {error}")  # the page is told as the job ends
         raise
 
 
@@ -155,16 +155,16 @@ class Teller(Reporter):
         super().__init__(reporter.verbose, reporter.console)
         self._tell, self._path, self._name = tell, path, name
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         if self._path is not None:
             line = line.replace(str(self._path), self._name).replace(self._path.name, self._name)
-        super().say(line)
+        super().log(line)
         self._tell({"line": line})
 
     def detail(self, line: str) -> None:
         """For the terminal alone."""
         if self.verbose:
-            super().say(line)
+            super().log(line)
 
     @contextlib.contextmanager
     def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
@@ -182,14 +182,14 @@ class Teller(Reporter):
 def announce(server: ViewerServer, name: str, reporter: Reporter, *, browser: bool) -> None:
     """Print the page's address, warn if it is open to the network, and open a browser if there is a screen."""
     if not server.local:
-        reporter.say(OPEN_TO_ALL.format(host=server.host))
-        reporter.say(f"{name}: from other machines {server.url_at(address_in_network(server.host))}")
-    reporter.say(f"{name}: {server.url} (Ctrl-C ends)")
+        reporter.log(OPEN_TO_ALL.format(host=server.host))
+        reporter.log(f"{name}: from other machines {server.url_at(address_in_network(server.host))}")
+    reporter.log(f"{name}: {server.url} (Ctrl-C ends)")
     reporter.result({"url": server.url})
     # A browser of text would take the terminal away.
     screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if browser and sys.platform.startswith("linux") and not screen:
-        reporter.say("no screen here: open that page yourself; from another machine through `ssh -L`")
+        reporter.log("no screen here: open that page yourself; from another machine through `ssh -L`")
     elif browser:
         # Some browsers come back only when they are closed.
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True, name="browser").start()

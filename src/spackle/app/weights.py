@@ -57,15 +57,15 @@ def get_weights(
         with results_folder(path.parent, [path.name]):
             record = _download(known, known.url if url is None else url, path, reporter)
         hint = "" if output is None else "; --checkpoint names it to predict"
-        reporter.say(f"{_summary(known, record)} -> {path}{hint}")
+        reporter.log(f"{_summary(known, record)} -> {path}{hint}")
     else:
         with reporter.stage("check", {}):
             record = check_recorded(path)
         if record is None:
             unchecked = "there already, unchecked for want of a record; --force downloads it again"
-            reporter.say(f"{known.name}: {unchecked}: {path}")
+            reporter.log(f"{known.name}: {unchecked}: {path}")
         else:
-            reporter.say(f"{_summary(known, record)}, there already and intact: {path}")
+            reporter.log(f"{_summary(known, record)}, there already and intact: {path}")
     sha256 = None if record is None else record.sha256
     size = os.path.getsize(path)
     reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
@@ -88,7 +88,7 @@ def make_weights(output: Path, size: str, reporter: Reporter) -> None:
         else:
             save_file(tensors, temporary)
     count = sum(tensor.numel() for tensor in tensors.values())
-    reporter.say(
+    reporter.log(
         f"sharp ({size}): {count / 1e6:.2f} M random numbers, the same each time; they show no scene -> {output}"
     )
 
@@ -117,14 +117,14 @@ def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> 
             if not noticed:  # not before: where nothing comes, nothing needs a licence
                 noticed = True
                 for line in known.notice:
-                    reporter.say(line)
+                    reporter.log(line)
             step(done, total)
 
         try:
             return download(url, path, advance)
         except KeyboardInterrupt:
             if noticed:
-                reporter.say(f"{known.name}: what has come is kept; the same command goes on from there")
+                reporter.log(f"{known.name}: what has come is kept; the same command goes on from there")
             raise
 
 

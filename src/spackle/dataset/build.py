@@ -40,7 +40,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     options.check()
     inpainter = Maker.of(options, output).inpainter  # fails before long work
     if inpainter.notice:
-        reporter.say(inpainter.notice)
+        reporter.log(inpainter.notice)
     with cluster(options) as ray:
         photos = _photos(source, options, reporter)
         config = configuration(options, photos, inpainter)
@@ -53,14 +53,14 @@ def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[P
     found = find_photos(source, options.images)
     if found.missing:
         names = ", ".join((*found.missing[:NAMED], *(["…"] if len(found.missing) > NAMED else [])))
-        reporter.say(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
+        reporter.log(f"{len(found.missing)} images that {source} names are not in {found.root}: {names}")
     if options.sample is None and len(found.names) > MAX_PHOTOS:
         raise InputError(
             f"{source}: {len(found.names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
             "give --sample, or build several"
         )
     with reporter.stage("photos", {}) as step:
-        return choose(found, options.sample, options.choices.seed, reporter.say, step)
+        return choose(found, options.sample, options.choices.seed, reporter.log, step)
 
 
 def _begin(output: Path, config: dict[str, Any]) -> Manifest:
@@ -102,14 +102,14 @@ class _Build:
     def run(self, ray: Any) -> str:
         """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
         if ready := len(self.photos) - len(self.jobs):
-            self.reporter.say(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
+            self.reporter.log(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
         with self.reporter.stage("photos", {}) as step, asked_to_stop(alone=True) as stop:
             self._write_ready()
             if not self.jobs:
                 return self._finish(0.0)
             total: Seconds = {}
             work = (self.options, self.output, self.jobs)
-            workers = at_work(*work) if ray is None else at_work_on_ray(ray, *work, self.reporter.say)
+            workers = at_work(*work) if ray is None else at_work_on_ray(ray, *work, self.reporter.log)
             with timed("wall", total), workers as results:
                 for done, result in enumerate(results, ready + 1):
                     self._note(result)
@@ -118,7 +118,7 @@ class _Build:
                     if stop():
                         break
         if any(self.waiting.values()):
-            self.reporter.say("stopped; the same command goes on from here")
+            self.reporter.log("stopped; the same command goes on from here")
             return "stopped"
         return self._finish(total["wall"])
 
@@ -129,7 +129,7 @@ class _Build:
             self.seconds[stage] += time
         if result.problem is not None:
             self.problems[result.index] = result.problem
-            self.reporter.say(f"passed over: {result.problem}")
+            self.reporter.log(f"passed over: {result.problem}")
 
     def _write_ready(self) -> None:
         """Write shards whose photos are all done: first the file, then its entry; its parts go last."""
@@ -164,9 +164,9 @@ class _Build:
             raise InputError(f"{self.output}: none of {len(self.photos)} photos gave a sample, such as {why}")
         if made := len(self.jobs) - len(self.problems):
             stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
-            self.reporter.say(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
+            self.reporter.log(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
         total = decimal(sum(shard.size for shard in shards))
-        self.reporter.say(f"{samples} photos in {len(shards)} shards, {total} -> {self.output}")
+        self.reporter.log(f"{samples} photos in {len(shards)} shards, {total} -> {self.output}")
         return "complete"
 
     def _portable(self, name: str, problem: str) -> str:

@@ -50,10 +50,10 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
     count = 0
     with reporter.stage("verify", {}) as step:
         for line in problems(location, manifest, step):
-            reporter.say(f"{location}: {line}")
+            reporter.log(f"{location}: {line}")
             count += 1
     if not count:
-        reporter.say(f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, as they were written")
+        reporter.log(f"{location}: {len(manifest.samples)} photos, {decimal(manifest.size)}, as they were written")
     return count
 
 
@@ -75,7 +75,7 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
         path = (chosen[0].view(index) for index in range(1, chosen[0].views))
         frames = (torch.cat([view.rendering.rgb, view.target], dim=1) for view in path)
         save_video(frames, output / VIDEO, fps=FPS)
-    reporter.say(f"{SHEET} and {VIDEO} -> {output}")
+    reporter.log(f"{SHEET} and {VIDEO} -> {output}")
 
 
 def _spread(total: int, count: int) -> list[int]:

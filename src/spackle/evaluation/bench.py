@@ -63,7 +63,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
             for index, case in enumerate(tools.cases):
                 if stop():
-                    reporter.say("stopped; the same command goes on from here")
+                    reporter.log("stopped; the same command goes on from here")
                     return "stopped"
                 path, inputs = image_file(output, index, case.name, ".json"), inputs_digest(case)
                 image = load_part(path, inputs)
@@ -74,7 +74,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
                         raise
                     except InputError as error:  # the next run tries it again
                         problem = problem_of(case, error, options.root)
-                        reporter.say(f"passed over: {problem}")
+                        reporter.log(f"passed over: {problem}")
                         image = {"name": case.name, "facts": {}, "problem": problem, "views": []}
                     else:
                         warm = True
@@ -138,7 +138,7 @@ def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter:
     write_text(to_latex(tables), output / LATEX)
     write_json({"parameters": parameters, **found.plain()}, output / RESULTS)
     overheads = ", ".join(f"{s}: {100 * found.spread(s, 'overhead').median:.2f} %" for s in found.settings)
-    reporter.say(f"{found.config['title']}: {measured} of {total} images, overhead {overheads} -> {output}")
+    reporter.log(f"{found.config['title']}: {measured} of {total} images, overhead {overheads} -> {output}")
     reporter.result({"folder": output, "images": total, "measured": measured})
 
 

@@ -56,7 +56,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         begin(output, evaluation.config)
         records = _do_images(evaluation, output, reporter)
         if records is None:
-            reporter.say("stopped; the same command goes on from here")
+            reporter.log("stopped; the same command goes on from here")
             return "stopped"
         _finish(evaluation, records, output, reporter, html)
     return "complete"
@@ -69,9 +69,9 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
         if state.startswith(NOT_RUN):
             reasons.setdefault(state, []).append(name)
     for state, names in reasons.items():
-        reporter.say(f"{', '.join(names)}: {state}")
+        reporter.log(f"{', '.join(names)}: {state}")
     if evaluation.gauges.published:
-        reporter.say(NOTICE)
+        reporter.log(NOTICE)
 
 
 def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list[tuple[ImageResult, float]] | None:
@@ -85,7 +85,7 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
             one = _load(output, index, case, inputs)
             if one is None:
                 if index and not begun:
-                    reporter.say(f"{output}: going on, {index} of {len(cases)} images are done")
+                    reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun = True
                 try:
                     one = _do_image(evaluation, index, case, inputs, output, reporter)
@@ -93,7 +93,7 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
                     raise
                 except InputError as error:  # the next run tries it again
                     problem = problem_of(case, error, evaluation.options.root)
-                    reporter.say(f"passed over: {problem}")
+                    reporter.log(f"passed over: {problem}")
                     one = ImageResult(case.name, problem=problem), 0.0
             found.append(one)
             step(index + 1, len(cases))
@@ -118,7 +118,7 @@ def _do_image(
     start = time.perf_counter()
     record, pictures = examine(case, evaluation)
     for remark in record.remarks:
-        reporter.say(f"{case.name}: {remark}")
+        reporter.log(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
     for name, picture in pictures.items():
         report.save_picture(picture, image_file(output, index, case.name, f".{name}.webp"))
@@ -226,7 +226,7 @@ def _finish(
     write_json(about | run.plain(), output / results.RESULTS)
     count, passed = len(run.measured), len(found) - len(run.measured)
     more = f", {passed} passed over" if passed else ""
-    reporter.say(f"{run.title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")
+    reporter.log(f"{run.title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")
     reporter.result({"folder": output, "images": len(found), "measured": count})
 
 
@@ -260,4 +260,4 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
         if html:
             write_text(report.make_report(sources, report.find_bench(folders)), output / report.REPORT)
     names = ", ".join(f"{run.title} ({run.config['protocol']}, {run.base})" for run in runs)
-    reporter.say(f"{names} -> {', '.join(str(output / name) for name in files)}")
+    reporter.log(f"{names} -> {', '.join(str(output / name) for name in files)}")

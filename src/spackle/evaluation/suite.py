@@ -105,7 +105,7 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
                 elif options.only and name not in (*options.only, LIMITS):
                     not_run[name] = "not asked for (--only)"
                 elif stop():
-                    reporter.say("stopped; the same command goes on from here")
+                    reporter.log("stopped; the same command goes on from here")
                     return "stopped"
                 else:
                     load, start = load_average(), time.perf_counter()
@@ -114,10 +114,10 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
                             rows, facts = _section(name, options, device, found)
                     except InputError as error:
                         not_run[name] = str(error)
-                        reporter.say(f"{name}: not run: {error}")
+                        reporter.log(f"{name}: not run: {error}")
                         continue
                     seconds = time.perf_counter() - start
-                    reporter.say(f"{name}: {len(rows)} figures in {seconds:,.0f} s")
+                    reporter.log(f"{name}: {len(rows)} figures in {seconds:,.0f} s")
                     facts |= {"load_before": load, "seconds": round(seconds, 1)}
                     found[name] = without_nan({"rows": [plain_row(row) for row in rows], "facts": facts})
                     save_part(path, inputs, found[name])
@@ -125,7 +125,7 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
         head = f"# Speed\n\n{about}; commit {config['commit']}; {config['runs']} runs.\n\n"
         write_text(head + to_markdown(suite_tables(found, not_run)), output / MARKDOWN)
         write_json(without_nan({"config": config, "not_run": not_run, "sections": found}), output / RESULTS)
-    reporter.say(f"{len(found)} of {len(TITLES)} sections -> {output / MARKDOWN}")
+    reporter.log(f"{len(found)} of {len(TITLES)} sections -> {output / MARKDOWN}")
     return "complete"
 
 

@@ -211,7 +211,7 @@ def plan_direct_ft(context: RunContext[Recipe], checkpoint: Path | None) -> Plan
         decoder = base.network.gaussian_decoder().let_learn()
         method = DirectFt(base, owner, photos, objective, recipe.optim.batch, recipe.run.seed)
         facts = facts_of(method, base.network)
-        context.reporter.say(
+        context.reporter.log(
             f"{method.items} photos to learn from, {method.validation_items} to be judged by; "
             f"{facts['parameters']['learn']:,} weights of SHARP learn, {facts['parameters']['stay']:,} stay"
         )

@@ -119,7 +119,7 @@ class ResidualMethod(ViewMethod):
 
 def plan_residual(context: RunContext[Recipe]) -> Plan:
     """Find a recipe's files, make no sample yet; InputError where they cannot be used."""
-    objective, recipe, ranks, say = load_objective(context), context.recipe, context.ranks, context.reporter.say
+    objective, recipe, ranks, log = load_objective(context), context.recipe, context.ranks, context.reporter.log
     if recipe.init is not None:
         network = load_residual(recipe.init)
     else:
@@ -136,16 +136,16 @@ def plan_residual(context: RunContext[Recipe]) -> Plan:
 
         def skip(reason: str) -> None:
             if not skipped[reason]:
-                say(f"passed over: {reason}")
+                log(f"passed over: {reason}")
             skipped[reason] += 1
 
         make_folder(folder)
-        say(f"samples of {recipe.data.views + recipe.data.validation_views} views in {folder}")
+        log(f"samples of {recipe.data.views + recipe.data.validation_views} views in {folder}")
         with context.reporter.stage("samples", {}) as step:
             samples = supply.samples(folder, step, skip)
         if skipped:
-            say(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
-        say(f"{len(samples.train)} samples to learn from, {len(samples.validation)} to be judged by")
+            log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
+        log(f"{len(samples.train)} samples to learn from, {len(samples.validation)} to be judged by")
         if ranks.first:
             ranks.wait()
         method = ResidualMethod(samples, objective, recipe.optim.batch, ranks.count)

@@ -111,8 +111,8 @@ def train(
         if found:
             check_same_run(found, plan.method, recipe, plan.digest, output)
             if problem:
-                reporter.say(f"{problem}: going on from the one before it")
-            reporter.say(f"{output}: going on from step {found.progress.step}")
+                reporter.log(f"{problem}: going on from the one before it")
+            reporter.log(f"{output}: going on from step {found.progress.step}")
         start = plan.start()
         ranks.wait()  # nobody looks for checkpoints any more
         if overwrite and ranks.first:
@@ -154,14 +154,14 @@ class Logs:
 
 def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) -> str:
     """The training loop with everything that it talks to: bars, logs, signals and run.json."""
-    recipe, ranks, say, output = context.recipe, context.ranks, context.reporter.say, context.output
+    recipe, ranks, log, output = context.recipe, context.ranks, context.reporter.log, context.output
     method, first = start.method, checkpoint.progress.step if checkpoint else 0
     logs = Logs()
     if ranks.first:
         try:
             logs = Logs(output / LOGS, first)
         except ImportError:
-            say("no TensorBoard logs: pip install 'spackle-nvs[train]'")
+            log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
     facts = {
         "method": method.name,
         "aim": method.aim,
@@ -185,7 +185,7 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         logs.numbers("validation", {name: value for name, value in found.items() if name != "step"}, progress.step)
         logs.write("add_image", method.columns, sheet.clamp(0, 1), progress.step, dataformats="HWC")
         best = "the best so far" if progress.stale == 0 else f"best {progress.best:.4f} at step {progress.best_step}"
-        say(f"step {progress.step}: validation {aim} {found[aim]:.4f} ({best}){method.describe(found)}")
+        log(f"step {progress.step}: validation {aim} {found[aim]:.4f} ({best}){method.describe(found)}")
         write(progress)
 
     with (
@@ -200,5 +200,5 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         why = trainer.run()
     if ranks.first:
         write(trainer.progress, why)
-        say(f"{_END[why]}, step {trainer.progress.step} -> {output}")
+        log(f"{_END[why]}, step {trainer.progress.step} -> {output}")
     return why
