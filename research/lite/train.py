@@ -41,7 +41,7 @@ def plan_lite(context: RunContext[LiteRecipe]) -> Plan:
 
 def _start(context: RunContext[LiteRecipe], network: LiteNet, files: LiteFiles) -> Start:
     """Make the scenes that are missing, and read the frames."""
-    recipe, say, shares = context.recipe, context.reporter.log, context.recipe.data.shares
+    recipe, log, shares = context.recipe, context.reporter.log, context.recipe.data.shares
     freeze(network, recipe.optim.frozen)
     sources: list[Source] = []
     parts: list[float] = []
