@@ -50,12 +50,12 @@ def _start(context: RunContext[LiteRecipe], network: LiteNet, files: LiteFiles) 
         parts.append(shares.made)
     for measured, share in ((files.stereo, shares.stereo), (files.rgbd, shares.rgbd)):
         if measured:
-            sources.append(Kept(read_all(measured, LEARNED_SIDE, say)))
+            sources.append(Kept(read_all(measured, LEARNED_SIDE, log)))
             parts.append(share)
     if files.guessed:
         sources.append(_make_guesses(context, files))
         parts.append(shares.guessed)
-    groups = {group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, say)] for group in files.groups}
+    groups = {group.name: [frame for _, frame in read_all(group.files, JUDGED_SIDE, log)] for group in files.groups}
     counts = {"made": recipe.data.made if files.photos else 0, "stereo": len(files.stereo), "rgbd": len(files.rgbd)}
     counts |= {"guessed": len(files.guessed)} if files.guessed else {}
     judged = {name: len(frames) for name, frames in groups.items()}

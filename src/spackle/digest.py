@@ -14,11 +14,7 @@ MAX_HASHED = 200_000_000  # bytes of a file that is read to tell whether it has 
 
 
 def fingerprint(file: Path, kind: str) -> str:
-    """The digest of what a file holds; of gigabytes, which would take seconds to read, size and time of change.
-
-    Raises:
-        InputError: no such file; `kind` names it in the message.
-    """
+    """The digest of a file, or of gigabytes size and time of change; InputError (naming `kind`) if it is missing."""
     size = check_file(file, kind)
     if size > MAX_HASHED:
         return f"{size} bytes of {file.stat().st_mtime_ns}"

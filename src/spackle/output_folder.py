@@ -22,20 +22,15 @@ LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls
 def results_folder(path: Path, files: Sequence[str] = ()) -> Iterator[None]:
     """Create a folder for results; where the block puts nothing into it, it goes again.
 
-    Args:
-        path: the folder.
-        files: what the block is going to write there. That none of it can be is known at once rather
-            than after long work, and what a killed run left of it half-written goes.
-
-    Raises:
-        InputError: where the folder cannot be created, or one of the files not be written.
+    The block writes `files`: InputError before long work if it cannot. Deletes what a killed run left of them.
     """
     missing = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         make_folder(path)
         for name in files:
             check_writable(path / name)
-        _remove_leftovers(path, files)
+        with contextlib.suppress(OSError):
+            remove_half_written(path, files=files)
         yield
     finally:
         for folder in missing:
@@ -45,11 +40,7 @@ def results_folder(path: Path, files: Sequence[str] = ()) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone_in(folder: Path, work: str) -> Iterator[None]:
-    """Keep others out of a folder while the block works there: they would take each other's files away.
-
-    Raises:
-        InputError: somebody else is at work, or nothing can be written.
-    """
+    """Keep others out of a folder while the block works there; InputError if somebody is, or it cannot be written."""
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(hold(folder / LOCK))
@@ -60,30 +51,17 @@ def alone_in(folder: Path, work: str) -> Iterator[None]:
         yield
 
 
-def remove_half_written(*folders: Path) -> None:
-    """Delete what killed runs left of any file; for folders in which nobody else is at work (see `alone_in`)."""
+def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
+    """Delete what killed runs left of `files`; of any file if None, where nobody else is at work (see `alone_in`)."""
     for folder in folders:
         for file in folder.iterdir():
-            if LEFTOVER.fullmatch(file.name):
-                file.unlink(missing_ok=True)
-
-
-def _remove_leftovers(folder: Path, files: Sequence[str]) -> None:
-    """Delete temporary files of these names; others may belong to a run that is still at work."""
-    wanted = set(files)
-    with contextlib.suppress(OSError):
-        for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)
-            if match and match[1] + match[2] in wanted:
+            if match and (files is None or match[1] + match[2] in files):
                 file.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder for results, or check that it can be written to.
-
-    Raises:
-        InputError: where it cannot.
-    """
+    """Create a folder for results, or check that it can be written to; InputError where it cannot."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:

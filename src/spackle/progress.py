@@ -25,6 +25,16 @@ from rich.progress import (
 Step = Callable[[int, int], None]  # (done, of how many)
 
 
+@contextlib.contextmanager
+def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Add the block's time to `seconds[stage]`."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
 class Reporter:
     """Says what is going on, and how long each stage took; people read it from the standard error.
 

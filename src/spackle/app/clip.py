@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.opencv import OpenCV
 from spackle.output_folder import results_folder, write_report
-from spackle.progress import Reporter, Step
+from spackle.progress import Reporter, Step, timed
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_area_ratio, hole_mask
@@ -81,8 +79,7 @@ def predict_clip(
 ) -> None:
     """One clip to `folder`: video.mp4 with as many frames, and report.json; `lens` as `load_photo` takes it.
 
-    Raises:
-        InputError: a clip, a frame or a depth map that cannot be used, or a folder that cannot be written to.
+    InputError for a clip, a frame, a depth map or a folder that cannot be used.
     """
     seconds: dict[str, float] = {}
     with results_folder(folder, FILES):
@@ -134,10 +131,10 @@ class _Run:
         frames = clip_frames(self._clip)
         with ClipWriter(path, self._clip) as writer:
             for index in range(len(self._clip)):
-                with self._completer.timed("decode"):
+                with timed("decode", self._completer.seconds):
                     rgb = next(frames)
                 drawn = self._draw(Photo(rgb, *self._focal, self._clip.path / NAME.format(index)))
-                with self._completer.timed("encode"):
+                with timed("encode", self._completer.seconds):
                     writer.add(drawn.view.rgb)
                 holes = (hole_area_ratio(drawn.before.alpha), hole_area_ratio(drawn.view.alpha))
                 aux = len(drawn.gaussians[1])
@@ -151,7 +148,7 @@ class _Run:
 
     def _draw(self, photo: Photo) -> CompletedView:
         """A frame's completed view."""
-        with self._completer.timed("base"):
+        with timed("base", self._completer.seconds):
             prediction = self._predict(photo)
         small = resize_photo(photo)
         try:
@@ -272,20 +269,15 @@ class ClipCompleter:
 
     @torch.no_grad()
     def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
-        """The next frame.
+        """The next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
 
-        Args:
-            rgb: [H, W, 3] sRGB at the size of the prediction's camera.
-            prediction: of the frame, in the frame of its camera.
-
-        Raises:
-            ValueError: depths and focal length allow no path.
+        ValueError where depths and focal length allow no path.
         """
-        with self.timed("depth"):
+        with timed("depth", self.seconds):
             base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
         camera = view_at(self.trajectory, even, self.disparity, now.depths, self._count, self.frames)
-        with self.timed("complete"):
+        with timed("complete", self.seconds):
             before, aux = self.renderer.render(base, camera), Gaussians.empty()
             alone = before
             if self.fill:
@@ -293,20 +285,13 @@ class ClipCompleter:
                 aux, alone = completer.completed_view(camera, [guard], rendering=before)
         drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
         if self.fill:
-            with self.timed("carry"):
+            with timed("carry", self.seconds):
                 memory_before = None if past is None else past.memory
                 frame = propagate_colors(base, aux, camera, self.renderer, (before, alone), memory_before, self.flow)
                 drawn, memory = _carried(drawn, frame, past), frame.memory
         self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
         self._count += 1
         return drawn
-
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the block's time to a stage's seconds."""
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
     def _aligned(
         self, rgb: Tensor, prediction: BasePrediction

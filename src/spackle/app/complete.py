@@ -61,11 +61,7 @@ class CompletedPhoto:
 
 
 class PhotoCompleter:
-    """Completes photos: base, residual, cameras and renderer are set up once for all of them.
-
-    Raises:
-        InputError: an option that cannot be used, whatever the photo.
-    """
+    """Completes photos by one base, residual and renderer; InputError for an option that no photo can use."""
 
     def __init__(self, base: BaseSettings, residual: ResidualChoice, path: PathOptions, mode: Mode = "scene") -> None:
         base.check()
@@ -77,11 +73,7 @@ class PhotoCompleter:
         self.renderer = get_renderer(base.device)
 
     def complete(self, photo: Photo, reporter: Reporter, seconds: dict[str, float]) -> CompletedPhoto:
-        """A photo, given at its full size, to its completed scene.
-
-        Raises:
-            InputError: a photo or depth map that cannot be used.
-        """
+        """A photo at its full size to its completed scene; InputError for a photo or depth map that cannot be used."""
         with reporter.stage("prepare", seconds):
             base = self.base.load(photo, log=reporter.log)
         with reporter.stage("base", seconds) as step:

@@ -35,57 +35,52 @@ MARGIN = 8  # pixels between the pictures of the comparison
 def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
     """Complete the photo, write scene, video and pictures, and print the comparison with the truth.
 
-    Raises:
-        InputError: where scikit-image is missing, or `output` cannot be written to.
+    InputError where scikit-image is missing, or `output` cannot be written to.
     """
     pair = load_motorcycle()
     with results_folder(output, FILES):
-        return _demo_of(pair, output, reporter)
-
-
-def _demo_of(pair: StereoPair, output: Path, reporter: Reporter) -> dict[str, Any]:
-    start = time.perf_counter()
-    renderer = get_renderer()
-    seconds: dict[str, float] = {}
-    with reporter.stage("base", seconds):
-        prediction = lift(pair.left, pair.depth, pair.left_camera)
-    missing = float(prediction.notes["depth_filled"])
-    reporter.log(
-        f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
-    )
-    base, camera = prediction.gaussians, prediction.camera
-    cameras = scene_path(base, camera, "rotate_forward", DISPARITY)
-    sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
-    with reporter.stage("complete", seconds) as step:
-        scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step)
-    with reporter.stage("write", seconds):
-        save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
-        scene.save(output / "scene.ply", disparity=DISPARITY)
-    with reporter.stage("video", seconds) as step:
-        total = len(cameras)
-        views = ((step(i + 1, total), scene.render(camera, renderer).rgb)[1] for i, camera in enumerate(cameras))
-        save_video(views, output / "video.mp4")
-    holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
-    with reporter.stage("truth", seconds):
-        scores = _compare_truth(prediction, pair, renderer, output)
-    report: dict[str, Any] = {
-        "disparity": DISPARITY,
-        "base_gaussians": len(scene.base),
-        "aux_gaussians": len(scene.aux),
-        "hole_area_ratio": holes,
-        "right_camera": scores,
-        "residual": {"weights": "seeds" if shipped_network() is None else "shipped"},
-        "seconds": {**seconds, "total": round(time.perf_counter() - start, 3)},
-    }
-    write_report(report, output / "report.json")
-    reporter.console.print(_table(scores))
-    reporter.log(
-        f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "
-        f"{holes['before']:.1%} -> {holes['after']:.2%}; {time.perf_counter() - start:.0f} s"
-    )
-    reporter.log(f"Look at {output / 'comparison.png'} and {output / 'video.mp4'}")
-    reporter.result({"folder": output, **report})
-    return report
+        start = time.perf_counter()
+        renderer = get_renderer()
+        seconds: dict[str, float] = {}
+        with reporter.stage("base", seconds):
+            prediction = lift(pair.left, pair.depth, pair.left_camera)
+        missing = float(prediction.notes["depth_filled"])
+        reporter.log(
+            f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
+        )
+        base, camera = prediction.gaussians, prediction.camera
+        cameras = scene_path(base, camera, "rotate_forward", DISPARITY)
+        sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
+        with reporter.stage("complete", seconds) as step:
+            scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step)
+        with reporter.stage("write", seconds):
+            save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
+            scene.save(output / "scene.ply", disparity=DISPARITY)
+        with reporter.stage("video", seconds) as step:
+            total = len(cameras)
+            views = ((step(i + 1, total), scene.render(camera, renderer).rgb)[1] for i, camera in enumerate(cameras))
+            save_video(views, output / "video.mp4")
+        holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
+        with reporter.stage("truth", seconds):
+            scores = _compare_truth(prediction, pair, renderer, output)
+        report: dict[str, Any] = {
+            "disparity": DISPARITY,
+            "base_gaussians": len(scene.base),
+            "aux_gaussians": len(scene.aux),
+            "hole_area_ratio": holes,
+            "right_camera": scores,
+            "residual": {"weights": "seeds" if shipped_network() is None else "shipped"},
+            "seconds": {**seconds, "total": round(time.perf_counter() - start, 3)},
+        }
+        write_report(report, output / "report.json")
+        reporter.console.print(_table(scores))
+        reporter.log(
+            f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "
+            f"{holes['before']:.1%} -> {holes['after']:.2%}; {time.perf_counter() - start:.0f} s"
+        )
+        reporter.log(f"Look at {output / 'comparison.png'} and {output / 'video.mp4'}")
+        reporter.result({"folder": output, **report})
+        return report
 
 
 @torch.no_grad()

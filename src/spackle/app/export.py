@@ -31,9 +31,7 @@ WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
     """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
 
-    Raises:
-        InputError: a scene that is none, a name that says no format or cannot be written, or a scene that is
-            too large for one of the formats.
+    Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
     writers = [writer_of(output) for output in outputs]
     targets = [check_writable(output) for output in outputs]
@@ -60,11 +58,7 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
 
 
 def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:
-    """What writes a file of this name.
-
-    Raises:
-        InputError: a name that ends in none of the formats.
-    """
+    """What writes a file of this name; InputError for a name that ends in none of the formats."""
     for suffix, writer in WRITERS.items():
         if output.name.lower().endswith(suffix):
             return writer
@@ -79,21 +73,15 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
         factor = "as large as"
     reporter.log(f"{output}: {len(scene.gaussians):,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
     result = {"file": output, "gaussians": len(scene.gaussians), "bytes": size, "seconds": round(seconds, 3)}
-    far = 0
-    if output.name.lower().endswith(".spz"):
-        bits, far = spz_grid(scene.gaussians)
-        if far:
-            reach = f"{LARGEST / 2**bits:,.0f} m"
-            reporter.log(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
+    bits, far = spz_grid(scene.gaussians) if output.name.lower().endswith(".spz") else (0, 0)
+    if far:
+        reach = f"{LARGEST / 2**bits:,.0f} m"
+        reporter.log(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
     reporter.result({**result, "drawn_nearer": far})
 
 
 def page_of(scene: SceneFile, focal_px: float | None = None, fov: float | None = None) -> PageScene:
-    """A loaded scene, of ours or of others: where no camera is stored, a usual lens looks along z.
-
-    Raises:
-        InputError: a scene that cannot be seen from its camera.
-    """
+    """A loaded scene for the page, with a usual lens along z if none is stored; InputError if it cannot be seen."""
     path, gaussians, camera = scene.path, scene.gaussians, _lens(scene, focal_px, fov)
     if not at_origin(camera):
         gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin

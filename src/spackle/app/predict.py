@@ -7,7 +7,6 @@ import dataclasses
 import json
 import os
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +65,7 @@ class PredictOptions:
 def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
     """Work through a photo, a clip or a folder of photos; returns the number of photos that failed.
 
-    Raises:
-        InputError: a single photo, a clip, or an option, that cannot be used.
+    InputError for an option, a clip or a single photo that cannot be used.
     """
     found = find_photos(photos)
     if is_clip(photos):
@@ -84,7 +82,9 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
         for path, name in found:
             try:
                 request = request_of(path, options.base.depth, shared)
-                if path != photos and not options.overwrite and is_done(output / name, wanted, request):
+                whole = all((output / name / file).is_file() for file in wanted)
+                done = whole and _earlier(output / name).get("request") == request
+                if done and path != photos and not options.overwrite:
                     reporter.log(f"{path.name}: done already (--overwrite does it again)")
                     reporter.result({"folder": output / name, "done_already": True})
                     continue
@@ -105,10 +105,7 @@ def predict_one(
 ) -> None:
     """One photo to `folder`: base.ply, scene.ply, a video, report.json, and views/ with --cameras.
 
-    Nothing is written before all is computed.
-
-    Raises:
-        InputError: a photo or depth map that cannot be used, or a folder that cannot be written to.
+    Nothing is written before all is computed. InputError for a photo, a depth map or a folder that cannot be used.
     """
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
@@ -160,11 +157,7 @@ def open_completer(options: PredictOptions) -> PhotoCompleter:
 
 
 def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
-    """A digest of all that the photos have in common: the version, the options, and what their files hold.
-
-    Raises:
-        InputError: one of the files is missing.
-    """
+    """A digest of what all photos share: version, options, and what their files hold; InputError for a missing file."""
     settings, residual, path = options.base, options.residual, options.path
     named = settings.named if settings.folder is None else "hf"  # its files tell, wherever they lie
     own: dict[str, object] = {"spackle": spackle.__version__, "base": named, "residual": residual.weights}
@@ -180,11 +173,7 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
 
 
 def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
-    """A digest of all that the result of one photo depends on.
-
-    Raises:
-        InputError: the photo or its depth map is missing.
-    """
+    """A digest of all that the result of one photo depends on; InputError if the photo or its depth map is missing."""
     files = [fingerprint(photo, "photo")]
     if isinstance(depth, Path):
         depth = find_depth(depth, photo)
@@ -194,11 +183,7 @@ def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
 
 
 def find_photos(path: Path) -> list[tuple[Path, str]]:
-    """A photo, or the photos of a folder in order of their names, each with the name of its results.
-
-    Raises:
-        InputError: nothing there, or a folder without photos.
-    """
+    """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
     if not os.path.isdir(path):
         return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
     try:
@@ -241,7 +226,7 @@ def make_report(
         "disparity": None if given else path.disparity,
         "video": video,
         "hole_area_ratio": holes,
-        "request": request if choice.lasting else None,  # None: the next run does it again, see `is_done`
+        "request": request if choice.lasting else None,  # None: the next run does it again
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
     if choice.failures:
@@ -251,11 +236,6 @@ def make_report(
     if done.saved_view is not None:
         report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
     return report
-
-
-def is_done(folder: Path, results: Sequence[str], request: str) -> bool:
-    """Whether an earlier run with the same files and options has finished, and its results still exist."""
-    return all((folder / name).is_file() for name in results) and _earlier(folder).get("request") == request
 
 
 def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:

@@ -29,18 +29,9 @@ DEFAULT_SIZE = (1280, 720)
 def render_scene(
     scene: Path, output: Path, path: PathOptions, focal_px: float | None, device: str, reporter: Reporter
 ) -> None:
-    """Draw a PLY along a path: the video `output`, or `output`/STEM.mp4 (with --cameras also PNGs).
+    """Draw a PLY along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
 
-    Args:
-        scene: the file.
-        output: a folder, or a name that ends as videos do.
-        path: the cameras and the video; its size is the stored camera's where None.
-        focal_px: in pixels of the video, in place of the stored camera's lens.
-        device: where to render.
-        reporter: says what has been drawn.
-
-    Raises:
-        InputError: a scene, a camera file or an output that cannot be used.
+    `focal_px`, in pixels of the video, replaces the stored lens. InputError for a file or option that cannot be used.
     """
     single = output.suffix.lower() in FORMATS
     if single:

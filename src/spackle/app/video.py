@@ -123,9 +123,7 @@ class PathOptions:
     def fly(self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None) -> list[Camera]:
         """The cameras of a video: through keyframes or along the trajectory, at the photo's size made even.
 
-        Raises:
-            PathError: the keyframes lead nowhere.
-            ValueError: no such path through this scene.
+        PathError where the keyframes lead nowhere, ValueError for a path that this scene does not allow.
         """
         if keyframes is None:
             looped, count = self.video.plays != 1, self.frames or PATH_FRAMES
@@ -146,11 +144,7 @@ class FrameMaker:
 
     @staticmethod
     def of(options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path) -> FrameMaker:
-        """For a scene along a path; what was not chosen is measured on the scene.
-
-        Raises:
-            InputError: a scene where it cannot be measured, or frames that are too large; `source` is named.
-        """
+        """For a scene along a path; measures on it what was not chosen; InputError (naming `source`) if it cannot."""
         try:
             stereo = _stereo(options, gaussians, cameras[0])
             depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None

@@ -53,11 +53,7 @@ class ViewOptions:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file claims to be a scene, by its name or by its first bytes.
-
-    Raises:
-        InputError: there is no such file, or nothing in it.
-    """
+    """Whether a file claims to be a scene, by its name or its first bytes; InputError for a missing or empty file."""
     check_file(path, "photo or scene")
     if path.suffix.lower() in WRITTEN_ONLY:
         raise InputError(f"{path}: {path.suffix} files are written, not read: give the scene.ply that it was made of")
@@ -68,8 +64,7 @@ def is_scene(path: Path) -> bool:
 def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
     """Show a scene or a photo until somebody stops it; False where work is left over that cannot be interrupted.
 
-    Raises:
-        InputError: a file that is neither, or an option that cannot be used.
+    InputError for a file that is neither, or an option that cannot be used.
     """
     uploads = Uploads(options, reporter)
     begin = _first(target, options, uploads, reporter)

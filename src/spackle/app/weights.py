@@ -32,17 +32,10 @@ from spackle.progress import Reporter
 def get_weights(
     name: str, output: Path | None, reporter: Reporter, *, url: str | None = None, force: bool = False
 ) -> Path:
-    """Download known weights unless they are there; returns their file.
+    """Download known weights unless they are there, or always with `force`; returns their file.
 
-    Args:
-        name: as in `WEIGHTS`.
-        output: a folder, or a file name with the weights' suffix; the folder of weights where None.
-        reporter: says the terms of use when the first bytes come, and where the file lies.
-        url: a mirror.
-        force: download what is there already.
-
-    Raises:
-        InputError: an unknown name, a file that cannot be had or not be written, or one that is there and damaged.
+    `output` is a folder, or a file name with the weights' suffix (None: the weights' folder); `url` is a mirror.
+    InputError for an unknown name, and for a file that cannot be downloaded, cannot be written or is damaged.
     """
     known = known_weights(name)
     if output is None:
@@ -73,11 +66,7 @@ def get_weights(
 
 
 def make_weights(output: Path, size: str, reporter: Reporter) -> None:
-    """Write weights that anyone can make (see `deterministic_weights`): "full" or "tiny", .pt or .safetensors.
-
-    Raises:
-        InputError: another suffix, or a file that cannot be written.
-    """
+    """Write `deterministic_weights`, "full" or "tiny", as .pt or .safetensors; InputError for another suffix."""
     suffix = output.suffix.lower()
     if suffix not in (".pt", ".safetensors"):
         raise InputError(f"{output}: give a name that ends in .pt or .safetensors")

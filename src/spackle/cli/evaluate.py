@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, DeviceOption, JsonOption, PrecisionName, PrecisionOption, VerboseOption
+from spackle.cli.options import INTERRUPTED, DeviceOption, JsonOption, PrecisionOption, VerboseOption
 from spackle.errors import InputError
-
-if TYPE_CHECKING:
-    from spackle.bases.open import BaseSettings
 
 # Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_with_words`.
 EXTRA_WORDS = {"allow_extra_args": True}
@@ -82,6 +79,7 @@ def evaluate(
     verbose: VerboseOption = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
+    from spackle.bases.open import BaseSettings
     from spackle.evaluation.run import evaluate as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
@@ -93,7 +91,7 @@ def evaluate(
         methods=split_words(methods),
         disparities=parse_disparities(_with_words(context, disparity)),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
-        base=_settings(base, checkpoint, precision, low_memory, device),
+        base=BaseSettings(base, None, None, checkpoint, precision, low_memory, device=device),
         residual=residual,
         direct_ft=direct_ft,
         features=features,
@@ -161,15 +159,17 @@ def bench(
 
     With --suite: time every stage on this machine, without a dataset: suite.json, suite.md.
     """
+    from spackle.bases.open import BaseSettings
     from spackle.evaluation.bench import bench as run
-    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, residual_file, split_words
+    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.evaluation.suite import SuiteOptions, run_suite
     from spackle.progress import Reporter
+    from spackle.scene import ResidualChoice
 
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     _check_choice(suite, given)
     disparities = parse_disparities(_with_words(context, disparity))
-    bases = _settings(base, checkpoint, precision, low_memory, device)
+    bases = BaseSettings(base, None, None, checkpoint, precision, low_memory, device=device)
     if dataset is None or root is None:
         sharp = dataclasses.replace(bases, windows=windows, compiled=compiled)
         asked = SuiteOptions(
@@ -178,7 +178,7 @@ def bench(
             device=device,
             sharp=sharp if {"--base", "--checkpoint"} & given else None,
             base_runs=base_runs,
-            residual=residual_file(residual),
+            residual=ResidualChoice(residual).file,
             side=side,
         )
         end = run_suite(asked, output or Path("bench-suite"), reporter)
@@ -216,14 +216,6 @@ def _given(context: typer.Context) -> set[str]:
     """The options that stand on the command line, by their long names."""
     sources = {p.opts[-1]: context.get_parameter_source(p.name) for p in context.command.params if p.name}
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
-
-
-def _settings(
-    base: str, checkpoint: Path | None, precision: PrecisionName, low_memory: bool, device: str
-) -> BaseSettings:
-    from spackle.bases.open import BaseSettings
-
-    return BaseSettings(base, checkpoint=checkpoint, precision=precision, low_memory=low_memory, device=device)
 
 
 def _with_words(context: typer.Context, disparity: str) -> str:

@@ -8,14 +8,14 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from spackle.dataset.maker import PARTS, Made, Maker, Seconds, at_work, key_of, part_file, timed
+from spackle.dataset.maker import PARTS, Made, Maker, Seconds, at_work, key_of, part_file
 from spackle.dataset.options import MAX_PHOTOS, DatasetOptions, configuration
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.ray import at_work_on_ray, cluster
 from spackle.dataset.shards import NAME, Manifest, differences, load_manifest, shard_name, write_shard
 from spackle.errors import InputError
 from spackle.output_folder import alone_in, make_folder, remove_half_written, results_folder
-from spackle.progress import Reporter
+from spackle.progress import Reporter, timed
 from spackle.signals import asked_to_stop
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
@@ -23,19 +23,9 @@ NAMED = 5  # missing files that the log names
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset, or go on with one.
+    """Build a dataset of a folder of photos or COCO annotations, or resume that: "complete", or "stopped" by Ctrl-C.
 
-    Args:
-        source: a folder of photos, or COCO annotations.
-        output: a folder for manifest and shards.
-        options: everything else.
-        reporter: logs the photos that give no sample, and at the end the time of each stage.
-
-    Returns:
-        "complete", or "stopped" where Ctrl-C came.
-
-    Raises:
-        InputError: options, photos or folders that cannot be used; another dataset in `output`.
+    InputError for options, photos or folders that cannot be used, and for another dataset in `output`.
     """
     options.check()
     inpainter = Maker.of(options, output).inpainter  # fails before long work

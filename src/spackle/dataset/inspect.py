@@ -60,8 +60,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
     """Write a sheet (base, mask and target of some views of some photos) and a video of one path, base beside target.
 
-    Raises:
-        InputError: no finished dataset, a damaged one, or a folder that cannot be written to.
+    InputError for a dataset that is unfinished or damaged, or a folder that cannot be written to.
     """
     if min(photos, views) < 1:
         raise InputError("--photos and --views must be at least 1")

@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -29,6 +28,7 @@ from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
+from spackle.progress import timed
 from spackle.render import Renderer, get_renderer
 
 PARTS = "parts"  # in the output: samples that are in no shard yet
@@ -80,11 +80,7 @@ class Maker:
         return keep(self.output, *self.sample(job))
 
     def sample(self, job: Job) -> tuple[Made, bytes | None]:
-        """A photo's sample as a stretch of a tar archive, or None where the photo gives none.
-
-        Raises:
-            BaseError: no photo can be worked on.
-        """
+        """A photo's sample as a stretch of a tar archive, None if it gives none; BaseError if no photo can."""
         index, file = job
         seconds: Seconds = {}
         try:
@@ -130,22 +126,8 @@ def keep(output: Path, made: Made, data: bytes | None) -> Made:
 
 
 @contextlib.contextmanager
-def timed(stage: str, seconds: Seconds) -> Iterator[None]:
-    """Add the block's time to `seconds[stage]`."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-@contextlib.contextmanager
 def at_work(options: DatasetOptions, output: Path, jobs: Sequence[Job]) -> Iterator[Iterator[Made]]:
-    """Results as they come, in any order; with one worker in this process.
-
-    Raises:
-        InputError: a base, folder or disk that cannot be used, or a worker that died.
-    """
+    """Results as they come, in any order, from this process with one worker; InputError also if a worker dies."""
     if options.workers == 1 or len(jobs) < 2:
         before = torch.get_num_threads()
         torch.set_num_threads(options.threads)

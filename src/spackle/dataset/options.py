@@ -66,11 +66,7 @@ class DatasetOptions:
                 raise InputError(f"{name} must be between {least} and {most}, got {value}")
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
-        """The depth map of a photo: in --depth, below the same subfolder as the photo; None without --depth.
-
-        Raises:
-            InputError: there is none of that name.
-        """
+        """A photo's depth map in --depth, below the photo's subfolder; None without --depth; InputError if missing."""
         folder = self.base.depth
         if not isinstance(folder, Path):
             return None

@@ -42,14 +42,9 @@ class Found:
 
 
 def find_photos(source: Path, folder: Path | None = None) -> Found:
-    """The photos below a folder, or those that a COCO annotation file names.
+    """The photos below a folder, or those that a COCO file `{"images": [{"file_name": …}, …]}` names.
 
-    Args:
-        source: a folder, searched with its subfolders; or a JSON file `{"images": [{"file_name": …}, …]}`.
-        folder: where the files of a JSON lie; beside it where None.
-
-    Raises:
-        InputError: nothing there, no photo, or no such JSON.
+    `folder` is where the COCO file's photos lie (None: beside it). InputError without a photo or such a file.
     """
     if not os.path.isdir(source):
         return _named_by_coco(source, folder)
@@ -94,10 +89,7 @@ def choose(found: Found, count: int | None, seed: int, warn: Log, progress: Step
     """The photos of a dataset, in the order of their names: all, or a random subset of `count`.
 
     The subset depends on the names, the contents and the seed alone. `warn` names each photo that cannot be read, is
-    too small, or is a copy of another; in a subset the next one takes its place.
-
-    Raises:
-        InputError: fewer good photos than `count`, or none.
+    too small, or is a copy of another; the next one takes its place. InputError for fewer good photos than `count`.
     """
     repeated = _repeated(found, warn)
     names = [name for name in found.names if name not in repeated]

@@ -37,8 +37,7 @@ STARTING = -1  # in place of a photo's index, for deaths before the first photo
 def cluster(options: DatasetOptions) -> Iterator[Any]:
     """The package, connected to the cluster of --ray; None without --ray. A cluster of our own ends with the block.
 
-    Raises:
-        InputError: Ray is not installed, nothing answers at the address, or there is too little room.
+    InputError where Ray is not installed, nothing answers at the address, or there is too little room.
     """
     if options.ray is None:
         yield None
@@ -115,10 +114,9 @@ class RemoteMaker:
     """A `Maker` on a node, which has to see the same files as the main process; it returns samples as bytes."""
 
     def __init__(self, options: DatasetOptions, folder: str) -> None:
-        """Start in `folder`, the main process's, so that relative paths mean the same files."""
         self.options = options
         torch.set_num_threads(options.threads)
-        with contextlib.suppress(OSError):  # where it is missing, so are the files that are looked for in it
+        with contextlib.suppress(OSError):  # without this folder of the main process, its relative paths fail later
             os.chdir(folder)
 
     def begin(self, expected: Mapping[str, Any]) -> None:
@@ -157,11 +155,7 @@ def what_is_seen(photo: PhotoFile, options: DatasetOptions) -> list[str]:
 def at_work_on_ray(
     ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], log: Log
 ) -> Iterator[Iterator[Made]]:
-    """As `at_work`, on the cluster that `ray` is connected to; `log` is told of workers that died.
-
-    Raises:
-        InputError: likewise; a node that is not like the others, or a photo at which workers die.
-    """
+    """As `at_work`, on the cluster of `ray`; logs dead workers. InputError also for a node unlike the others."""
     pool = WorkerPool(ray, options, output, jobs, log)
     try:
         yield pool.results()
@@ -180,11 +174,7 @@ class _Worker:
 
 
 class WorkerPool:
-    """Workers with few photos each, replaced when they die.
-
-    Ray's `ActorPool` gives an actor one call at a time and names neither the call nor the actor that failed, so the
-    photo could not be named and made again.
-    """
+    """Workers with few photos each, replaced when they die; Ray's `ActorPool` does not name the call that failed."""
 
     def __init__(self, ray: Any, options: DatasetOptions, output: Path, jobs: Sequence[Job], log: Log) -> None:
         """Start workers on `ray`, which is connected to a cluster."""

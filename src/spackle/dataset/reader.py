@@ -18,11 +18,7 @@ class DatasetFiles:
     """Any view of a dataset by its place, for readers that choose themselves."""
 
     def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Read the manifest in a folder, or at an address that fsspec understands.
-
-        Raises:
-            InputError: no dataset, or one that is not finished.
-        """
+        """Read the manifest in a folder or at an fsspec address; InputError without a finished dataset."""
         self.location = location
         self.manifest = load_manifest(location)
         if not self.manifest.complete:
@@ -96,11 +92,7 @@ class ViewDataset(IterableDataset[DatasetView]):
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[DatasetView]:
-        """Views of this rank and worker.
-
-        Raises:
-            InputError: a shard that is missing or damaged.
-        """
+        """Views of this rank and worker; InputError for a shard that is missing or damaged."""
         worker = get_worker_info()
         part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
         shards = list(self.files.manifest.shards)  # the same order for everybody

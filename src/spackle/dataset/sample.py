@@ -58,15 +58,8 @@ def pack_sample(
 ) -> bytes:
     """A photo as a stretch of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
 
-    The archive's end is missing, and so are time, owner and machine.
-
-    Args:
-        key: how the files begin, without a dot.
-        photo: [h, w, 3] sRGB at its working size.
-        stack: V views of it.
-        targets: [V, H, W, 3] sRGB.
-        path: where the camera goes.
-        facts: more for the JSON; the mask's "threshold" among them.
+    The archive's end is missing, and so are time, owner and machine. `photo` [h, w, 3] (at its working size) and
+    `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold".
     """
     files: list[tuple[str, bytes]] = []
     views: list[dict[str, Any]] = []

@@ -21,11 +21,7 @@ FORMAT = 1  # of shards and manifest; a reader of another one refuses
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a file in a folder, or at an address that fsspec understands (s3://bucket/dataset); it can be sought in.
-
-    Raises:
-        InputError: it is not there or cannot be read, or fsspec is missing.
-    """
+    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if it cannot."""
     place = f"{str(location).rstrip('/')}/{name}"
     try:
         if "://" not in place:
@@ -161,11 +157,7 @@ def shard_name(number: int) -> str:
 
 
 def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
-    """Write a tar file of samples, each given by its key and file, whole or not at all; returns its entry.
-
-    Raises:
-        InputError: a part that is damaged, or a disk that is full.
-    """
+    """Write a tar file of (key, file) samples, whole or not at all; InputError for a damaged part or a full disk."""
     samples: list[SampleEntry] = []
     whole, offset = hashlib.sha256(), 0
     with atomic_path(target) as temporary, open(temporary, "wb") as file:

@@ -53,18 +53,10 @@ def draw_path(choices: ViewChoices, photo_sha256: str) -> PathChoice:
 
 
 def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int = VIEWS) -> list[Camera]:
-    """The photo's own view, and then the others along the path, no two alike.
+    """The photo's own view (`camera`, of the views' size), then others along the path: `views` in all, no two alike.
 
     Frames at the photo's eye and at the end of a closed path repeat others, so the path gets more frames instead.
-
-    Args:
-        path: its kind and width.
-        camera: the photo's, of the views' size.
-        depth_range: of the base.
-        views: how many in all.
-
-    Raises:
-        ValueError: a path that cannot be, or one on which the camera does not move.
+    ValueError for a path that cannot be, or on which the camera does not move.
     """
     cameras = [camera]
     least = APART * max_offset(camera, path.disparity, depth_range)

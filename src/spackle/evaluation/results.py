@@ -123,11 +123,7 @@ class Run:
 
 
 def begin(output: Path, config: Mapping[str, Any], parts: str = IMAGES) -> None:
-    """Make a folder this configuration's, with a folder for finished `parts`; `KINDS` has the configuration's "kind".
-
-    Raises:
-        InputError: it holds another configuration; the message tells where they differ.
-    """
+    """Make a folder for this configuration (its "kind" is in `KINDS`); InputError if it holds another one."""
     make_folder(output / parts)
     remove_half_written(output, output / parts)
     path, kind = output / CONFIG, config.get("kind")

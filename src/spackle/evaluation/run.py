@@ -41,11 +41,8 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     """Evaluate a dataset, or resume that: "complete", or "stopped" by Ctrl-C.
 
     Writes results.json, times.json, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and
-    report.html with `html`.
-
-    Raises:
-        InputError: options, a dataset or a folder that cannot be used; another evaluation in `output`; too little
-            memory for the base.
+    report.html with `html`. InputError for options, a dataset or a folder that cannot be used, for another evaluation
+    in `output`, and for too little memory.
     """
     if html:
         check_matplotlib("--html")
@@ -132,9 +129,7 @@ def _do_image(
 def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, Tensor]]:
     """All figures of an image, and what is shown of it: a picture of one view by each method, and the truth.
 
-    Raises:
-        InputError: a file that cannot be used, or something that the protocol needs and the case lacks.
-        BaseError: no image can be worked on.
+    InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
     """
     options = evaluation.options
     if options.near and not case.seconds and case.problem is None:
@@ -239,10 +234,8 @@ def _write_tables(runs: Sequence[Run], output: Path) -> None:
 def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
     """Write the tables of several finished evaluations into `output`, and report.html with `html`.
 
-    With `html` a folder may hold a bench.json alone.
-
-    Raises:
-        InputError: a folder without results, results that do not go together, or an output that cannot be written to.
+    With `html` a folder may hold a bench.json alone. InputError for a folder without results, results that do not go
+    together, or an output that cannot be written to.
     """
     if not folders:
         raise InputError("no results: name the folders that `spackle evaluate` wrote")

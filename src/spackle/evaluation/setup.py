@@ -27,7 +27,7 @@ from spackle.evaluation.protocols import Gauges
 from spackle.inpaint.opencv import OpenCV
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
-from spackle.residual.network import SHIPPED, load_residual
+from spackle.scene import ResidualChoice
 from spackle.training.features import load_features
 
 BASE = BaseSettings("sharp")
@@ -110,13 +110,6 @@ class EvaluateOptions:
             raise InputError("--disparity: the same number twice: leave one out")
 
 
-def residual_file(named: str | None) -> Path | None:
-    """The file of the weights that --residual means: the shipped ones where it is not given, else "seeds" or a file."""
-    if named is None:
-        return SHIPPED if SHIPPED.is_file() else None
-    return None if named in ("seeds", "none") else Path(named)
-
-
 def split_words(text: str) -> tuple[str, ...]:
     """ "a, b,c" as words; a word twice counts once."""
     return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
@@ -152,8 +145,7 @@ class Evaluation:
 def open_evaluation(options: EvaluateOptions) -> Evaluation:
     """Check the options and load what all images share; networks of a base are loaded with the first image.
 
-    Raises:
-        InputError: an option, a dataset, weights or a package that cannot be used.
+    InputError for an option, a dataset, weights or a package that cannot be used.
     """
     options.check()
     dataset = get_dataset(options.dataset)
@@ -161,8 +153,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)
-    weights, direct, features = residual_file(options.residual), None, None
-    network = None if weights is None else load_residual(weights)
+    network, direct, features = ResidualChoice(options.residual).load(), None, None
     if options.direct_ft is not None:
         direct = open_base(dataclasses.replace(options.base, checkpoint=_there(options.direct_ft, "--direct-ft")))
     wanted = options.wanted_metrics
@@ -195,7 +186,7 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
 
 
 def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case]) -> dict[str, Any]:
-    base, file = options.base, residual_file(options.residual)
+    base, file = options.base, ResidualChoice(options.residual).file
     residual = {
         "weights": "seeds" if file is None else "shipped" if options.residual is None else "given",
         "sha256": None if file is None else weights_digest(file),

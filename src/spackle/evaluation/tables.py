@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from spackle.errors import InputError
@@ -30,11 +31,7 @@ Cells = tuple[str, ...]
 
 
 def make_tables(runs: Sequence[Run]) -> list[Table]:
-    """All tables of some runs.
-
-    Raises:
-        InputError: a dataset twice under one protocol with the same base, or different disparities.
-    """
+    """All tables; InputError for a dataset twice with one protocol and base, or for different disparities."""
     large, near = [run for run in runs if not run.near], [run for run in runs if run.near]
     seen: set[tuple[bool, str, str]] = set()
     for run in runs:
@@ -207,9 +204,7 @@ def holes_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
 
 def gaussians_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
     """Added and merged Gaussians (tab:expanded_efficiency_gaussian_overhead, without its times)."""
-
-    def share_text(share: float | None) -> str:
-        return _percent_text(share, "")
+    share_text = functools.partial(_percent_text, sign="")
 
     def three(run: Run, method: str, setting: str) -> Cells:
         added, share, merged = (run.mean(figure, method, setting).value for figure in ("aux", "aux_share", "merged"))
