@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -22,3 +23,22 @@ def pair(tmp_path: Path) -> tuple[Path, Path]:
     from photos import write_pair
 
     return write_pair(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Weights of SHARP's and lite's networks, which show no scene."""
+    from sharp_weights import write_tiny
+    from stand_in import SHARP_FILE, write_lite
+
+    folder = tmp_path_factory.mktemp("weights")
+    return {"sharp": write_tiny(folder / SHARP_FILE), "lite": write_lite(folder / "lite.safetensors")}
+
+
+@pytest.fixture
+def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine without SHARP, and with weights of lite that belong to the test."""
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
+    lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
+    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
+    return lite

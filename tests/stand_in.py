@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from command import Run, report_of, run
+from command import Run, run
 from photos import box
 from safetensors.torch import save_file
 
@@ -17,6 +16,7 @@ from spackle.bases.lite import LiteNet
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.image import Photo, resize_photo
 
+SHARP_FILE = "sharp_2572gikvuh.pt"
 QUICK = ("--no-render", "--residual", "none")
 
 
@@ -51,10 +51,3 @@ def write_model(folder: Path) -> Path:
 def predict(tmp_path: Path, *options: object) -> Run:
     """`spackle predict` into `out`, without completion."""
     return run("predict", "-o", tmp_path / "out", *QUICK, *options)
-
-
-def base_of(tmp_path: Path, *options: object) -> tuple[dict[str, Any], Run]:
-    """What the report says of the base of a single photo."""
-    result = predict(tmp_path, *options)
-    assert result.code == 0, result.err
-    return report_of(tmp_path / "out" / Path(str(options[options.index("-i") + 1])).stem)["base"], result

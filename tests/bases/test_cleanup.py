@@ -99,33 +99,6 @@ def sphere(radius_px: float, behind: float, size: int = 120) -> Tensor:
     return torch.where(within > 0, a / (3 - within.clamp_min(0).sqrt()), 1 / (3 + behind * radius))
 
 
-def horizon(size: int = 120) -> Tensor:
-    """Ground that runs up to a far wall: steep, with a crease at its end."""
-    return (0.004 * (torch.arange(size) - size / 3)).clamp_min(0.002)[:, None].expand(size, size).contiguous()
-
-
-def bump(size: int = 120) -> Tensor:
-    """A smooth hill, as steep as 45° somewhere."""
-    x = (torch.arange(size) - size / 2) / 30
-    return 0.3 + 0.02 * torch.exp(-(x**2 + x[:, None] ** 2))
-
-
-@pytest.mark.parametrize(
-    ("inverse", "smooth"),
-    [
-        *((1 / slanted_plane(1.5, far, axis).depth, axis == 0) for far in (6, 1000) for axis in (0, 1)),
-        *((sphere(radius, 4.0), False) for radius in (5, 10, 30, 50)),
-        (horizon(), True),
-        (horizon().T.contiguous(), True),
-        (bump(), True),
-    ],
-)
-def test_planes_creases_and_round_things_are_not_smeared(inverse: Tensor, smooth: bool) -> None:
-    found = find_edges(inverse.numpy(), np.ones(inverse.shape, bool), (200.0, 200.0))
-    assert not found.step.any()
-    assert not smooth or not (found.across.any() or found.down.any())
-
-
 @pytest.mark.parametrize("radius", [5, 10, 30, 50])
 @pytest.mark.parametrize("behind", [0.0, 0.2, 1.0])
 def test_a_ball_keeps_its_roundness_even_where_it_touches_the_wall(radius: float, behind: float) -> None:

@@ -19,7 +19,7 @@ from photos import HEIGHT, WIDTH, calibration, metres, write_depth, write_photo
 from safetensors.torch import load_file, save_file
 from scenes import same_bits
 from sharp_weights import gaussians_of, write_tiny
-from stand_in import StandIn, write_lite, write_model
+from stand_in import SHARP_FILE, StandIn, write_model
 
 import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
@@ -30,29 +30,12 @@ from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.layers import TINY
-from spackle.device import MemoryShort
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 
-SHARP_FILE = "sharp_2572gikvuh.pt"
+pytestmark = pytest.mark.usefixtures("shipped")
 NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here"
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Weights of both networks, which show no scene."""
-    folder = tmp_path_factory.mktemp("weights")
-    return {"sharp": write_tiny(folder / SHARP_FILE), "lite": write_lite(folder / "lite.safetensors")}
-
-
-@pytest.fixture(autouse=True)
-def shipped(tmp_path: Path, made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine without SHARP, and with weights of lite that belong to the test."""
-    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
-    lite = Path(shutil.copy(made["lite"], tmp_path / "lite.safetensors"))
-    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
-    return lite
 
 
 @pytest.fixture
@@ -237,27 +220,10 @@ def test_broken_depth_in_the_photo_fails(tmp_path: Path, monkeypatch: pytest.Mon
         pick(photo, name="rgbd")
 
 
-def garbage(file: Path) -> str:
-    file.write_bytes(b"not weights at all")
-    return "neither a PyTorch checkpoint"
-
-
-def unlike_its_record(file: Path) -> str:
-    record = f'{{"url": "https://x", "size": {file.stat().st_size}, "sha256": "{"0" * 64}"}}'
-    file.with_name(f"{file.name}.json").write_text(record)
-    return "SHA-256 is not that of what was downloaded"
-
-
-def of_another_network(file: Path) -> str:
-    torch.save({"weight": torch.zeros(3)}, file)
-    return "not SHARP's weights"
-
-
-@pytest.mark.parametrize("damage", [garbage, unlike_its_record, of_another_network])
-def test_damaged_weights_of_sharp_fail_once_for_all_photos(
-    tmp_path: Path, photo: Path, sharp: Path, damage: Callable[[Path], str]
-) -> None:
-    said, log = damage(sharp), list[str]()
+def test_damaged_weights_of_sharp_fail_once_for_all_photos(photo: Path, sharp: Path) -> None:
+    record = {"url": "https://x", "size": sharp.stat().st_size, "sha256": "0" * 64}
+    sharp.with_name(f"{sharp.name}.json").write_text(json.dumps(record))
+    said, log = "SHA-256 is not that of what was downloaded", list[str]()
     base = open_base(BaseSettings(), log.append)
     choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
     assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used"] * 2
@@ -266,25 +232,6 @@ def test_damaged_weights_of_sharp_fail_once_for_all_photos(
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):
         with pytest.raises(BaseError, match=said):
             pick(photo, **settings)
-
-
-def hungry(*args: object, **options: object) -> None:
-    raise MemoryShort("not enough memory for SHARP: try --low-memory")
-
-
-@pytest.mark.parametrize("when", ["load", "predict"])
-def test_too_little_memory_fails_once_and_stops_a_base_that_is_named(
-    photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    monkeypatch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
-    log: list[str] = []
-    base = open_base(BaseSettings(), log.append)
-    for _ in range(2):
-        choice = base.predict(load_photo(photo))[1]
-        assert (choice.base, choice.lasting) == ("lite", False)
-    assert len(log) == 1
-    with pytest.raises(BaseError, match="not enough memory for SHARP"):
-        pick(photo, name="sharp")
 
 
 def test_what_fails_for_one_photo_is_tried_for_the_next(

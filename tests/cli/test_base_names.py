@@ -1,36 +1,33 @@
-"""Lite and the models of transformers wherever a base is named: datasets, evaluations and benchmarks."""
+"""Bases on the command line: what `auto` takes for a folder, and a base by its name in datasets and evaluations."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
-from command import Run, refuses, run
+from command import Run, refuses, report_of, run
 from evaluation_data import write_boxes
-from photos import write_photo
-from stand_in import StandIn, write_lite
+from photos import write_depth, write_photo
+from safetensors.torch import load_file, save_file
+from stand_in import StandIn, predict, write_model
 
 from spackle.bases.hf import HfBase
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.sharp import SharpBase
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.image import Photo
 
 
-@pytest.fixture(scope="module")
-def lite(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_lite(tmp_path_factory.mktemp("weights") / "lite.safetensors")
-
-
 @pytest.fixture(autouse=True)
-def _shipped(tmp_path: Path, lite: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine without SHARP, and with these weights of lite."""
-    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
-    monkeypatch.setattr("spackle.bases.lite.SHIPPED", lite)
+def _quick(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine without SHARP, whose loading takes no time."""
+    monkeypatch.setattr(SharpBase, "load", lambda path, **options: StandIn("sharp"))
 
 
 @pytest.fixture
@@ -64,14 +61,10 @@ def sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, lite: Path, hub: list[dict[str, Any]]) -> None:
-    model = tmp_path / "models" / "small"
-    model.mkdir(parents=True)
-    (model / "config.json").write_text("{}")
-    (model / "model.safetensors").write_bytes(b"weights")
-    (model / "README.md").write_text("about it")
+def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, shipped: Path, hub: list[dict[str, Any]]) -> None:
+    model = write_model(tmp_path / "models" / "small")
     digests = {name: sha256(model / name) for name in ("config.json", "model.safetensors")}
-    for base, name, weights in (("lite", "lite", sha256(lite)), (f"hf:{model}", "hf:small", digests)):
+    for base, name, weights in (("lite", "lite", sha256(shipped)), (f"hf:{model}", "hf:small", digests)):
         result = build(tmp_path / name, "--base", base)
         assert result.code == 0, result.err
         manifest = load_manifest(tmp_path / name / "out")
@@ -107,9 +100,9 @@ def test_a_photo_that_a_model_cannot_work_on_is_passed_over_and_too_little_memor
 
 
 def test_an_evaluation_of_lite_and_of_a_model(
-    tmp_path: Path, stereo: Path, lite: Path, hub: list[dict[str, Any]]
+    tmp_path: Path, stereo: Path, shipped: Path, hub: list[dict[str, Any]]
 ) -> None:
-    for base, title, weights in (("lite", "lite", sha256(lite)), ("hf:me/small", "hf:me/small", None)):
+    for base, title, weights in (("lite", "lite", sha256(shipped)), ("hf:me/small", "hf:me/small", None)):
         folder = tmp_path / title
         words = ("--methods", "base", "--metrics", "none", "--disparity", "0.3", "-o", folder / "out")
         root = ("--dataset", "middlebury", "--root", stereo)
@@ -134,4 +127,98 @@ def test_where_results_must_say_what_they_are_of_auto_is_refused_and_sharp_the_d
     ):
         refuses(result, "--base auto: results must say what they are of")
     refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, lite, hf:NAME_OR_FOLDER need none")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """A folder with a photo and another."""
+    for name in ("a.png", "b.png"):
+        write_photo(tmp_path / "photos" / name)
+    return tmp_path / "photos"
+
+
+def install(made: dict[str, Path], tmp_path: Path) -> Path:
+    """Weights of SHARP where a download puts them."""
+    (tmp_path / "weights").mkdir(exist_ok=True)
+    return Path(shutil.copy(made["sharp"], tmp_path / "weights"))
+
+
+def test_a_folder_is_done_again_when_better_weights_come(
+    tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path
+) -> None:
+    def base() -> str:
+        result = predict(tmp_path, "-i", photos)
+        assert result.code == 0, result.err
+        name: str = report_of(tmp_path / "out" / "a")["base"]["name"]
+        return "done already" if "done already" in result.err else name
+
+    assert [base(), base()] == ["lite", "done already"]
+    save_file({name: 2 * tensor for name, tensor in load_file(shipped).items()}, shipped)
+    assert [base(), base()] == ["lite", "done already"]
+    weights = install(made, tmp_path)
+    assert [base(), base()] == ["sharp", "done already"]
+    weights.unlink()
+    assert [base(), base()] == ["lite", "done already"]
+
+
+def test_results_of_sharp_that_give_way_to_lite_are_named(
+    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def bad(path: Path, **options: Any) -> None:
+        raise InputError(f"{path}: cut off")
+
+    def warned() -> list[str]:
+        return [line for line in predict(tmp_path, "-i", photos).lines if "was made by sharp" in line]
+
+    sharp = install(made, tmp_path)
+    assert warned() == []
+    sharp.write_bytes(b"cut")
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase, "load", bad)
+        first, second = warned()
+        assert str(tmp_path / "out" / "a") in first
+        assert second.endswith(f"by lite: no depth in the photo, SHARP cannot be used ({sharp})")
+        assert warned() == []  # done already
+    install(made, tmp_path)
+    assert warned() == []
+    # With depth no network counts.
+    words = ("-i", photos, "--depth", write_depth(tmp_path / "d.npy"))
+    assert predict(tmp_path, *words).code == 0
+    sharp.unlink()
+    assert "done already" in predict(tmp_path, *words, "--base", "rgbd").err
+
+
+@pytest.mark.parametrize("when", ["load", "predict"])
+def test_results_for_want_of_memory_are_tried_again_the_next_time(
+    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    def hungry(*args: object, **options: object) -> None:
+        raise MemoryShort("not enough memory for SHARP")
+
+    install(made, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
+        result = predict(tmp_path, "-i", photos)
+        assert [line for line in result.lines if "not enough memory" in line] == result.lines[:1]
+        refuses(predict(tmp_path, "-i", photos, "--base", "sharp"), "not enough memory for SHARP")
+    for name in "ab":
+        report = report_of(tmp_path / "out" / name)
+        assert (report["base"]["name"], report["request"]) == ("lite", None)
+    assert "done already" not in predict(tmp_path, "-i", photos).err
+    assert report_of(tmp_path / "out" / "b")["base"]["name"] == "sharp"
+
+
+def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
+    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuses(predict(tmp_path, "-i", photos, "--base", "lite", "-c", made["sharp"]), made["sharp"])
+    sharp = install(made, tmp_path)
+
+    def change(path: Path, **options: Any) -> StandIn:
+        sharp.write_bytes(sharp.read_bytes() + b"more")
+        return StandIn("sharp")
+
+    monkeypatch.setattr(SharpBase, "load", change)
+    refuses(predict(tmp_path, "-i", photos), "changed while this was running")
     assert not (tmp_path / "out").exists()
