@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from portraits import png
 
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.errors import InputError
@@ -169,12 +170,6 @@ def zipped(content: bytes) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("arr_0.npy", content)
-    return buffer.getvalue()
-
-
-def png(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(array).save(buffer, "png")
     return buffer.getvalue()
 
 
