@@ -48,10 +48,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of all numbers and kernels that a function's module has so far, imported ones above all.
-
-    With them kept machine code becomes invalid; numba itself looks at the function's own file alone.
-    """
+    """A hash of the numbers and kernels in a function's module; numba itself looks at the function's own file alone."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):

@@ -140,11 +140,7 @@ def _far_weight(relative: Any, bias: Any) -> Any:
 
 @kernel
 def _find_holes(known: Any, count: int) -> Any:
-    """The unknown pixels, what is around each of them, and the known ones among that; positions are flat.
-
-    Returns holes [count], their links [count, 4] up, down, left and right, which count the holes first and the rim
-    after them, and the rim. Across the image's border a hole is linked to itself.
-    """
+    """Flat positions of the holes [n], links [n, 4] to neighbours (holes first, then the rim; itself outside), the rim."""
     height, width = known.shape
     holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
     rim = np.empty(min(AROUND * count, height * width - count), np.int32)

@@ -60,11 +60,7 @@ def surface_gaussians(
 
 
 def _principal_axes(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Orthonormal frames [N, 3, 3] (columns: two in-plane axes, normal) and in-plane lengths [N, 2].
-
-    The ellipse a·cos t + b·sin t has its axes at the angle where p = a·cos θ + b·sin θ and
-    q = b·cos θ − a·sin θ are orthogonal; a aᵀ + b bᵀ = p pᵀ + q qᵀ for every θ.
-    """
+    """Frames [N, 3, 3] (columns: axes of the ellipse a·cos t + b·sin t, normal) and in-plane lengths [N, 2]."""
     theta = 0.5 * torch.atan2(2 * (a * b).sum(-1), (a * a).sum(-1) - (b * b).sum(-1))[:, None]
     p = a * theta.cos() + b * theta.sin()
     q = b * theta.cos() - a * theta.sin()

@@ -43,10 +43,7 @@ def _shifted(image: Tensor, axis: int, by: int) -> Tensor:
 
 
 def _neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """The previous and the next pixel along an axis of [H, W].
-
-    Beyond the border numbers continue linearly, so that the slope there is the one-sided one; booleans are false.
-    """
+    """The previous and the next pixel along an axis of [H, W]; beyond the border: linear, and false for booleans."""
     size = image.shape[axis]
     start, end = image.narrow(axis, 0, 1), image.narrow(axis, size - 1, 1)
     if image.dtype == torch.bool:

@@ -137,10 +137,7 @@ class Version:
 
 
 def _version(response: HTTPResponse, url: str, begun: Version | None, offset: int) -> Version:
-    """What the server sends: the rest of `begun`, that object, or a whole file of this version.
-
-    Raises Changed for another rest than from `offset` on, and InputError for what is no file.
-    """
+    """The version that the server sends: `begun` itself for its rest from `offset` on, or that of a whole file."""
     rest = begun if response.status == 206 else None
     if not rest and (response.status != 200 or response.headers.get_content_type() == "text/html"):
         raise InputError(f"{url}: the server answers with something else than a file: check the address in a browser")

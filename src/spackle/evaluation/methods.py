@@ -84,10 +84,7 @@ def _one_scene(shot: Shot, network: ResidualNet | None, precision: Precision) ->
 
 @torch.no_grad()
 def _dense(shot: Shot, network: ResidualNet | None, precision: Precision) -> Iterator[View]:
-    """An aux Gaussian for every cell, hole or not: the other side of the mask-guided ablation (tab:mask_guided_init).
-
-    Exactly one for each 2×2 pixels less the few that find no place behind what the photo shows, and no second pass.
-    """
+    """An aux Gaussian for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
     photo_camera = shot.prediction.camera
     for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
         cues = Cues.of(before)
@@ -109,10 +106,7 @@ def _inpaint_2d(shot: Shot, inpainter: Inpainter) -> Iterator[View]:
 
 
 def _direct_ft(shot: Shot, prediction: BasePrediction, unit: float) -> Iterator[View]:
-    """The paper's naive decoupled framework: another base, trained on completed views, by itself.
-
-    Its `unit` is its unit of length in this one's, where both were aligned with a dataset.
-    """
+    """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
     for camera in shot.cameras:
         pose = camera.world_to_camera.clone()
         pose[:3, 3] *= unit

@@ -190,10 +190,7 @@ def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
 
 
 def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
-    """Deltas [B, 14, ...] from the outputs of the heads [B, 16, ...].
-
-    Colours that are there need not be learnt: it is enough to say how much of them to take.
-    """
+    """Deltas [B, 14, ...] from the outputs of the heads [B, 16, ...], the last two of which copy known colours."""
     deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
     taken = copies[:, :1] * features[:, FAR_RIM] + copies[:, 1:] * features[:, MIRRORED]
     return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)

@@ -234,11 +234,7 @@ def behind(before: Rendering, own: Rendering, hole: Tensor) -> tuple[Tensor, Ten
 
 
 def _recall(past: FrameMemory, uv: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Light [H, W, 3] that stood at uv [H, W, 2] in the past, and how far it is trusted, [H, W].
-
-    Of the four pixels around, those count that do not stand clearly nearer than what is looked for: they are
-    the edge of the thing that hides it.
-    """
+    """Past light [H, W, 3] at uv [H, W, 2] without pixels of nearer things, and how far it is trusted, [H, W]."""
     height, width = past.trust.shape
     corner = (uv - 0.5).floor()
     part = uv - 0.5 - corner

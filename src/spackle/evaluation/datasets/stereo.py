@@ -43,15 +43,7 @@ class BrokenPhoto(InputError):
 def _depth_map(
     lens: Calibration, disparity: NDArray[Any], known: NDArray[np.bool_], unit: float, path: Path
 ) -> DepthMap:
-    """z = focal · baseline / (disparity + doffs).
-
-    Args:
-        lens: of the pair.
-        disparity: [H, W] as stored, `unit` pixels each.
-        known: [H, W].
-        unit: pixels.
-        path: for messages.
-    """
+    """z = focal · baseline / (disparity + doffs), of a disparity [H, W] in steps of `unit` pixels."""
     reach = float(lens.K[0, 0]) * lens.baseline_m
     with np.errstate(all="ignore"):  # what is not known may be anything
         z = torch.from_numpy((reach / (disparity * unit + lens.doffs_px)).astype(np.float32))
