@@ -48,7 +48,7 @@ def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Ca
 
 
 def _surroundings(function: Callable[..., Any]) -> str:
-    """A hash of the numbers and kernels in a function's module; numba itself looks at the function's own file alone."""
+    """A hash of the numbers and kernels in a function's module: numba itself looks at the function's file alone."""
     seen = []
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher):

@@ -140,7 +140,7 @@ def _far_weight(relative: Any, bias: Any) -> Any:
 
 @kernel
 def _find_holes(known: Any, count: int) -> Any:
-    """Flat positions of the holes [n], links [n, 4] to neighbours (holes first, then the rim; itself outside), the rim."""
+    """Flat positions of the holes [n], links [n, 4] to neighbours (holes, then the rim; itself outside), the rim."""
     height, width = known.shape
     holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
     rim = np.empty(min(AROUND * count, height * width - count), np.int32)

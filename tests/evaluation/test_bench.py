@@ -38,7 +38,7 @@ from spackle.evaluation.protocols import large_views
 from spackle.evaluation.results import KINDS, begin
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.suite import TITLES, plain_row, suite_tables
-from spackle.evaluation.suite_sections import Figure, count_flops, holed_scene, photo_scene
+from spackle.evaluation.suite_sections import SuiteRow, count_flops, holed_scene, photo_scene
 from spackle.evaluation.table import EMPTY
 from spackle.evaluation.timing import TOTAL, Lap, complete_in_laps, measure
 from spackle.image import Photo
@@ -281,7 +281,7 @@ SIDE = 64
 PEAKS = {stages.PRODUCT.format("fp32"): 1e6, stages.PRODUCT.format("bf16"): 4e6, stages.COPY: 2e6}
 
 
-def rows_of(section: stages.Section) -> dict[str, Figure]:
+def rows_of(section: stages.Section) -> dict[str, SuiteRow]:
     return {row.name: row for row in section[0]}
 
 
@@ -318,7 +318,7 @@ def test_limits_are_rates_and_stand_beside_the_rows_that_they_hold_for() -> None
     rows = stages.limits_section(2, share=1 / 128)[0]
     assert [row.unit for row in rows] == ["GFLOP/s", "GFLOP/s", "GB/s"]
     assert all(len(row.values) == stages.LIMIT_RUNS and min(row.values) > 0 for row in rows)
-    row = plain_row(Figure("call", np.array([6.0, 8.0, 10.0]), limit_ms=2.0))
+    row = plain_row(SuiteRow("call", np.array([6.0, 8.0, 10.0]), limit_ms=2.0))
     table, missing = suite_tables({"renderer": {"rows": [row], "facts": {}}}, {"video": "no photo"})
     assert table.lines[0].cells == ("call", "8.00 ms", "7.00 – 9.00", "3", "2.00 ms", "4.0×")
     assert missing.lines[0].cells == ("video", TITLES["video"], "not run: no photo")

@@ -168,7 +168,7 @@ def _section(name: str, options: SuiteOptions, device: torch.device, found: Mapp
     return sections.completion_section(runs, base_scene.gaussians, base_scene.camera, renderer, network, device)
 
 
-def plain_row(row: sections.Figure) -> Record:
+def plain_row(row: sections.SuiteRow) -> Record:
     """A row ready for JSON, with median and quartiles beside the values."""
     low, median, high = np.quantile(row.values, [0.25, 0.5, 0.75]).tolist()
     return {**row._asdict(), "values": row.values.tolist(), "median": median, "quartiles": [low, high]}

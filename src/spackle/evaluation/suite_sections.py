@@ -53,7 +53,7 @@ SPREAD_PX = 1.3
 Peaks = Mapping[str, float]  # a row of the limits → its best run, operations or bytes a millisecond
 
 
-class Figure(NamedTuple):
+class SuiteRow(NamedTuple):
     """One measured figure."""
 
     name: str
@@ -62,7 +62,7 @@ class Figure(NamedTuple):
     limit_ms: float | None = None  # the least time that it needs, at the measured limit that holds for it
 
 
-Section = tuple[list[Figure], dict[str, Any]]  # figures; sizes and settings, ready for JSON
+Section = tuple[list[SuiteRow], dict[str, Any]]  # figures; sizes and settings, ready for JSON
 
 
 def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
@@ -71,11 +71,11 @@ def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) ->
     `share` is of the full sizes.
     """
     side = round(share * MATRIX_SIDE)
-    rows: list[Figure] = []
+    rows: list[SuiteRow] = []
 
     def add(name: str, unit: str, amount: float, task: Task) -> None:
         times = measure(max(runs, LIMIT_RUNS), {name: task}, device)[name, TOTAL]
-        rows.append(Figure(name, amount / (times / MS) / 1e9, unit))
+        rows.append(SuiteRow(name, amount / (times / MS) / 1e9, unit))
 
     for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
         a, b = (torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype) for k in range(2))
@@ -98,10 +98,10 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
     times = measure(runs, tasks)
     call, naive = times["call", TOTAL], times["naive", TOTAL]
     least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that are read once or written once
-    rows = [Figure(stage, times["ours", stage]) for stage in RENDER_STAGES]
-    rows.append(Figure("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
-    rows += [Figure(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
-    rows += [Figure("naive: whole call", naive), Figure("naive over ours", naive / call, "×")]
+    rows = [SuiteRow(stage, times["ours", stage]) for stage in RENDER_STAGES]
+    rows.append(SuiteRow("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
+    rows += [SuiteRow(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
+    rows += [SuiteRow("naive: whole call", naive), SuiteRow("naive over ours", naive / call, "×")]
     return rows, {"gaussians": len(scene), "width": side, "height": side}
 
 
@@ -138,9 +138,9 @@ def completion_section(
         "mask, seeds, network, placing",
         "redraw",
     )
-    rows = [Figure(name, values) for name, values in zip(names, (render, guard, place, redraw), strict=True)]
-    rows.append(Figure("added time", place + redraw))
-    rows.append(Figure("added time over base render", (place + redraw) / render, "×"))
+    rows = [SuiteRow(name, values) for name, values in zip(names, (render, guard, place, redraw), strict=True)]
+    rows.append(SuiteRow("added time", place + redraw))
+    rows.append(SuiteRow("added time over base render", (place + redraw) / render, "×"))
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
     holes = hole_area_ratio(renderer.render(base, camera).alpha)
     return rows, {**facts, "holes": holes, "added": len(completer.complete_view(camera))}
@@ -208,11 +208,11 @@ def video_section(
     whole, each, guards = times["scene", TOTAL], times["scratch", EACH], times["scratch", GUARDS]
     anew = times["scene", LIFT] + each + guards + times["scene", ENCODE]
     kept = anew - guards * (frames - 1) / frames
-    rows = [Figure(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
-    rows += [Figure("one scene: photo to video", whole), Figure(EACH, each), Figure(GUARDS, guards)]
-    rows.append(Figure("frame by frame: photo to video", anew))
-    rows.append(Figure("frame by frame over one scene", anew / whole, "×"))
-    rows.append(Figure("the same, the photo's occlusion guard made once", kept / whole, "×"))
+    rows = [SuiteRow(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
+    rows += [SuiteRow("one scene: photo to video", whole), SuiteRow(EACH, each), SuiteRow(GUARDS, guards)]
+    rows.append(SuiteRow("frame by frame: photo to video", anew))
+    rows.append(SuiteRow("frame by frame over one scene", anew / whole, "×"))
+    rows.append(SuiteRow("the same, the photo's occlusion guard made once", kept / whole, "×"))
     facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
     return rows, {**facts, "width": path[0].width, "height": path[0].height}
 
@@ -236,11 +236,11 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
     flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
     times = measure(runs, {"": whole}, device, warm=flops > 0)
     least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
-    rows = [Figure(FORWARD, times["", FORWARD], limit_ms=least)]
+    rows = [SuiteRow(FORWARD, times["", FORWARD], limit_ms=least)]
     rows += [
-        Figure(UNPROJECT, times["", UNPROJECT]),
-        Figure(SAVE, times["", SAVE]),
-        Figure("photo to scene", times["", TOTAL]),
+        SuiteRow(UNPROJECT, times["", UNPROJECT]),
+        SuiteRow(SAVE, times["", SAVE]),
+        SuiteRow("photo to scene", times["", TOTAL]),
     ]
     facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
     facts |= {"windows": base.windows, "compiled": base.compiled, "compile_problem": base.compile_problem or None}

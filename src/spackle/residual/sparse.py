@@ -195,7 +195,7 @@ def _tight(cells: Mask, crop: Crop) -> Crop:
 
 
 def _cut(blocks: Mask, crop: Crop, reach: int) -> list[Crop]:
-    """A rectangle that its masked blocks fill to all four sides, cut in two as long as all later cuts save something."""
+    """A rectangle that its masked blocks fill to all four sides, cut in two where later cuts save something."""
     own = crop.grown(reach, 1, *blocks.shape).area
     if own <= NEARLY * _least(blocks, crop, reach):
         return [crop]
