@@ -36,12 +36,9 @@ def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
 
 
 class Reporter:
-    """Says what is going on, and how long each stage took; people read it from the standard error.
+    """Logs what is going on, and how long each stage took, to `console` (None: the standard error).
 
-    Args:
-        verbose: say the details too.
-        console: where to say it.
-        as_json: print each result for scripts, a line of JSON on the standard output.
+    `verbose` logs details too; `as_json` prints each result for scripts, a line of JSON on the standard output.
     """
 
     def __init__(self, verbose: bool = False, console: Console | None = None, *, as_json: bool = False) -> None:

@@ -83,8 +83,7 @@ class Scene:
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
         """Cameras through keyframes, see `spackle.formats.load_path`; without a number as many as they take at `fps`.
 
-        Raises:
-            ValueError: the path leads through a view that cannot be.
+        ValueError for a path through a view that cannot be.
         """
         count = frames or keyframes.frame_count(fps)
         return keyframes.cameras(self.camera.even(), count, DepthRange.of(self.base))

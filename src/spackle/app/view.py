@@ -146,7 +146,7 @@ class Teller(Reporter):
     """A reporter that sends the page what the terminal gets."""
 
     def __init__(self, reporter: Reporter, tell: Tell, path: Path | None = None, name: str = "") -> None:
-        """`path` is a file of ours that people know by `name`."""
+        """`path` is an uploaded file, which messages call `name`."""
         super().__init__(reporter.verbose, reporter.console)
         self._tell, self._path, self._name = tell, path, name
 
@@ -163,7 +163,7 @@ class Teller(Reporter):
 
     @contextlib.contextmanager
     def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
-        """As ever; a total of 0 means that it is not known."""
+        """As `Reporter.stage`; a total of 0 is unknown."""
         self._tell({"stage": name, "done": 0, "total": 0})
         with super().stage(name, seconds) as step:
 

@@ -74,9 +74,7 @@ class ViewDataset(IterableDataset[DatasetView]):
             rank: of this process, from 0; torch.distributed's where None.
             ranks: how many there are; likewise.
 
-        Raises:
-            InputError: no dataset, or one that is not finished.
-            ValueError: a rank that there is not.
+        Raises InputError without a finished dataset, and ValueError for a rank outside 0..ranks - 1.
         """
         super().__init__()
         self.files = DatasetFiles(location)
