@@ -19,7 +19,7 @@ import numpy as np
 import pillow_heif
 from numpy.typing import NDArray
 from photos import picture
-from PIL import Image
+from PIL import Image, ImageOps
 
 Codes = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -32,16 +32,6 @@ DYNAMIC = " ".join(
     f'xmlns:{name}="http://ns.google.com/photos/dd/1.0/{name.lower()}/"'
     for name in ("Device", "Container", "Item", "Camera", "DepthMap", "ImagingModel")
 )
-# What EXIF orientations ask for, in Pillow's words.
-TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
 
 
 def codes(width: int = WIDTH // 2, height: int = HEIGHT // 2) -> NDArray[np.uint8]:
@@ -55,8 +45,9 @@ def codes(width: int = WIDTH // 2, height: int = HEIGHT // 2) -> NDArray[np.uint
 
 def upright(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Pixels as the EXIF orientation turns them."""
-    turn = TURNS.get(orientation)
-    return stored if turn is None else np.asarray(Image.fromarray(stored).transpose(turn))
+    image = Image.fromarray(stored)
+    image.getexif()[ORIENTATION] = orientation
+    return np.asarray(ImageOps.exif_transpose(image))
 
 
 def png(values: Codes) -> bytes:
