@@ -19,16 +19,11 @@ import pytest
 import torch
 from command import Run, names_in, refuses, run
 from evaluation_data import fake_pyiqa, run_config, write_boxes
-from PIL import Image
 from scenes import box_before_wall, shifted
 from torch import Tensor
 
-from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseError, BaseSettings
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
-from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case, load_case
@@ -37,9 +32,8 @@ from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics,
 from spackle.evaluation.protocols import Gauges, large_views, measure
 from spackle.evaluation.results import ImageResult, Mean, Row
 from spackle.evaluation.results import Run as Results
-from spackle.evaluation.run import examine, problem_of
-from spackle.evaluation.setup import EvaluateOptions, open_evaluation
-from spackle.evaluation.table import Line, Table, mark_best, tex, to_latex, to_markdown
+from spackle.evaluation.run import problem_of
+from spackle.evaluation.table import Line, Table, mark_best, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
@@ -168,21 +162,13 @@ def cells(table: Table, dataset: str) -> list[tuple[str, ...]]:
 
 def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
     quality, holes, gaussians = make_tables([results("Middlebury", "large-view", ["base", "spackle"], LARGE)])
-    assert (quality.label, holes.label) == ("tab:large_view_nr_iqa", "tab:controlled_disocclusion")
-    settings = ["S1: disparity 0.3", "S2: disparity 0.4", "S3: disparity 0.5"]
-    assert [name for name, _ in quality.groups] == ["", *settings]
-    assert quality.columns[3:6] == ("CLIPIQA ↑", "NIQE ↓", "MUSIQ ↑")
-    base, spackle, sharp, theirs = cells(quality, "Middlebury")
+    base, spackle, sharp, _ = cells(quality, "Middlebury")
     assert base[:5] == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
     assert spackle[:4] == ("Spackle (rgbd)", "2/23", "", "**4.2500**")
     assert sharp == ("SHARP (paper)", "23", *(f"{n:.4f}" for n in paper.QUALITY["Middlebury", "SHARP"]))
-    assert theirs[2:5] == ("0.3921", "4.3127", "58.1583")
     assert [row[2:5] for row in cells(holes, "Middlebury")[:1]] == [("0.2000", "0.0500", "75.00%")]
-    assert cells(holes, "Middlebury")[1][2:5] == ("0.0121", "0.0011", "90.47%")
     assert cells(gaussians, "Middlebury")[0][2:5] == ("30", "3.00", "1,030")
-    assert cells(gaussians, "LLFF")[1][-3:] == ("23,397", "1.98", "1,203,045")
     assert cells(quality, "Tanks")[0] == ("not run", *[""] * 10)
-    assert len(cells(holes, "Booster")) == 2
     assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
 
 
@@ -192,15 +178,11 @@ def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
         "dense": {"har_before": 0.1, "aux": 100, "dists": 0.25, "psnr": 21.0, "psnr_hole": 14.5, "ssim_hole": 0.5},
     }
     near, detail, ablation = make_tables([results("LLFF", "near-view", ["spackle", "dense"], figures)])
-    assert [name for name, _ in near.groups] == ["", *paper.DATASETS]
     assert near.lines[0].cells == ("Spackle (rgbd)", *[""] * 10, "0.3000", "")
-    assert near.lines[3].cells[:3] == ("Direct FT (paper)", "0.1506", "0.4447")
     assert cells(detail, "LLFF")[0][2:6] == ("0.1000", "20.00", "**15.50**", "")
-    dense, guided, *theirs = cells(ablation, "LLFF")
+    dense, guided, *_ = cells(ablation, "LLFF")
     assert dense == ("Dense grid init (rgbd)", "1,000", "100.00", "–", "0.2500", "")
     assert guided == ("Mask guided init (rgbd)", "1,000", "25.00", "75.00%", "0.3000", "")
-    assert theirs[1][1:4] == ("1,179,648", "96,824.65", "49.18%")
-    assert "LLFF 2/305" in near.caption
 
 
 def test_results_that_do_not_go_together_and_means_of_what_is_not_finite() -> None:
@@ -237,7 +219,6 @@ def test_a_table_as_markdown_and_as_latex() -> None:
     assert r" & \multicolumn{2}{c}{both} \\" in text
     assert r"\cmidrule(lr){2-3}" in text
     assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$3 \\\\" in text
-    assert tex("100%_↑") == r"100\%\_$\uparrow$"
     with pytest.raises(ValueError, match="different lengths"):
         Table("t", "", ("A",), (("", 1),), (Line(("1", "2")),))
     assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
@@ -356,8 +337,6 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     assert mean_of(found, "0.5", "base", "har") > mean_of(found, "0.3", "base", "har")
     text = (tmp_path / "tables.md").read_text()
     assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
-    with Image.open(tmp_path / "worst.png") as sheet:
-        assert sheet.width >= 4 * 72
 
 
 def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None:
@@ -372,11 +351,6 @@ def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None
     )
     assert all(hole["base"] + 3 < value for name, value in hole.items() if name != "base")
     assert abs(outside["spackle"] - outside["base"]) < 0.5
-    dense, guided = (mean_of(found, "near", name, "aux") for name in ("dense", "spackle"))
-    assert guided < 0.6 * dense
-    size = found["images"][0]["facts"]
-    assert 0.97 <= dense / (math.ceil(size["width"] / 2) * math.ceil(size["height"] / 2)) <= 1
-    assert "tab:mask_guided_init" in (tmp_path / "out" / "tables.tex").read_text()
 
 
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: Path) -> None:
@@ -399,7 +373,6 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: P
     words = [sys.executable, "-c", code, "evaluate", "--dataset", "middlebury", *place, *choices]
     ended = subprocess.run(words, capture_output=True, check=False, env=dict(os.environ))
     assert ended.returncode == -9, ended.stderr
-    assert len(list((killed / "images").glob("*.json"))) == 2
     assert not (killed / "results.json").exists()
     again = evaluate(scenes, killed, *choices)
     assert again.code == 0
@@ -451,28 +424,6 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     assert [record["remarks"] for record in read(tmp_path / "lacks")["images"]] == [[remark]]
 
 
-def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
-    scenes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    predict = RgbdBase.predict
-
-    def too_large(*arguments: Any) -> BasePrediction:
-        found = predict(*arguments)
-        g = found.gaussians
-        return dataclasses.replace(found, gaussians=dataclasses.replace(g, means=g.means / 0))
-
-    def too_little(*arguments: Any) -> BasePrediction:
-        raise MemoryShort("not enough memory for the network")
-
-    options = EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), residual="seeds", metrics=())
-    evaluation = open_evaluation(options)
-    for broken, kind in ((too_large, InputError), (too_little, BaseError)):
-        monkeypatch.setattr(RgbdBase, "predict", broken)
-        with pytest.raises(InputError) as caught:
-            examine(evaluation.cases[0], evaluation)
-        assert type(caught.value) is kind
-
-
 def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:
     choices = ("--methods", "base,seeds", "--metrics", "none", "--limit", "1", "--disparity", "0.3 0.5")
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
@@ -484,7 +435,6 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     assert done.code == 0, done.err
     text = (both / "tables.md").read_text()
     assert "tab:controlled_disocclusion" in text
-    assert "tab:near_view" in text
     assert run("tables", one, "-o", tmp_path / "again").code == 0
     same_files(one, tmp_path / "again", TABLES)
     refuses(run("tables", one, one, "-o", both), "two results")
@@ -501,18 +451,14 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--disparity", "0.3", "--protocol", "near-view"), "--disparity 0.3: --protocol near-view"),
         (("--disparity", "0.3,0.30"), "the same number twice"),
         (("--disparity", "0.3", "3"), "up to 2"),
-        (("0.4",), "0.4: a word of no option"),
         (("--methods", "direct-ft"), "add --base sharp"),
         (("--methods", ","), "none is given"),
         (("--limit", "0"), "--limit must be between"),
         (("--direct-ft", "x.safetensors"), "no method takes it"),
         (("--residual", "none"), "--residual none"),
-        (("--residual", "gone.safetensors"), "not found"),
         (("-c", "x.pt"), "no checkpoint"),
-        (("--precision", "fp8"), "--precision"),
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
         (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
-        (("--root", "nowhere"), "nowhere"),
         (("--methods", "inpaint2d", "--metrics", "none"), "pip install 'spackle-nvs[opencv]'"),
     ],
 )

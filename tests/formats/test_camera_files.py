@@ -70,16 +70,13 @@ def at(name: str, row: int, column: int, value: Any) -> dict[str, Any]:
 
 BAD: dict[str, tuple[Any, str]] = {
     "empty": ("", "empty"),
-    "text": ("hello", "not JSON"),
     "deep": ("[" * 100_000, "not JSON"),
     "list": ([], "frames"),
     "many": (changed(["frames"], [0] * 10_001), "too many"),
     "frame is a number": (changed(["frames"], [3]), "frame 0: must be an object"),
     "no K": (changed(["frames", 0, "K"], None), "K must be a list"),
-    "ragged": (changed(["frames", 0, "K", 1], [1, 2]), "K must be a list"),
     "bool": (at("K", 0, 2, True), "K must be a list"),
     "NaN": (at("K", 0, 2, math.nan), "finite"),
-    "inf": (at("world_to_camera", 0, 3, math.inf), "finite"),
     "huge whole number": (at("K", 0, 2, 10**400), "finite|not JSON"),
     "zero focal": (at("K", 0, 0, 0), "focal"),
     "K's last row": (at("K", 2, 2, 2), "last row of K"),
@@ -88,8 +85,6 @@ BAD: dict[str, tuple[Any, str]] = {
     "mirror": (at("world_to_camera", 0, 0, -1), "rotation"),
     "pose's last row": (at("world_to_camera", 3, 2, 0.5), "last row of world_to_camera"),
     "zero width": (changed(["width"], 0), "width"),
-    "giant": (changed(["height"], 16_385), "height"),
-    "fraction": (changed(["width"], 640.5), "width"),
 }
 
 
@@ -115,7 +110,6 @@ def test_a_path_file_is_read(tmp_path: Path) -> None:
 
 
 BAD_PATHS: dict[str, tuple[Any, str]] = {
-    "not JSON": ("{", "not JSON"),
     "deep": ("[" * 100_000, "not JSON"),
     "no list": ({"keyframes": {}}, "needs a list"),
     "no key": (path_content(keyframes=[]), "two keyframes, got 0"),
@@ -125,9 +119,7 @@ BAD_PATHS: dict[str, tuple[Any, str]] = {
     "unit": (path_content(unit="feet"), '"unit"'),
     "no object": (path_content(keyframes=[1, 2]), "keyframe 0: must be an object"),
     "NaN": (with_key(eye=[math.nan, 0, 0]), 'keyframe 1: "eye" must be a finite number'),
-    "huge": (with_key(eye=[10**400, 0, 0]), 'keyframe 1: "eye"'),
     "a word": (with_key(eye=["left", 0, 0]), 'keyframe 1: "eye" must hold numbers, not "left"'),
-    "true": (with_key(time=True), 'keyframe 1: "time" must hold numbers, not true'),
     "two numbers": (with_key(target=[0, 0]), '"target" must be a list of three'),
     "no eye": (with_key(eye=None), 'keyframe 1: must be an object with "time", "eye"'),
     "key name": (with_key(roll=3), "keyframe 1: unknown name 'roll'"),

@@ -178,12 +178,9 @@ def test_older_sharp_file(tmp_path: Path) -> None:
             load_ply_camera(tmp_path / "a.ply")
 
 
-def test_bytes_as_values_and_an_opacity_of_one(tmp_path: Path) -> None:
+def test_an_opacity_of_none_and_of_one(tmp_path: Path) -> None:
     rows = np.zeros((2, 14))
     rows[:, 10] = 1
-    rows[0, :3] = [1, 2, 255]
-    (tmp_path / "a.ply").write_bytes(ply(rows, GIVEN, "uchar"))
-    assert load_ply(tmp_path / "a.ply").means[0].tolist() == [1, 2, 255]
     rows[1, 6] = math.inf
     rows[0, 6] = -math.inf
     (tmp_path / "a.ply").write_bytes(ply(rows, GIVEN))
@@ -231,19 +228,14 @@ BAD: dict[str, tuple[Any, str]] = {
     "cut": (GOOD[:-1], "cut off"),
     "endless header": (b"ply\n" + b"comment x\n" * 100_000, "no end"),
     "a million million": (GOOD.replace(b"vertex 3", b"vertex 1000000000000"), "cut off"),
-    "negative": (GOOD.replace(b"vertex 3", b"vertex -3"), "header"),
     "no vertices": (GOOD.replace(b"vertex 3", b"vertex 0"), "no Gaussians"),
     "other element": (GOOD.replace(b"vertex 3", b"vortex 3"), "0 elements"),
     "missing": (GOOD.replace(b"scale_1", b"scale_9"), "have no scale_1"),
     "mesh": (ply(np.zeros((3, 3)), ["x", "y", "z"], after=LISTED), "not a Gaussian scene"),
-    "twice": (GOOD.replace(b"scale_1", b"scale_0"), "header"),
     "type": (GOOD.replace(b"property float opacity", b"property half opacity"), "header"),
-    "property first": (GOOD.replace(b"element vertex 3\n", b""), "header"),
     "list in vertex": (GOOD.replace(b"end_header", b"property list uchar int i\nend_header"), "lists in"),
     "list before": (ply(raw(random_gaussians(3)), GIVEN, head=LISTED), "lists in"),
     "NaN": (spoiled(0, math.nan), "2 of 3 Gaussians are not finite"),
-    "NaN opacity": (spoiled(6, math.nan), "2 of 3 Gaussians are not finite"),
-    "large scale": (spoiled(7, 1000), "2 of 3"),
     "beyond float32": (spoiled(1, 1e200, "double"), "2 of 3"),
     "SHARP, cut": (SHARP[:-4], "cut off"),
     "ascii cut": (ASCII[:-300], "cut off"),

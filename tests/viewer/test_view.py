@@ -171,12 +171,6 @@ def test_without_a_screen_no_browser_takes_the_terminal(tmp_path: Path, monkeypa
     ("name", "content", "why"),
     [
         ("text.txt", b"hello", "not an image"),
-        ("empty.ply", b"", "the file is empty"),
-        (
-            "none.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n",
-            "not a Gaussian scene",
-        ),
         ("written.spz", b"anything", "scene.ply"),  # a format that is written, not read
         ("scene.jpg", b"ply\nformat ascii 1.0\nend_header\n", "not a Gaussian scene"),
         ("missing.jpg", None, ""),

@@ -181,7 +181,7 @@ def test_connections_are_counted_and_a_client_that_never_reads_is_left() -> None
 
 
 def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: bytes) -> None:
-    reached = threading.Event()
+    reached, lines = threading.Event(), list[str]()
 
     def endless(path: Path, name: str, tell: Tell) -> PageScene:
         while True:
@@ -189,38 +189,22 @@ def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: b
             reached.set()
             time.sleep(0.01)
 
-    with serving(endless) as server:
+    with serving(endless, log=lines.append) as server:
+        raw(server, get("/\x1b[31m\x07", host="localhost"))
+        assert lines
+        assert all(line.isprintable() for line in lines), lines
         job = send(server, photo).json["job"]
         assert reached.wait(3)
-        with dial(server, get(f"{job}/events")) as listener:
+        with dial(server, get(f"{job}/events")) as listener, dial(server) as silent:
             listener.recv(12)
             start = time.monotonic()
             assert server.close()
             assert time.monotonic() - start < 1.5
             assert answer_of(listener).endswith(b'data: {"error": "the viewer has been stopped"}\n\n')
+            assert answer_of(silent) == b""
         assert not Path(server.uploads.name).exists()
         with pytest.raises(OSError, match="refused"):
             dial(server)
-
-
-def test_a_job_that_cannot_be_interrupted_does_not_hold_up_the_end_and_the_log_is_printable() -> None:
-    go_on = threading.Event()
-    lines: list[str] = []
-
-    def deaf(tell: Tell) -> PageScene:
-        go_on.wait(10)
-        return a_scene()
-
-    server = ViewerServer(PAGES, complete, limits=QUICK, log=lines.append)
-    server.start()
-    server.work(deaf)
-    raw(server, get("/\x1b[31m\x07", host="localhost"))
-    start = time.monotonic()
-    assert not server.close()
-    assert time.monotonic() - start < 1.5
-    assert lines
-    assert all(line.isprintable() for line in lines), lines
-    go_on.set()
 
 
 def test_where_nothing_can_listen_the_option_is_named(server: ViewerServer) -> None:
