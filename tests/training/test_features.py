@@ -140,31 +140,19 @@ def test_networks_are_frozen_and_pass_gradients_on(kind: type[ResNet50 | Squeeze
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
-def test_a_network_wants_its_file(tmp_path: Path) -> None:
+def test_what_is_not_a_networks_weights_is_refused(
+    resnet: dict[str, Tensor], squeezed: dict[str, np.ndarray], tmp_path: Path
+) -> None:
     assert load_features("none", None) is None
     assert "name their file" in refusal("resnet50", None)
     assert "no such weight file" in refusal("squeezenet", tmp_path / "missing.npz")
-
-
-@pytest.mark.parametrize("name", ["resnet50", "squeezenet"])
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"\x80\x02cos\nsystem\n."])
-def test_a_broken_file_is_refused(name: str, content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "weights").write_bytes(content)
-    assert "give" in refusal(name, tmp_path / "weights")
-
-
-def test_resnet_refuses_what_is_not_its_weights(resnet: dict[str, Tensor], tmp_path: Path) -> None:
     path = tmp_path / "other.pth"
-    for content, words in [
-        ({name: value for name, value in resnet.items() if name != "bn1.bias"}, "('bn1.bias' is missing)"),
-        ([1, 2], "more than named tensors"),
-        ({"conv1.weight": resnet["conv1.weight"].to_sparse()}, "more than named tensors"),
-    ]:
-        torch.save(content, path)
-        assert words in refusal("resnet50", path)
-
-
-def test_squeezenet_refuses_what_is_not_its_weights(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
+    path.write_bytes(b"\x80\x02cos\nsystem\n.")  # a pickle that would run a command
+    assert "cannot be read" in refusal("resnet50", path)
+    torch.save({name: value for name, value in resnet.items() if name != "bn1.bias"}, path)
+    assert "('bn1.bias' is missing)" in refusal("resnet50", path)
+    torch.save([1, 2], path)
+    assert "more than named tensors" in refusal("resnet50", path)
     path = tmp_path / "other.npz"
     first = squeezed["conv1.w"]
     for change, words in [

@@ -63,17 +63,14 @@ def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path:
     [
         ("optim: {stepps: 3}", "", "optim.stepps is unknown; there are lr, min_lr"),
         ("optim: {steps: many}", "", "optim.steps cannot be 'many'; it takes a whole number from 1 to"),
-        ("optim: {steps: true}", "", "optim.steps cannot be 'True'"),
         ("optim: {lr: .nan}", "", "optim.lr cannot be 'nan'; it takes a number above 0, up to 1"),
         ("optim: {precision: fp8}", "", "optim.precision cannot be 'fp8'; it takes auto, fp32, bf16"),
-        ("loss: {feature_size: 3}", "", "loss.feature_size cannot be '3'; it takes a whole number from 64 to 4096, or"),
         ("data: {photos: 3}", "", "data.photos cannot be '3'; it takes a path, or null"),
         ("data: {disparity: [0.1]}", "", "data.disparity cannot be '[0.1]'; it takes a list of two numbers, each from"),
         ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px is missing"),
         ("data: {rgbd: kitchen}", "", "data.rgbd cannot be 'kitchen'; it takes a list"),
         ("[1, 2]", "", "the recipe cannot be '[1, 2]'; it takes keys data, loss, optim, run, init"),
         ("a: [", "", "not YAML"),
-        (PLAIN, "optim.stepps=3", "optim.stepps=3: optim.stepps is unknown"),
         (PLAIN, "quick", "'quick': neither an option nor key=value"),
         (PLAIN, "optim.steps.a=1", "optim.steps cannot be"),
         ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd has 0 entries"),
@@ -90,10 +87,7 @@ def test_what_cannot_be_is_named_with_its_file_or_option(tmp_path: Path, text: s
     assert named in str(error.value)
     assert str(tmp_path / "recipe.yaml") in str(error.value) or (override and override in str(error.value))
     assert "\n" not in str(error.value)
-
-
-def test_a_missing_recipe_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cpus: no such recipe; there are cpu, direct_ft, paper, reverse_view"):
+    with pytest.raises(InputError, match="cpus: no such recipe"):
         load_recipe(Recipe, "cpus")
 
 
@@ -115,7 +109,6 @@ def test_the_rate_warms_up_and_falls_as_a_cosine_and_the_average_forgets_quickly
     assert learning_rate(9, optim) == pytest.approx(0.55)
     assert learning_rate(13, optim) == pytest.approx(0.1 + 0.45 * (1 + math.cos(0.9 * math.pi)))
     assert learning_rate(99, optim) == pytest.approx(0.1)
-    # The average forgets quickly at first.
     assert ema_decay(0, 0.9) == pytest.approx(0.1)
     assert ema_decay(10_000, 0.9) == 0.9
     assert ema_decay(0, 0) == 0
@@ -128,9 +121,7 @@ def test_an_epoch_is_a_permutation_whatever_the_batch(count: int, batch: int) ->
     assert all(sorted(epoch) == list(range(count)) for epoch in epochs)
     assert count == 3 or epochs[0] != epochs[1]
     assert picks != [pick for step in range(count) for pick in samples_of_step(step, count, batch, seed=4)]
-
-
-def test_processes_share_one_batch() -> None:
+    # Processes share one batch.
     whole = samples_of_step(5, 100, 8, seed=1)
     parts = [samples_of_step(5, 100, 8, seed=1, rank=rank, ranks=4) for rank in range(4)]
     assert [pick for part in parts for pick in part] == whole

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,14 @@ from spackle.training.sources import frame_view, load_pair, reverse_view, right_
 
 CPU = CpuRenderer()
 RIM_PX = 2  # blobs are wider than pixels: what stands in front hides so much more than a line says, but not less
+
+
+def named_tensors(value: object, prefix: str = "") -> dict[str, Tensor]:
+    if isinstance(value, Tensor):
+        return {prefix: value}
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
+    parts = (named_tensors(getattr(value, f.name), f"{prefix}.{f.name}".strip(".")) for f in fields)
+    return {name: tensor for part in parts for name, tensor in part.items()}
 
 
 # Geometry, once more ------------------------------------------------------------------------------
@@ -140,20 +147,8 @@ def test_a_viewer_in_the_photos_place_leaves_no_hole_and_one_turned_away_nothing
     assert torch.equal(views[0].target, scene.rgb)
     assert not any(random_crops(view, np.random.default_rng(0), 3, 16) for view in views)
     assert not (reverse(box, box.camera).hole & ~outline(box)).any()
-    for width, height in ((31, 64), (64, 31)):  # too small for a crop
-        scene = box_before_wall(width=width, height=height)
-        assert not random_crops(reverse(scene, shifted(scene.camera, 0.35)), np.random.default_rng(0), 3, 16)
-
-
-def named_tensors(value: object, prefix: str = "") -> dict[str, Tensor]:
-    if isinstance(value, Tensor):
-        return {prefix: value}
-    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
-    parts = (named_tensors(getattr(value, f.name), f"{prefix}.{f.name}".strip(".")) for f in fields)
-    return {name: tensor for part in parts for name, tensor in part.items()}
-
-
-# What is seen -------------------------------------------------------------------------------------
+    scene = box_before_wall(width=31, height=64)  # too small for a crop
+    assert not random_crops(reverse(scene, shifted(scene.camera, 0.35)), np.random.default_rng(0), 3, 16)
 
 
 PLANES = [(3.0, 3.001, 1), (2.0, 6.0, 1), (2.0, 5.0, 0), (1.5, 5.0, 0)]
@@ -216,13 +211,12 @@ def test_a_crop_is_a_part_of_the_view_and_so_is_what_completes_it(whole: Sample,
     assert torch.equal(crop.seeds.uv[0, 0], torch.tensor([1.0, 1.0]))
     assert torch.equal(crop.seeds.uv[-1, -1], torch.tensor([2.0 * CROP - 1, 2.0 * CROP - 1]))
     assert (crop.camera.width, crop.camera.height) == (2 * CROP, 2 * CROP)
-    # It needs fewer Gaussians for the same picture.
+    # It needs fewer Gaussians for the same picture, and completed, it is the crop of the completed view.
     assert len(crop.base) < 0.7 * len(whole.base)
     inside = crop.tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: CELL * CROP, : CELL * CROP]
     for name, tensor in named_tensors(CPU.render(crop.base, crop.camera, tiles=crop.tiles)).items():
         truth = getattr(whole.rendering, name)[part]
         assert (tensor - truth).abs()[inside].max() < (1e-4 if name == "depth" else 1e-5)
-    # Completed, it is the crop of the completed view.
     chosen = training_cells(crop.cues)
     masked = torch.zeros_like(whole.cues.mask)
     masked[cells] = chosen
@@ -355,32 +349,26 @@ def test_a_sample_comes_back_from_its_file_unless_that_is_damaged(tmp_path: Path
             load_sample(path)
 
 
-class Boxes:
-    """Views of a box from a random place, quickly made; some of them have no hole."""
-
-    def __init__(self, killed_at: int | None = None) -> None:
-        self.asked: list[float] = []
-        self.killed_at = killed_at
-
-    def __call__(self, rng: np.random.Generator) -> Sample:
-        if len(self.asked) == self.killed_at:
-            raise KeyboardInterrupt
-        self.asked.append(float(rng.uniform(-0.4, 0.4)))
-        scene = box_before_wall()
-        return reverse(scene, shifted(scene.camera, self.asked[-1]))
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[float]]:
-    """The samples of five views, and which views were made for them."""
-    boxes, warnings = Boxes(killed_at), list[str]()
-    supply = Supply(DataRecipe(crops=2, cells=16), [boxes], [1.0], [])
+    """The samples of five views of a box, some of which have no hole, and from where these views were made."""
+    asked: list[float] = []
+
+    def view(rng: np.random.Generator) -> Sample:
+        if len(asked) == killed_at:
+            raise KeyboardInterrupt
+        asked.append(float(rng.uniform(-0.4, 0.4)))
+        scene = box_before_wall()
+        return reverse(scene, shifted(scene.camera, asked[-1]))
+
+    warnings: list[str] = []
+    supply = Supply(DataRecipe(crops=2, cells=16), [view], [1.0], [])
     files = supply.fill(folder, 7, 5, lambda done, total: None, warnings.append)
     assert not warnings
-    return [file.name for file in files], boxes.asked
+    return [file.name for file in files], asked
 
 
 def test_a_killed_fill_leaves_whole_files_and_goes_on_to_the_same_ones(tmp_path: Path) -> None:
@@ -424,27 +412,25 @@ def test_random_crops_have_holes_and_lie_within_the_picture(width: int, height: 
 # Sources ------------------------------------------------------------------------------------------
 
 
-def write_frame(folder: Path, unit_m: float, focal: float, width: int = 96, height: int = 72) -> Path:
-    """A depth camera's two files, with some depth unknown."""
-    stored = np.round(metres(width, height) / unit_m).astype(np.uint16)
-    stored[2:5, 2:5], stored[60:63, 80:83] = 0, 65535
-    Image.fromarray(stored).save(folder / "frame-0.depth.png")
-    color = folder / "frame-0.color.jpg"
-    Image.fromarray(picture(width, height)).save(color, quality=95)
-    return color
+def pixels(photo: Path) -> Tensor:
+    with Image.open(photo) as image:
+        return torch.from_numpy(np.array(image)).float() / 255
 
 
 @pytest.mark.parametrize("unit_m", [0.001, 0.0002])
 def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float) -> None:
-    color = write_frame(tmp_path, unit_m, 80.0)
+    stored = np.round(metres(96, 72) / unit_m).astype(np.uint16)
+    stored[2:5, 2:5], stored[60:63, 80:83] = 0, 65535  # unknown
+    Image.fromarray(stored).save(tmp_path / "frame-0.depth.png")
+    color = tmp_path / "frame-0.color.jpg"
+    Image.fromarray(picture(96, 72)).save(color, quality=95)
 
     def view() -> Sample:
         return frame_view(np.random.default_rng(1), [color], 80.0, unit_m, (0.3, 0.6), CPU)
 
     sample = view()
     assert all(map(torch.equal, tensors_of(sample), tensors_of(view())))
-    with Image.open(color) as image:
-        assert torch.equal(sample.target, torch.from_numpy(np.array(image)).float() / 255)
+    assert torch.equal(sample.target, pixels(color))
     assert sample.camera.focal == (80.0, 80.0)
     depth = torch.from_numpy(metres(96, 72))
     seen = ~grow(sample.hole, 2)
@@ -456,9 +442,6 @@ def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float
     assert sample.hole.any()
     write_depth(tmp_path / "frame-0.depth.png", metres(40, 72))
     with pytest.raises(InputError, match=r"is 40×72 but photo .* is 96×72"):
-        view()
-    (tmp_path / "frame-0.depth.png").unlink()
-    with pytest.raises(InputError, match=r"frame-0\.depth\.png: no such depth map"):
         view()
 
 
@@ -478,7 +461,6 @@ def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any
         front, back = paint(box, (0.8, 0.3, 0.2)), paint(wall, (0.2, 0.4, 0.7))
         return torch.where(there[..., None], front, back), there
 
-    folder.mkdir(parents=True, exist_ok=True)
     left, there = photo(False)
     for name, image in (("left", left), ("right", photo(True)[0])):
         Image.fromarray((255 * image).round().byte().numpy()).save(folder / f"{name}.png")
@@ -494,8 +476,7 @@ def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tm
     (folder / "maps").mkdir()
     (folder / "disparity.npy").rename(folder / "maps" / "left.npy")
     sample = right_view(np.random.default_rng(0), [folder], CPU)
-    with Image.open(folder / "right.png") as image:
-        right = torch.from_numpy(np.array(image)).float() / 255
+    right = pixels(folder / "right.png")
     assert torch.equal(sample.target, right)
     covered = ~grow(sample.hole)
     assert psnr(sample.rendering.rgb[covered], right[covered]) > 30
@@ -511,8 +492,7 @@ def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tm
     assert not (~sample.hole & ~grow(~expected)).any()
     assert sample.hole[26:46, 57:61].all()
     sample = stereo_view(np.random.default_rng(0), [folder], (0.3, 0.6), CPU)
-    with Image.open(folder / "left.png") as image:
-        assert torch.equal(sample.target, torch.from_numpy(np.array(image)).float() / 255)
+    assert torch.equal(sample.target, pixels(folder / "left.png"))
     assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
     covered = ~grow(sample.hole)
     covered[21:51, 37:67] = False  # the box's outline is where a base is not sharp
@@ -525,24 +505,18 @@ def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tm
     [
         ({"left": None}, "no stereo pair"),
         ({"focal_px": 10**400}, "no stereo pair"),
-        ({"focal_px": 0}, "focal_px must be a positive number"),
-        ({"cx": math.nan}, "must be finite numbers"),
-        ({"right": "nowhere.png"}, "nowhere.png: no such photo"),
         ({"right": "small.png"}, "the two photos differ in size"),
         ({"disparity": "narrow.npy"}, "narrow.npy is 20×72 but photo"),
-        *((text, "no stereo pair") for text in (b"[]", b'{"left": ', b"[" * 100_000, b"\xff\xfe\x00", None)),
     ],
 )
-def test_a_pair_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any] | bytes | None, said: str) -> None:
-    folder = write_stereo(tmp_path, **(changes if isinstance(changes, dict) else {}))
-    if not isinstance(changes, dict):
-        (folder / "scene.json").unlink()
-    if isinstance(changes, bytes):
-        (folder / "scene.json").write_bytes(changes)
+def test_a_pair_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    folder = write_stereo(tmp_path, **changes)
     write_photo(folder / "small.png", 32, 24)
     np.save(folder / "narrow.npy", np.full((72, 20), 4, np.float32))
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=said) as caught:
         load_pair(folder)
-    assert said in str(caught.value)
     assert str(folder) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    for damaged in (b'{"left": ', b"[" * 100_000, b"\xff\xfe\x00"):
+        (folder / "scene.json").write_bytes(damaged)
+        with pytest.raises(InputError, match="no stereo pair"):
+            load_pair(folder)
