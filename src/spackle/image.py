@@ -188,7 +188,10 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # broken EXIF, 90 megapixels: not worth a line
-            _register_heif()
+            if "HEIF" not in Image.OPEN:
+                import pillow_heif
+
+                pillow_heif.register_heif_opener()
             with Image.open(path) as image:
                 if image.width * image.height > MAX_PIXELS:
                     megapixels = image.width * image.height / 1e6
@@ -237,13 +240,6 @@ def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | No
             raise InputError(f"{name} must be a positive number, got {value}")
         if name == "--fov" and value >= 180:
             raise InputError(f"--fov must lie between 0 and 180 degrees, got {value}")
-
-
-def _register_heif() -> None:
-    if "HEIF" not in Image.OPEN:
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
 
 
 def _upright(image: Image.Image) -> Image.Image:

@@ -94,18 +94,12 @@ def _description(arrays: dict[str, NDArray[Any]], camera: Camera | None, base_co
         "buffers": [{"byteLength": offset}],
     }
     if camera is not None:
-        pose = _pose(camera)
+        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+        matrix = flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
+        pose = (matrix.T.flatten() + 0.0).tolist()  # camera to world, column by column, without -0
         nodes.append({"name": "photo", "camera": 0} | ({} if pose == UNMOVED else {"matrix": pose}))
         (fx, fy), width, height = camera.focal, camera.width, camera.height
         lens = {"yfov": 2 * math.atan2(height, 2 * fy), "aspectRatio": width * fy / (height * fx), "znear": NEAR_PLANE}
         extras = {"K": camera.K.tolist(), "width": width, "height": height}  # where the middle lies glTF cannot say
         description["cameras"] = [{"type": "perspective", "perspective": lens, "extras": extras}]
     return description
-
-
-def _pose(camera: Camera) -> list[float]:
-    """Camera to world, y up and z backward on both sides, column by column."""
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    matrix = flip @ torch.linalg.inv(camera.world_to_camera.detach().to("cpu", torch.float64)) @ flip
-    numbers: list[float] = (matrix.T.flatten() + 0.0).tolist()  # no -0
-    return numbers

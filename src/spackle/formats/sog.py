@@ -64,7 +64,11 @@ def encode_sog(gaussians: Gaussians) -> bytes:
         "sh0": {"codebook": color_book.tolist(), "files": ["sh0.webp"]},
     }
     files = {name: _webp(np.concatenate(parts, axis=1), width) for name, parts in pictures.items()}
-    return _zipped({"meta.json": json.dumps(meta, allow_nan=False).encode(), **files})
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:  # nothing is packed twice
+        for name, content in {"meta.json": json.dumps(meta, allow_nan=False).encode(), **files}.items():
+            archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
+    return buffer.getvalue()
 
 
 def codebook(values: Floats) -> tuple[Floats, NDArray[np.uint8]]:
@@ -106,13 +110,4 @@ def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
     pixels[: len(rgba)] = rgba
     buffer = io.BytesIO()
     Image.fromarray(pixels.reshape(height, width, 4)).save(buffer, "WEBP", **EFFORT)
-    return buffer.getvalue()
-
-
-def _zipped(files: dict[str, bytes]) -> bytes:
-    """A zip archive that packs nothing twice."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in files.items():
-            archive.writestr(zipfile.ZipInfo(name, EPOCH), content)
     return buffer.getvalue()

@@ -152,17 +152,13 @@ def single_html(scene: PageScene) -> bytes:
     data = data.replace("<", "\\u003c")  # nothing in a name may end the element
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
-    page = page.replace(STYLE, f"{_policy(css, js)}\n{style}").replace(SCRIPT, f"{embedded}\n{script}")
-    return page.encode()
-
-
-def _policy(css: str, js: str) -> str:
-    """Only these scripts and styles run, and nobody is asked for anything."""
-    policy = (
+    policy = (  # only these scripts and styles run, and the page fetches nothing
         f"default-src 'none'; script-src {_digest(js)} 'wasm-unsafe-eval'; style-src {_digest(css)}; worker-src blob:; "
         "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
     )
-    return f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+    page = page.replace(STYLE, f"{meta}\n{style}").replace(SCRIPT, f"{embedded}\n{script}")
+    return page.encode()
 
 
 def _gzipped(data: bytes) -> bytes:

@@ -96,10 +96,6 @@ def _called(folder: Path, scenes: set[str]) -> bool:
     return not scenes.isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
 
 
-def _is_llff(folder: Path) -> bool:
-    return _has(folder, "poses_bounds.npy", "sparse") and not _called(folder, TANKS_SCENES)
-
-
 def _is_tanks(folder: Path) -> bool:
     other = _has(folder, "poses_bounds.npy") or _called(folder, LLFF_SCENES)
     return _has(folder, "sparse", "dense/sparse") and (_called(folder, TANKS_SCENES) or not other)
@@ -142,6 +138,9 @@ LAYOUTS = {
         _is_middlebury,
         skip=frozenset({"test", "testF", "testH", "testQ"}),
     ),
-    "llff": Layout("SCENE/poses_bounds.npy or SCENE/sparse/0 beside SCENE/images_4 or SCENE/images", _is_llff),
+    "llff": Layout(
+        "SCENE/poses_bounds.npy or SCENE/sparse/0 beside SCENE/images_4 or SCENE/images",
+        lambda folder: _has(folder, "poses_bounds.npy", "sparse") and not _called(folder, TANKS_SCENES),
+    ),
     "tanks": Layout("SCENE/sparse/0 beside SCENE/images", _is_tanks),
 }
