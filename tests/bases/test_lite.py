@@ -19,13 +19,11 @@ from spackle.bases.lite import (
     INPUT_SCALES,
     SCALE,
     SHIPPED,
-    STRIDE,
     LiteBase,
     LiteNet,
     Size,
     load_networks,
     merged,
-    network_size,
 )
 from spackle.bases.protocol import NEAREST_M
 from spackle.errors import InputError
@@ -91,20 +89,10 @@ def test_the_same_photo_gives_the_same_scene_and_its_colours() -> None:
     assert float(z.max()) < NEAREST_M * FARTHEST * 10  # what is taken for sky stands behind all else
 
 
-@pytest.mark.parametrize(("height", "width"), [(480, 640), (1536, 864), (40, 3000), (17, 17), (1, 1)])
-def test_the_network_sees_any_photo_at_its_own_size_and_nearly_in_its_shape(height: int, width: int) -> None:
-    for pixels in {scale.pixels for scale in INPUT_SCALES}:
-        tall, wide = network_size(height, width, pixels)
-        assert tall % STRIDE == 0
-        assert wide % STRIDE == 0
-        if 0.5 < height / width < 2:
-            assert 0.65 * pixels < tall * wide < 1.4 * pixels
-            assert abs(tall - (pixels * height / width) ** 0.5) <= STRIDE / 2
-            assert abs(wide - (pixels * width / height) ** 0.5) <= STRIDE / 2
-            assert 0.75 < (tall / wide) / (height / width) < 1.33
-    small = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
-    if height * width < 200_000:
-        assert bool(torch.isfinite(shipped().inverse_depth(small)).all())
+@pytest.mark.parametrize("shape", [(40, 3000), (17, 17), (1, 1)])
+def test_a_photo_of_any_shape_has_finite_depth(shape: tuple[int, int]) -> None:
+    small = torch.rand(*shape, 3, generator=torch.Generator().manual_seed(0))
+    assert bool(torch.isfinite(shipped().inverse_depth(small)).all())
 
 
 def test_stored_weights_are_small_and_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
@@ -138,20 +126,6 @@ def test_each_look_is_by_its_own_network_and_one_network_alone_does_without_the_
     first = [number for number, scale in enumerate(INPUT_SCALES) if scale.network == 0]
     expected = merged(seen[first], [INPUT_SCALES[number].tilt for number in first]).exp()
     torch.testing.assert_close(alone[0].inverse_depth(rgb), expected)
-
-
-@pytest.mark.parametrize("shape", [(48, 64), (80, 48)])
-def test_a_look_without_a_say_in_the_tilt_adds_its_outlines_alone(shape: tuple[int, int]) -> None:
-    height, width = shape
-    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
-    post = torch.zeros(shape)
-    post[:, width // 2 - 1 : width // 2 + 1] = 0.5
-    level, steep = torch.zeros(shape), 3 * y + x
-    torch.testing.assert_close(merged(torch.stack([level, steep]), [True, True]), steep / 2, rtol=0, atol=1e-5)
-    inner = (slice(height // 5, -height // 5), slice(width // 5, -width // 5))  # bicubic flattens the ends
-    assert float(merged(torch.stack([level, steep]), [True, False])[inner].abs().max()) < 0.15
-    seen = merged(torch.stack([level, steep + post]), [True, False])[inner]
-    assert 0.15 < float((seen.amax(1) - seen.median(1).values).min()) < 0.35
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ from spackle.bases.lift import RgbdBase, lift
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
-from spackle.errors import InputError
 from spackle.fill import far_fill
 from spackle.image import Photo
 from spackle.render import CpuRenderer
@@ -69,22 +68,15 @@ def on_plane(scene: Scene, camera: Camera) -> Tensor:
     return eye + ray * ((1 - normal @ eye) / (ray @ normal))[..., None]
 
 
-def test_one_gaussian_for_each_pixel_in_order_then_one_for_each_cell() -> None:
-    scene = box_before_wall()
-    base = scene.base()
-    height, width = scene.depth.shape
+def test_one_gaussian_for_each_pixel_in_order_then_one_behind_each_cell_of_the_farthest_ones_colour() -> None:
+    scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
+    base, (height, width) = scene.base(), scene.depth.shape
     assert len(base) == height * width + height * width // 4
-    front = base.select(slice(0, height * width))
+    front, backing = base.select(slice(0, height * width)), base.select(slice(height * width, None))
     uv, z = scene.camera.project(front.means)
     torch.testing.assert_close(uv, scene.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
     torch.testing.assert_close(z, scene.depth.reshape(-1))
     assert torch.equal(front.colors, srgb_to_linear(scene.rgb).reshape(-1, 3))
-
-
-def test_the_backing_stands_behind_each_of_its_pixels_and_has_the_farthest_ones_colour() -> None:
-    scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
-    height, width = scene.depth.shape
-    backing = scene.base().select(slice(height * width, None))
     uv, z = scene.camera.project(backing.means)
     torch.testing.assert_close(uv, scene.camera.pixel_centers(stride=2).reshape(-1, 2), rtol=0, atol=1e-3)
     farthest = max_pool2d(scene.depth[None, None], 2)[0, 0].reshape(-1)
@@ -167,11 +159,6 @@ def test_filling_of_missing_depth_matches_dijkstra(seed: int) -> None:
     valid = torch.rand(9 + seed, 11, generator=generator) < 0.25
     found = fill_missing(torch.where(valid, inverse, 0.0), rgb, valid)
     torch.testing.assert_close(found, plain_missing(inverse, rgb, valid))
-
-
-def test_a_depth_map_of_another_shape_than_the_photos_is_refused() -> None:
-    with pytest.raises(InputError, match="synthetic"):
-        RgbdBase(wall(width=64, height=64).depth_map).predict(photo_of(wall()))
 
 
 def test_the_lens_is_the_calibrations_where_there_is_one_and_else_the_photos() -> None:

@@ -25,7 +25,6 @@ from spackle.bases.sharp.layers import (
     FULL_WINDOWS,
     HALF_WINDOWS,
     TINY,
-    WINDOWS,
     GroupNorm,
     cut,
     merge,
@@ -100,14 +99,12 @@ def test_bf16_draws_the_same_picture_to_45_db() -> None:
 
 @pytest.mark.parametrize("batch", [4, 35])
 def test_the_number_of_windows_at_once_changes_nothing(batch: int) -> None:
-    network, seen = micro_network(), []
+    network = micro_network()
     with torch.inference_mode():
         expected = network(waves(MICRO.side), 0.8, batch=5)
-        found = network(waves(MICRO.side), 0.8, batch, lambda done, total: seen.append((done, total)))
+        found = network(waves(MICRO.side), 0.8, batch)
     torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
-    assert seen[-1] == (WINDOWS, WINDOWS)
-    assert len(seen) == -(-WINDOWS // batch)
 
 
 @pytest.mark.parametrize(("side", "count"), [(1536, FULL_WINDOWS), (768, HALF_WINDOWS)])
@@ -132,22 +129,10 @@ def test_group_norm_is_exact_over_half_a_million_pixels(channels_last: bool) -> 
     assert found.shape == x.shape
 
 
-def test_without_deltas_gaussians_lie_on_the_nearest_depth_of_their_cells_with_its_colour() -> None:
-    torch.manual_seed(0)
-    image, depth = torch.rand(1, 3, 8, 8), 2 + torch.rand(1, 2, 8, 8)
-    for extreme in (1e-8, 1e9):  # stays finite
-        odd = compose(make_start(image, torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4))
-        assert all(bool(torch.isfinite(t).all()) for t in odd.tensors)
-    gaussians = compose(make_start(image, depth), torch.zeros(14, 2, 4, 4))
-    z = depth.reshape(2, 4, 2, 4, 2).amin((2, 4)).flatten()
-    torch.testing.assert_close(gaussians.means[:, 2], z, rtol=5e-3, atol=0)  # farther than it is by 0.1 % a unit
-    x = gaussians.means[:, 0] / gaussians.means[:, 2]
-    torch.testing.assert_close(x.reshape(2, 4, 4)[1, 3], torch.tensor([-0.75, -0.25, 0.25, 0.75]))
-    torch.testing.assert_close(gaussians.scales, (gaussians.means[:, 2:] / 2).expand(-1, 3))
-    mean = spackle.color.srgb_to_linear(image.reshape(3, 4, 2, 4, 2).mean((2, 4))).flatten(1).T
-    torch.testing.assert_close(gaussians.colors, mean.repeat(2, 1), rtol=1e-4, atol=1e-5)
-    assert torch.equal(gaussians.opacities, torch.full((32,), 0.5))
-    assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(32, 4))
+@pytest.mark.parametrize("extreme", [1e-8, 1e9])
+def test_extreme_depths_make_finite_gaussians(extreme: float) -> None:
+    odd = compose(make_start(waves(8), torch.full((1, 2, 8, 8), extreme)), torch.zeros(14, 2, 4, 4))
+    assert all(bool(torch.isfinite(t).all()) for t in odd.tensors)
 
 
 def odd_photos() -> dict[str, Image.Image]:

@@ -62,15 +62,6 @@ def test_both_kinds_of_file_give_the_same_network(
     assert not any("depth_alignment" in name or ".head.weight" in name for name in network.state_dict())
 
 
-def test_in_bf16_the_heavy_parts_are_halved_and_the_sensitive_ones_are_not(tmp_path: Path) -> None:
-    tensors = load_network(write_tiny(tmp_path / "w.pt"), torch.bfloat16).state_dict()
-    exact = {name for name, tensor in tensors.items() if tensor.dtype == FP32}
-    for part in ("patch_embed.proj", "norm1", "gamma", "pos_embed", "head.4", "prediction_head", "image_encoder.conv"):
-        assert any(part in name for name in exact), part
-    for part in ("attn.qkv", "mlp.fc1", "upsample0", "resnet1", "texture_head"):
-        assert not any(part in name for name in exact), part
-
-
 def test_a_pickle_with_code_is_refused_and_not_run(tmp_path: Path, weights: dict[str, Tensor]) -> None:
     mark = tmp_path / "ran"
     torch.save({**weights, "more": Bomb(mark)}, tmp_path / "zip.pt")
@@ -93,28 +84,22 @@ def test_a_cut_file_is_refused(tmp_path: Path, suffix: str, share: float) -> Non
     refused(path)
 
 
-def test_a_zip_whose_tensor_is_cut_is_refused(tmp_path: Path) -> None:
-    """A whole archive whose entries are shorter than the tensors need."""
-    source = write_tiny(tmp_path / "whole.pt")
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(tmp_path / "cut.pt", "w") as new:
-        for entry in old.infolist():
-            data = old.read(entry)
-            new.writestr(entry.filename, data[: len(data) // 2] if "/data/" in entry.filename else data)
-    refused(tmp_path / "cut.pt")
-
-
-def repacked(source: Path, target: Path, method: int = zipfile.ZIP_STORED, byteorder: bytes = b"little") -> Path:
-    """What a checkpoint becomes when another program packs it."""
+def repacked(
+    source: Path, target: Path, method: int = zipfile.ZIP_STORED, byteorder: bytes = b"little", share: float = 1
+) -> Path:
+    """What a checkpoint becomes when another program packs it, of each tensor a share."""
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", method) as new:
         for entry in old.infolist():
-            new.writestr(entry.filename, byteorder if entry.filename.endswith("/byteorder") else old.read(entry))
+            data = byteorder if entry.filename.endswith("/byteorder") else old.read(entry)
+            new.writestr(entry.filename, data[: int(share * len(data))] if "/data/" in entry.filename else data)
     return target
 
 
-def test_a_zip_that_was_compressed_or_is_big_endian_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
+def test_a_zip_that_was_compressed_cut_or_is_big_endian_is_refused(tmp_path: Path, weights: dict[str, Tensor]) -> None:
     path = write_tiny(tmp_path / "w.pt")
     packed = repacked(path, tmp_path / "packed.pt", zipfile.ZIP_DEFLATED)
     assert "zipped again by another program" in refused(packed)
+    refused(repacked(path, tmp_path / "cut.pt", share=0.5))
     assert "big-endian" in refused(repacked(path, tmp_path / "turned.pt", byteorder=b"big"))
     assert "endian" in refused(repacked(path, tmp_path / "turned.pt", byteorder=b"middle"))
     network = load_network(repacked(path, tmp_path / "stored.pt"), FP32)  # packed again without compression
@@ -128,11 +113,6 @@ def test_a_zip_with_one_changed_byte_is_refused(tmp_path: Path, weights: dict[st
     content[number + 40] ^= 1  # a last digit
     path.write_bytes(content)
     assert "damaged at " in refused(path)
-    torch.serialization.set_crc32_options(False)
-    try:
-        load_network(write_tiny(path), FP32)  # without sums there is nothing to hold it against
-    finally:
-        torch.serialization.set_crc32_options(True)
 
 
 def files_of_other_kinds() -> dict[str, bytes | None]:

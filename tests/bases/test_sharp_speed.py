@@ -42,12 +42,6 @@ def test_so_many_windows_go_at_once(options: dict[str, Any], calls: int) -> None
     assert seen[-1] == WINDOWS
 
 
-@pytest.mark.parametrize("options", [{"windows": 0}, {"windows": 36}, {"windows": 5, "low_memory": True}])
-def test_windows_that_cannot_be_are_one_line_before_anything_is_read(tmp_path: Path, options: dict[str, Any]) -> None:
-    with pytest.raises(spackle.InputError, match=r"^windows.*(between 1 and 35, got|leave one of the two out)"):
-        SharpBase.load(tmp_path / "none.pt", device="cpu", **options)
-
-
 # --- torch.compile
 
 
@@ -55,8 +49,6 @@ def test_a_compiled_forward_shares_the_weights_of_a_network_that_stays_as_it_is(
     network = micro_network()
     twin = compile_forward(network, backend="eager")
     assert isinstance(twin, SharpNetwork)
-    translated = [module for module in twin.modules() if module._compiled_call_impl is not None]
-    assert len(translated) == 2 * MICRO.depth + 3
     assert all(module._compiled_call_impl is None for module in network.modules())
     assert all(a is b for a, b in zip(twin.parameters(), network.parameters(), strict=True))
     tokens = torch.randn(2, 65, MICRO.embed, generator=torch.Generator().manual_seed(0))

@@ -68,19 +68,6 @@ def test_a_sky_that_melts_into_the_sea_is_left_alone() -> None:
     assert "sky" not in dataclasses.replace(found.scene, rgb=sea).lift().notes
 
 
-def test_nothing_is_behind_the_sky_not_even_what_was() -> None:
-    found = outdoors()
-    hills = (torch.arange(96)[:, None] > 46) & found.sky
-    rgb = torch.where(hills[..., None], torch.tensor([0.2, 0.3, 0.15]), found.scene.rgb)
-    z = (
-        dataclasses.replace(found.scene, rgb=rgb, depth=torch.where(hills, 1e6, found.scene.depth))
-        .lift()
-        .gaussians.means
-    )
-    z = z[: 96 * 128, 2].reshape(96, 128)
-    assert float(z[hills].max()) < float(z[found.sky & ~hills].min())
-
-
 def test_a_floor_that_runs_to_the_horizon_is_no_sky() -> None:
     """A lake or a field of snow: at the photo's border as far and as bright as any sky."""
     scene = slanted_plane(1.5, 1000, 0)

@@ -142,14 +142,6 @@ def test_a_mixed_pixel_goes_where_its_colour_belongs(color: float, moves: bool, 
     assert torch.equal(attach_mixed_pixels(inverse, rgb), expected)
 
 
-def test_steps_of_several_quanta_stay_and_unknown_pixels_do_not_pull() -> None:
-    edge = torch.tensor([0.5] * 6 + [0.45] * 6).expand(4, 12)
-    assert torch.allclose(undo_quantisation(edge, torch.ones(4, 12, dtype=torch.bool), 0.01), edge, atol=1e-6)
-    stored, valid = torch.full((4, 9), 0.5), torch.ones(4, 9, dtype=torch.bool)
-    stored[:, 4], valid[:, 4] = 0.49, False
-    torch.testing.assert_close(undo_quantisation(stored, valid, 0.01), stored, rtol=0, atol=1e-6)
-
-
 @PROPERTY
 @given(IMAGES, st.floats(0.001, 0.1))
 def test_what_was_rounded_still_rounds_to_the_same_step(image: tuple[int, int, int, float], quantum: float) -> None:
