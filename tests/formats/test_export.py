@@ -36,7 +36,7 @@ from spackle.formats import load_ply, load_ply_camera, save_ply
 from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
 from spackle.formats.gltf import encode_glb
 from spackle.formats.scene_files import SceneFile, encode_splat
-from spackle.formats.sog import encode_sog
+from spackle.formats.sog import codebook, encode_sog
 from spackle.formats.spz import LIMIT, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.progress import Reporter
@@ -243,6 +243,18 @@ def test_spz_is_an_eighth_of_the_ply() -> None:
     assert float(error) < 0.01 / 16
 
 
+def test_a_codebook_is_close_to_every_value() -> None:
+    g = torch.Generator().manual_seed(0)
+    values = torch.cat([torch.randn(9000, 3, generator=g), 8 + 0.1 * torch.randn(900, 3, generator=g)]).numpy()
+    values[0] = [-30, 30, 17]
+    book, codes = codebook(values)
+    assert np.square(book[codes] - values).mean() < 2e-4
+    assert np.abs(book[codes] - values).max() < 60 / 64 / 2  # what is rare is not far off either
+    few = np.linspace(-3, 5, 256, dtype=np.float32)[np.arange(3000) % 256].reshape(-1, 3)
+    book, codes = codebook(few)
+    np.testing.assert_allclose(book[codes], few, atol=1e-6)
+
+
 # The command.
 
 
@@ -355,3 +367,17 @@ def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
     copy, expected = load_ply(tmp_path / "b.ply"), read(kind, data)
     agree(copy, expected, 0.02 if kind == "splat" else 0.001)  # of .splat's bytes it takes 127.5 for 0, others 128
     torch.testing.assert_close(copy.colors, expected.colors.float(), rtol=0, atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
+def test_gsply_reads_the_scene(kind: str, tmp_path: Path) -> None:
+    """It compiles its reader when it is first used, and leaves SPZ's axes as they are."""
+    gsply = pytest.importorskip("gsply")
+    path = tmp_path / f"a.{kind}"
+    path.write_bytes(encode(kind, random_gaussians(50)))
+    raw, expected = gsply.read_spz(path) if kind == "spz" else gsply.plyread(path), read(kind, path.read_bytes())
+    means, quats, scales, opacities = map(torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities))
+    flip = torch.tensor([1.0, -1.0, -1.0]) if kind == "spz" else torch.ones(3)
+    quats = quats * torch.cat([torch.ones(1), flip])
+    agree(Gaussians(means * flip, quats, scales.exp(), opacities.sigmoid(), means), expected, 0.01)

@@ -178,15 +178,6 @@ def test_older_sharp_file(tmp_path: Path) -> None:
             load_ply_camera(tmp_path / "a.ply")
 
 
-def test_an_opacity_of_none_and_of_one(tmp_path: Path) -> None:
-    rows = np.zeros((2, 14))
-    rows[:, 10] = 1
-    rows[1, 6] = math.inf
-    rows[0, 6] = -math.inf
-    (tmp_path / "a.ply").write_bytes(ply(rows, GIVEN))
-    assert load_ply(tmp_path / "a.ply").opacities.tolist() == [0, 1]
-
-
 def test_what_a_comment_keeps(tmp_path: Path) -> None:
     path, camera = tmp_path / "a.ply", Camera.from_focal(50.25, 64, 48)
     save_ply(random_gaussians(9), path, camera=camera, base_count=7, disparity=0.3)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
-import torch
 from holes import CPU, box_view, random_network
 from scenes import (
     away,
@@ -28,7 +27,6 @@ from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, farthest_first, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.complete import WIDEST
 from spackle.residual.rim_underlay import COARSE, REACH_CELLS, rim_underlay
-from spackle.residual.view_order import SettledFrames, has_speck, reach_of
 
 FRAMES = 60
 
@@ -148,19 +146,6 @@ def test_the_neighbours_of_a_completed_view_have_fewer_holes_for_it(
     assert len(completer.complete_scene([path[index]] * 2, exact=True)) > len(alone)
 
 
-@pytest.mark.parametrize(("holes", "reach"), [(0, 0.75), (25, 0.75), (26, 0.5), (100, 0.5), (101, 0.0)])
-def test_the_fewer_holes_the_farther_a_frame_speaks_but_a_speck_silences_it(holes: int, reach: float) -> None:
-    alpha = torch.ones(250, 400)
-    alpha.view(-1)[torch.arange(holes) * 37] = 0.3  # nowhere together
-    assert reach_of(hole_area_ratio(alpha), alpha) == reach
-    assert not has_speck(alpha)
-    for height, width, speck in ((4, 5, True), (3, 3, False), (1, 60, False)):
-        alpha = torch.ones(120, 160)
-        alpha[120 - height :, 160 - width :] = 0.3
-        assert has_speck(alpha) is speck
-        assert not (speck and reach_of(hole_area_ratio(alpha), alpha))
-
-
 class Counting(CpuRenderer):
     """A renderer that keeps the cameras that whole pictures are taken by."""
 
@@ -172,25 +157,6 @@ class Counting(CpuRenderer):
         if part.get("tiles") is None:
             self.cameras.append(camera)
         return CPU.render(gaussians, camera, **part)
-
-
-@pytest.mark.parametrize(
-    ("frames", "looks", "expected"),
-    [
-        (12, [(0, 0.0), (9, 0.0)], [0, 9]),
-        (12, [(0, 0.0), (9, 0.0), (4, 0.5)], [0, 2, 3, 4, 5, 6, 9]),
-        (12, [(0, 0.0), (9, 0.0), (4, 0.5), (8, 0.5)], [0, 2, 3, 4, 5, 6, 7, 8, 9]),
-        (16, [(1, 0.0), (14, 0.0), (5, 0.75)], [*range(1, 12), 14]),
-        *((5, [(2, reach)], [2]) for reach in (0.5, 0.75)),  # nobody speaks for the ends of a path
-    ],
-)
-def test_a_quiet_frame_speaks_for_a_part_of_the_way_to_the_next_known_ones(
-    frames: int, looks: list[tuple[int, float]], expected: list[int]
-) -> None:
-    settled = SettledFrames(frames)
-    for index, reach in looks:
-        settled.looked(index, reach)
-    assert [k for k in range(frames) if settled.known(k)] == expected
 
 
 @pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 30), ("rotate", 60), ("swipe", 20)])

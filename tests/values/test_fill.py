@@ -90,25 +90,6 @@ def test_a_hole_beside_a_near_thing_continues_what_lies_behind_it(turned: bool, 
     assert float(carried[0][~known].mean()) < 0.3
 
 
-def test_without_a_bias_both_sides_count_alike() -> None:
-    inverse, values, known = strip()
-    filled, carried = far_fill(inverse, values, known, far_bias=0.0)
-    x = torch.arange(16, 48)
-    expected = 1.0 - 0.8 * (x - 15) / 33  # the membrane between two straight rims is a ramp
-    assert float((filled[:, 16:48] - expected).abs().max()) < 0.08
-    torch.testing.assert_close(carried[0] + carried[2], torch.ones(16, 64), rtol=0, atol=1e-5)
-
-
-def test_a_bias_image_acts_where_it_stands() -> None:
-    near_far, colors, rim = (torch.cat([image] * 4, dim=-2) for image in strip())
-    upper = torch.zeros(64, 64)
-    upper[:32] = 80.0
-    mixed, _ = far_fill(near_far, colors, rim, far_bias=upper)
-    above, below = mixed[:24, 16:48].mean(), mixed[-24:, 16:48].mean()
-    assert float(above) < 0.4
-    assert float(below) == pytest.approx(0.6, abs=0.05)  # the mean of the ramp from 1 to 0.2
-
-
 def test_edge_cases() -> None:
     inverse, values, known = random_scene(4, 8, 8)
     kept = inverse.clone(), values.clone()
