@@ -66,21 +66,8 @@ def run_config(title: str, near: bool, methods: Sequence[str]) -> dict[str, Any]
     }
 
 
-def fake_pyiqa(
-    patch: pytest.MonkeyPatch, create: Callable[..., object] | None = None, error: Exception | None = None
-) -> types.ModuleType:
-    """Put a module in pyiqa's place: with `create_metric`, or one whose import raises `error`."""
+def fake_pyiqa(patch: pytest.MonkeyPatch, create: Callable[..., object]) -> None:
+    """Put a module in pyiqa's place: with `create_metric`."""
     module = types.ModuleType("pyiqa")
     module.__dict__.update(__version__="9.9", create_metric=create)
-    if error is None:
-        patch.setitem(sys.modules, "pyiqa", module)
-        return module
-
-    class Finder:
-        def find_spec(self, name: str, path: object = None, target: object = None) -> None:
-            if name == "pyiqa":
-                raise error
-
-    patch.delitem(sys.modules, "pyiqa", raising=False)
-    patch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
-    return module
+    patch.setitem(sys.modules, "pyiqa", module)

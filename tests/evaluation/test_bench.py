@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
-import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -36,10 +34,9 @@ from spackle.evaluation.naive_renderer import naive_render
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.results import KINDS, begin
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
-from spackle.evaluation.suite import TITLES, plain_row, suite_tables
+from spackle.evaluation.suite import TITLES
 from spackle.evaluation.suite_sections import SuiteRow, holed_scene, photo_scene
-from spackle.evaluation.table import EMPTY
-from spackle.evaluation.timing import TOTAL, Lap, complete_in_laps, measure
+from spackle.evaluation.timing import complete_in_laps
 from spackle.image import Photo
 from spackle.render import CpuRenderer, get_renderer
 from spackle.residual import Completer, ResidualNet, hole_area_ratio
@@ -108,14 +105,6 @@ def test_the_layouts_are_the_papers() -> None:
     for table in (overhead, expanded, stages):
         assert "A Processor, 2 cores, 2 threads" in table.caption
         assert any("1 of 4 images" in note and "broken" in note for note in table.notes)
-
-
-def test_a_disparity_that_the_paper_has_not_stands_alone() -> None:
-    tables = efficiency_tables(results((0.6,), warm=False, load=None), bench.count_parameters())
-    assert tables[0].groups[1] == ("disparity 0.6", 2)
-    assert {line.cells[2:] for line in tables[0].lines if "paper" in line.cells[1]} == {(EMPTY, EMPTY)}
-    assert [line.cells[1] for line in tables[1].lines] == ["disparity 0.6"]
-    assert any("it was not warm" in note for note in tables[1].notes)
 
 
 # --- timing
@@ -254,39 +243,6 @@ PEAKS = {stages.PRODUCT.format("fp32"): 1e6, stages.PRODUCT.format("bf16"): 4e6,
 
 def rows_of(section: stages.Section) -> dict[str, SuiteRow]:
     return {row.name: row for row in section[0]}
-
-
-# --- timing and limits
-
-
-def test_tasks_take_turns_and_their_laps_add_up() -> None:
-    order: list[str] = []
-
-    def task(lap: Lap, name: str) -> None:
-        order.append(name)
-        for stage in ("one", "two", "one"):
-            lap(stage)
-
-    tasks = {name: functools.partial(task, name=name) for name in "ab"}
-    times = measure(2, tasks)
-    assert order == ["a", "b"] * 3
-    assert set(times) == set(itertools.product("ab", ("one", "two", TOTAL)))
-    assert {len(values) for values in times.values()} == {2}
-    for name in "ab":
-        assert all(times[name, "one"] > 0)
-        assert all(times[name, "one"] + times[name, "two"] <= times[name, TOTAL])
-    assert len(measure(2, {"a": tasks["a"]}, warm=True)["a", TOTAL]) == 2
-    assert order[6:] == ["a", "a"]
-
-
-def test_limits_are_rates_and_stand_beside_the_rows_that_they_hold_for() -> None:
-    rows = stages.limits_section(2, share=1 / 128)[0]
-    assert [row.unit for row in rows] == ["GFLOP/s", "GFLOP/s", "GB/s"]
-    assert all(len(row.values) == stages.LIMIT_RUNS and min(row.values) > 0 for row in rows)
-    row = plain_row(SuiteRow("call", np.array([6.0, 8.0, 10.0]), limit_ms=2.0))
-    table, missing = suite_tables({"renderer": {"rows": [row], "facts": {}}}, {"video": "no photo"})
-    assert table.lines[0].cells == ("call", "8.00 ms", "7.00 – 9.00", "3", "2.00 ms", "4.0×")
-    assert missing.lines[0].cells == ("video", TITLES["video"], "not run: no photo")
 
 
 # --- sections

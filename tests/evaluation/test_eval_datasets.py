@@ -467,17 +467,6 @@ def test_a_broken_photo_costs_its_own_case_and_no_others(tmp_path: Path) -> None
             load_case(case)
 
 
-def test_llff_reads_images_4_first_and_matches_by_name_where_it_can(tmp_path: Path) -> None:
-    scene = llff(tmp_path / "fern", sparse=True)
-    photo(scene / "images/IMG_4026.JPG")
-    assert cases("llff", tmp_path)[2].photo == scene / "images_4/image002.png"
-    for k in range(1, 5):
-        photo(scene / f"images/IMG_{4026 + k}.png")
-    for path in (scene / "images_4").iterdir():
-        path.unlink()
-    assert cases("llff", tmp_path)[2].photo == scene / "images/IMG_4028.png"
-
-
 # -- sampling --------------------------------------------------------------------------------------------------------
 
 

@@ -22,8 +22,12 @@ from evaluation_data import fake_pyiqa, run_config, write_boxes
 from scenes import box_before_wall, shifted
 from torch import Tensor
 
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import BaseError, BaseSettings
+from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
+from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import paper
 from spackle.evaluation.case import Case, load_case
@@ -32,7 +36,8 @@ from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics,
 from spackle.evaluation.protocols import Gauges, large_views, measure
 from spackle.evaluation.results import ImageResult, Mean, Row
 from spackle.evaluation.results import Run as Results
-from spackle.evaluation.run import problem_of
+from spackle.evaluation.run import examine, problem_of
+from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.table import Line, Table, mark_best, to_latex, to_markdown
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
@@ -78,12 +83,14 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
 # --- pyiqa, by a stand-in
 
 
-def test_without_pyiqa_each_of_its_metrics_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    for error, why in (
-        (ModuleNotFoundError("No module named 'pyiqa'", name="pyiqa"), NOT_INSTALLED),
-        (RuntimeError("operator torchvision::nms does not exist"), "pyiqa cannot be imported: operator torchvision"),
-    ):
-        fake_pyiqa(monkeypatch, error=error)
+def test_without_pyiqa_each_of_its_metrics_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pyiqa.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for why in (NOT_INSTALLED, "pyiqa cannot be imported: operator torchvision"):
+        if why == NOT_INSTALLED:
+            monkeypatch.setitem(sys.modules, "pyiqa", None)
+        else:
+            monkeypatch.delitem(sys.modules, "pyiqa")
         metrics, states = open_metrics(["niqe", "lpips"], "cpu", download=False)
         assert metrics == {}
         assert [state.startswith(f"not run: {why}") for state in states.values()] == [True, True]
@@ -172,19 +179,6 @@ def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
     assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
 
 
-def test_the_near_view_tables_have_the_papers_layout_and_its_numbers() -> None:
-    figures: Figures = {
-        "spackle": {"har_before": 0.1, "aux": 25, "dists": 0.3, "psnr": 20.0, "psnr_hole": 15.5, "ssim_hole": 0.5},
-        "dense": {"har_before": 0.1, "aux": 100, "dists": 0.25, "psnr": 21.0, "psnr_hole": 14.5, "ssim_hole": 0.5},
-    }
-    near, detail, ablation = make_tables([results("LLFF", "near-view", ["spackle", "dense"], figures)])
-    assert near.lines[0].cells == ("Spackle (rgbd)", *[""] * 10, "0.3000", "")
-    assert cells(detail, "LLFF")[0][2:6] == ("0.1000", "20.00", "**15.50**", "")
-    dense, guided, *_ = cells(ablation, "LLFF")
-    assert dense == ("Dense grid init (rgbd)", "1,000", "100.00", "–", "0.2500", "")
-    assert guided == ("Mask guided init (rgbd)", "1,000", "25.00", "75.00%", "0.3000", "")
-
-
 def test_results_that_do_not_go_together_and_means_of_what_is_not_finite() -> None:
     one = results("LLFF", "large-view", ["base"], LARGE)
     other = Results({**one.config, "title": "Tanks", "disparities": [0.3]}, one.records)
@@ -194,20 +188,6 @@ def test_results_that_do_not_go_together_and_means_of_what_is_not_finite() -> No
     rows = tuple(Row("near", str(k), "base", {"psnr": value}) for k, value in enumerate((10.0, None, 20.0)))
     assert Results({}, (ImageResult("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
     assert Results({}, ()).mean("psnr", "base", "near") == Mean(None, 0, 0)
-
-
-def test_the_papers_numbers_are_whole() -> None:
-    assert {title for title, _ in paper.QUALITY} == set(paper.HOLES) == set(paper.GAUSSIANS) == set(paper.DATASETS)
-    assert {len(row) for row in (*paper.QUALITY.values(), *paper.HOLES.values(), *paper.GAUSSIANS.values())} == {9}
-    for added, share, merged in (row[k : k + 3] for row in paper.GAUSSIANS.values() for k in (0, 3, 6)):
-        assert merged - added == paper.BASE_GAUSSIANS
-        assert share == pytest.approx(100 * added / paper.BASE_GAUSSIANS, abs=0.006)
-    for before, after, less in (row[k : k + 3] for row in paper.HOLES.values() for k in (0, 3, 6)):
-        assert less == pytest.approx(100 * reduction(before, after), abs=1.5)  # of numbers with four digits
-    for dense, _, _, guided, less, _, _ in paper.ABLATION.values():
-        assert less == pytest.approx(100 * reduction(dense, guided), abs=0.006)
-    assert paper.at(paper.HOLES["Booster"], 0.4) == (0.0103, 0.0006, 94.51)
-    assert paper.at(paper.HOLES["Booster"], 0.6) == (None, None, None)
 
 
 def test_a_table_as_markdown_and_as_latex() -> None:
@@ -422,6 +402,28 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     remark = "without one of its second photos: Chair/third.png: not an image"
     assert f"Chair: {remark}" in done.lines
     assert [record["remarks"] for record in read(tmp_path / "lacks")["images"]] == [[remark]]
+
+
+def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
+    scenes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predict = RgbdBase.predict
+
+    def too_large(*arguments: Any) -> BasePrediction:
+        found = predict(*arguments)
+        endless = dataclasses.replace(found.gaussians, means=found.gaussians.means / 0)
+        return dataclasses.replace(found, gaussians=endless)
+
+    def too_little(*arguments: Any) -> BasePrediction:
+        raise MemoryShort("not enough memory for the network")
+
+    options = EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), residual="seeds", metrics=())
+    evaluation = open_evaluation(options)
+    for broken, kind in ((too_large, InputError), (too_little, BaseError)):
+        monkeypatch.setattr(RgbdBase, "predict", broken)
+        with pytest.raises(InputError) as caught:
+            examine(evaluation.cases[0], evaluation)
+        assert type(caught.value) is kind
 
 
 def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:

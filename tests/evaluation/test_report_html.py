@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import importlib.util
 import io
 import json
@@ -19,8 +18,8 @@ from command import refuses, run
 from evaluation_data import run_config, write_boxes
 from PIL import Image
 
-from spackle.evaluation.plots import SCENES, STYLES, evenly, overhead_plot
-from spackle.evaluation.report import BUDGET, MOST, ReportSource, encode, fitting, make_report
+from spackle.evaluation.plots import STYLES, evenly, overhead_plot
+from spackle.evaluation.report import BUDGET, ReportSource, encode, fitting, make_report
 from spackle.evaluation.results import ImageResult, Row
 from spackle.evaluation.results import Run as Results
 from spackle.evaluation.tables import make_tables
@@ -130,13 +129,6 @@ def test_a_page_is_well_formed_needs_nothing_else_and_is_the_same_bytes_again() 
         assert all(note in page.text("li") for note in table.notes)
     assert page.text("strong")  # the best of a column
 
-    assert sum(grip["type"] == "range" for grip in page.named("input")) == len(page.named("article")) == MOST
-    assert sum(image.get("class") != "plot" for image in page.named("img")) == MOST * (len(METHODS) + 1)
-    layers = [str(figure["class"]).split() for figure in page.named("figure") if "layer" in str(figure.get("class"))]
-    assert sum("left" in layer for layer in layers) == sum("right" in layer for layer in layers) == MOST
-    assert page.text("span").count("worst") == page.text("span").count("best") == 2
-    assert "4 of 11 images, from the worst to the best by distance" in page.text("p")
-
 
 def test_every_string_from_outside_is_escaped() -> None:
     text = report(
@@ -164,12 +156,6 @@ def test_many_evaluations_and_images_still_fit() -> None:
     whole = [{"base": encode(Image.new("RGB", (960, 720)))}]
     assert fitting(whole) == whole
 
-    text = make_report([ReportSource(results(near=True, count=400), lambda index: {})])
-    assert len(text) < 1_500_000
-    assert f"{SCENES} of 400 scenes, spread evenly." in text
-    assert re.search(r"\d+ of 1,600 images and views", text)
-    assert "No pictures are left." in text
-
 
 def test_plots_show_each_value_once_in_forms_that_tell_methods_apart() -> None:
     assert len(set(STYLES.values())) == len({form for _, form in STYLES.values()}) == len(STYLES)
@@ -179,12 +165,6 @@ def test_plots_show_each_value_once_in_forms_that_tell_methods_apart() -> None:
     drawn = [part.get("style", "") for part in ElementTree.fromstring(plot.svg).iter() if part.tag.endswith("}use")]
     for method in ("seeds", "spackle"):  # a dot for each image and view, and one in the legend
         assert sum(f"fill: {STYLES[method][0]}" in style for style in drawn) == 3 * 2 + 1
-
-    run = results(near=False, count=1)
-    bare = [dataclasses.replace(r, rows=tuple(dataclasses.replace(x, figures={}) for x in r.rows)) for r in run.records]
-    page = Page(report(dataclasses.replace(run, records=tuple(bare))))
-    assert page.named("article")
-    assert len(page.drawings()) == 1  # the paper's HAR alone
 
 
 def test_the_command_writes_it_and_tables_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
