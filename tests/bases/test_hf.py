@@ -29,7 +29,7 @@ from torch.nn.functional import interpolate
 from spackle.bases import hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import DepthModel, HfBase
-from spackle.bases.hf_models import FARTHEST_M, MEANINGS, UNFIT, Window, meaning_of, to_depth_map
+from spackle.bases.hf_models import FARTHEST_M, Window, meaning_of, to_depth_map
 from spackle.bases.protocol import NEAREST_M
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
@@ -162,12 +162,6 @@ def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
     return seen
 
 
-def front_depth(base: HfBase, photo: Photo) -> Tensor:
-    """[H, W]: where the pixels' own Gaussians stand."""
-    prediction = base.predict(photo)
-    return prediction.gaussians.means[: photo.width * photo.height, 2].reshape(photo.height, photo.width)
-
-
 # What comes out.
 
 
@@ -287,18 +281,6 @@ def test_relative_disparity_runs_from_its_zero_at_30_m_to_its_greatest_at_1_5_m(
     torch.testing.assert_close(found.depth, torch.tensor([[1.6, 0.8, 0.4, 1e4, 1e-4]]))  # its limits: 10 km, 0.1 mm
 
 
-def test_a_few_specks_do_not_push_the_rest_of_a_relative_scene_away() -> None:
-    raw = torch.linspace(0, 1, 100).expand(100, 100).contiguous()
-    clean = to_depth_map(raw, "relative disparity", 1.0, "hf:x", Path("photo.png")).depth
-    specked = raw.clone()
-    specked[3, :5], specked[4, 7] = 50.0, -3.0
-    found = to_depth_map(specked, "relative disparity", 1.0, "hf:x", Path("photo.png")).depth
-    same = specked == raw
-    torch.testing.assert_close(found[same], clean[same], rtol=0.02, atol=0)
-    assert float(found[3, 0]) == pytest.approx(1.5)
-    assert float(found[4, 7]) == pytest.approx(30.0)
-
-
 def depth_pro_by_hand(folder: Path, photo: Photo) -> tuple[Tensor, float]:
     """Inverse canonical depth and field of view in degrees."""
     settings = json.loads((folder / "preprocessor_config.json").read_text())
@@ -331,12 +313,6 @@ def test_depth_pro_gives_the_lens_where_nobody_knows_it_and_else_scales_its_dept
 
 
 # What the numbers mean.
-
-
-def test_every_depth_model_of_the_installed_transformers_has_a_known_meaning_or_a_reason() -> None:
-    from transformers.models.auto.modeling_auto import MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
-
-    assert set(MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES) == set(MEANINGS) | set(UNFIT)
 
 
 @pytest.mark.parametrize(
@@ -451,16 +427,6 @@ def test_bf16_is_close_to_fp32_without_stairs_and_repeats(folders: dict[str, Pat
     assert len(other.unique()) > 0.9 * len(one.unique())  # bfloat16 has 128 numbers between 8 and 16 m
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_every_kind_of_model_runs_in_bf16(name: str, folders: dict[str, Path]) -> None:
-    photo = photo_of()
-    exact, low = (load(folders[name], precision).model(photo.rgb) for precision in ("fp32", "bf16"))
-    assert low[0].dtype == torch.float32
-    assert float((low[0] - exact[0]).abs().mean()) < 0.02 * float(exact[0].abs().mean())
-    assert not torch.equal(low[0], exact[0])
-    assert low[1] == (None if exact[1] is None else pytest.approx(exact[1], rel=0.02))
-
-
 def test_weights_of_half_precision_are_widened(folders: dict[str, Path], tmp_path: Path, maps: list[DepthMap]) -> None:
     folder = shutil.copytree(folders["metric"], tmp_path / "half")
     tensors = {key: value.half() for key, value in load_file(folder / "model.safetensors").items()}
@@ -535,11 +501,9 @@ INPUT = "preprocessor_config.json"
             "needs torchvision: install the one",
             marks=pytest.mark.skipif(find_spec("torchvision") is not None, reason="torchvision is installed"),
         ),
-        (without("model.safetensors"), "has no model.safetensors, the only kind of weights that runs no code"),
         (pickled, "has no model.safetensors, the only kind of weights that runs no code"),
         (cut, "cannot be loaded"),
         (lacking("head"), "its weights lack .* and .* more: give the weights that belong to its config.json"),
-        (lacking("head.conv3.bias"), "its weights lack head.conv3.bias: give"),
         (
             writing(INDEX, '{"weight_map": {"a": "model-00001-of-00002.safetensors"}}'),
             "not there .model-00001-of-00002.s",
@@ -600,19 +564,6 @@ def test_code_in_a_models_folder_is_not_run(folders: dict[str, Path], tmp_path: 
     with contextlib.suppress(InputError):
         load(folder)
     assert not flag.exists()
-
-
-def test_loading_and_predicting_say_nothing_and_leave_the_packages_settings_alone(
-    folders: dict[str, Path], capfd: pytest.CaptureFixture[str]
-) -> None:
-    from huggingface_hub.utils import are_progress_bars_disabled
-
-    said = transformers.utils.logging
-    before = said.get_verbosity(), said.is_progress_bar_enabled(), are_progress_bars_disabled()
-    capfd.readouterr()
-    HfBase.load(str(folders["dpt"]), device="cpu").predict(photo_of())
-    assert capfd.readouterr() == ("", "")
-    assert before == (said.get_verbosity(), said.is_progress_bar_enabled(), are_progress_bars_disabled())
 
 
 @pytest.mark.parametrize("package", ["transformers", "huggingface_hub"])
@@ -706,9 +657,9 @@ def test_a_model_of_the_hub_is_fetched_once_and_then_needs_no_network_unless_a_f
     hub.asked.clear()
     again = HfBase.load("owner/name", device="cpu", precision="fp32")
     assert hub.asked == []
-    depth = front_depth(first, photo_of())
-    assert torch.equal(depth, front_depth(again, photo_of()))
-    assert torch.equal(depth, front_depth(load(folders["metric"]), photo_of()))
+    means = first.predict(photo_of()).gaussians.means
+    for base in (again, load(folders["metric"])):
+        assert torch.equal(base.predict(photo_of()).gaussians.means, means)
     os.remove(hub.cache / "owner" / "name" / "model.safetensors")  # as after a fetch that broke off
     HfBase.load("owner/name", device="cpu")
     assert hub.asked
