@@ -27,7 +27,6 @@ class Site:
     hang_after: int | None = None  # bytes of an answer, then nothing until `go_on` is set
     go_on: threading.Event = dataclasses.field(default_factory=threading.Event)
     requests: list[dict[str, str]] = dataclasses.field(default_factory=list)
-    paths: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def tag(self) -> str:
@@ -67,7 +66,6 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.server.site
         site.requests.append(dict(self.headers))
-        site.paths.append(self.path)
         start = self._start(site)
         status = site.status if site.status != 200 else 206 if start else 200
         size = len(site.content)

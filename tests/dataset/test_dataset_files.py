@@ -14,7 +14,7 @@ import torch
 from command import names_in, run
 from dataset_builds import VIEWS, refused
 from PIL import Image
-from scenes import box_before_wall, psnr, shifted
+from scenes import box_before_wall, psnr
 from torch.utils.data import DataLoader
 
 from spackle.camera import Camera
@@ -30,7 +30,7 @@ from spackle.dataset.sample import (
     encode_gaussians,
 )
 from spackle.dataset.shards import load_manifest
-from spackle.dataset.views import APART, PathChoice, ViewChoices, draw_path, path_cameras
+from spackle.dataset.views import APART, PathChoice, path_cameras
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
@@ -191,15 +191,6 @@ def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind
         path_cameras(PathChoice(kind, 0.0), camera, DepthRange(2.0, 3.0), views)
 
 
-def test_a_photos_path_depends_on_the_photo_and_the_seed() -> None:
-    drawn = [draw_path(ViewChoices(), str(number)) for number in range(40)]
-    assert {path.kind for path in drawn} == set(TRAJECTORIES)
-    assert all(0.1 <= path.disparity <= 0.6 for path in drawn)
-    path = draw_path(ViewChoices(), "ab")
-    assert draw_path(ViewChoices(), "ab") == path != draw_path(ViewChoices(seed=1), "ab")
-    assert draw_path(ViewChoices(trajectory="swipe"), "ab") == PathChoice("swipe", path.disparity)
-
-
 def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:
     rng = np.random.default_rng(0)
     z = torch.from_numpy(np.exp(rng.uniform(np.log(0.05), np.log(2e4), (40, 50)))).float()
@@ -221,16 +212,12 @@ def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:
 
 
 def test_gaussians_come_back_and_look_the_same() -> None:
-    scene = box_before_wall()
-    base = scene.base()
+    base = box_before_wall().base()
     data = encode_gaussians(base)
     back = decode_gaussians(data)
     assert len(data) < 35 * len(base) + 1000
     assert torch.equal(back.means, base.means)
     torch.testing.assert_close(back.scales, base.scales, rtol=3e-4, atol=0)
-    view = shifted(scene.camera, 0.4)
-    before, after = (get_renderer().render(gaussians, view) for gaussians in (base, back))
-    assert psnr(before.rgb, after.rgb) > 60
     assert len(decode_gaussians(encode_gaussians(Gaussians.empty()))) == 0
     with pytest.raises(ValueError, match="no Gaussians"):
         decode_gaussians(b"nothing")
