@@ -167,19 +167,6 @@ def test_a_given_focal_length_is_used_and_named(tmp_path: Path, option: str, val
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "frames"), [(64, 48, 3), (65, 47, 4), (1, 1, 1), (1, 60, 3), (60, 1, 3), (3, 7, 3)]
-)
-def test_the_video_has_the_frames_and_even_sides(tmp_path: Path, width: int, height: int, frames: int) -> None:
-    photo = write_photo(tmp_path / "a.png", width, height)
-    predicted(photo, write_depth(tmp_path / "d.npy", metres(width, height)), tmp_path / "out", "--frames", frames)
-    pictures = decode(tmp_path / "out" / "a" / "video.mp4")
-    assert len(pictures) == frames
-    for frame in pictures:
-        assert (frame.width, frame.height) == (width + width % 2, height + height % 2)
-        assert frame.format.name == "yuv420p"
-
-
-@pytest.mark.parametrize(
     ("name", "folder"),
     [
         *(
@@ -362,12 +349,3 @@ def test_outputs_that_cannot_be_written(tmp_path: Path, pair: tuple[Path, Path],
     refuses(run("render", "-i", scene, "-o", out, *SHORT), "output folder")
     assert names_in(tmp_path) == before
     assert (tmp_path / "file").read_text() == "in the way"
-
-
-def test_a_full_disk_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*args: object, **kwargs: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", *SHORT)
-    assert (result.code, "No space left" in result.lines[-1], (tmp_path / "new").exists()) == (2, True, False)

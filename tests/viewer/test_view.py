@@ -154,19 +154,6 @@ def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_w
     assert (result.code, any(line.startswith("error: ") for line in result.lines)) == (130, True)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
-def test_without_a_screen_no_browser_takes_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("webbrowser.open", lambda url: pytest.fail("a browser was opened"))
-    monkeypatch.setattr("spackle.app.view.time.sleep", lambda seconds: os.kill(os.getpid(), signal.SIGINT))
-    save_ply(box_before_wall().base(), tmp_path / "scene.ply")
-    for options, hint in (((), True), (("--no-open",), False)):
-        result = run("view", tmp_path / "scene.ply", *options)
-        assert result.code == 130
-        assert ("open that page yourself" in result.err) == hint
-
-
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
