@@ -95,7 +95,6 @@ MODELS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "tips": ("Tipsv2Dpt", {"backbone_config": TIPS, "num_depth_bins": 8, **NARROW}, TIPS_INPUT),
     "depth_pro": ("DepthPro", DEPTH_PRO, DEPTH_PRO_INPUT),
 }
-METRIC = ("metric", "dinov2", "glpn", "zoedepth")
 RELATIVE = ("relative", "dpt")
 
 
