@@ -462,6 +462,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
         (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
         (("--methods", "inpaint2d", "--metrics", "none"), "pip install 'spackle-nvs[opencv]'"),
+        (("--methods", "inpaint2d", "--inpainter", "opencb"), "did you mean opencv"),
     ],
 )
 def test_bad_input_is_one_line(

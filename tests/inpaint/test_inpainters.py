@@ -1,86 +1,31 @@
-"""Inpainters that need no weights: they touch the holes alone, and geometry is calm from view to view."""
+"""The registry of inpainters, and what each keeps to whose weights or package are here."""
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
-from scenes import Scene, box_before_wall, cast, shifted
-from torch import Tensor
-from torch.nn.functional import grid_sample
 
-from spackle.camera import Camera
-from spackle.camera_path import DepthRange
-from spackle.dataset.views import PathChoice, path_cameras, render_views, scene_completion
-from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
-from spackle.render import get_renderer
-from spackle.residual import Completer
+from spackle.errors import InputError
+from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter
 
 
-def inpainter(name: str) -> Inpainter:
-    return get_inpainter(name, InpainterOptions(complete_scene=scene_completion(get_renderer())))
-
-
-@pytest.mark.parametrize("name", ["geometry", "opencv", "none"])
-def test_inpainters_touch_the_holes_alone(name: str) -> None:
+@pytest.mark.parametrize("name", sorted(name for name, kind in INPAINTERS.items() if not kind.network))
+def test_only_the_holes_change_and_every_time_in_the_same_way(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")
-    scene = box_before_wall()
-    base = scene.base()
-    views = [scene.camera, shifted(scene.camera, 0.4), shifted(scene.camera, -0.3)]
-    stack = render_views(base, scene.camera, views, get_renderer())
-    targets = inpainter(name).complete(stack)
-    assert torch.equal(targets[~stack.mask], stack.rgb[~stack.mask])
-    assert bool((targets[stack.mask].amax(-1) > 0.2).all()) == (name != "none")
-    seen = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
-    assert torch.equal(inpainter(name).complete(seen), stack.rgb)
-    if name == "geometry":
-        with pytest.raises(ValueError, match="complete_scene"):
-            get_inpainter(name, InpainterOptions())
+    rgb = torch.rand(2, 24, 33, 3, generator=torch.Generator().manual_seed(0)) / 2 + 0.25
+    hole = torch.zeros(2, 24, 33, dtype=torch.bool)
+    hole[0, 4:13, 10:20] = hole[0, :, -3:] = True
+    rgb[hole] = 0
+    inverse_depth = torch.where(hole, 0.0, 0.5)
+    inpainter = get_inpainter(name, InpainterOptions())
+    painted = inpainter.paint(rgb, hole, inverse_depth)
+    assert torch.equal(painted[~hole], rgb[~hole])
+    assert 0.2 < float(painted[hole].min()) < float(painted[hole].max()) < 0.8
+    assert torch.equal(inpainter.paint(rgb, hole, inverse_depth), painted)
+    assert torch.equal(inpainter.paint(rgb[1:], hole[1:], inverse_depth[1:]), rgb[1:])
 
 
-FAR = 5.0  # metres of a wall that the photo's camera faces
-
-
-def pattern(points: Tensor) -> Tensor:
-    """The wall's colour [..., 3]."""
-    x, y = points[..., 0], points[..., 1]
-    waves = [torch.sin(9 * x + 4 * y), torch.sin(7 * y - 2 * x), torch.cos(6 * x + 5 * y)]
-    broad = torch.stack([0.15 * torch.sin(0.9 * x), 0.1 * torch.sin(1.3 * y), 0.15 * torch.cos(0.8 * x)], -1)
-    return (torch.tensor([0.35, 0.45, 0.6]) + 0.1 * torch.stack(waves, -1) + broad).clamp(0, 1)
-
-
-def flicker(stack: ViewStack, targets: Tensor) -> tuple[float, float]:
-    """Mean difference of the holes' colours between neighbouring views, followed along the wall, and from the truth."""
-    between, truth = [], []
-    for one in range(1, len(targets) - 1):
-        points, colors = cast(stack.cameras[one], FAR)[stack.mask[one]], targets[one][stack.mask[one]]
-        truth.append((colors - pattern(points)).abs().mean(-1))
-        uv, _ = stack.cameras[one + 1].project(points)
-        grid = (2 * uv / torch.tensor([targets.shape[2], targets.shape[1]]) - 1)[None, None]
-        images = torch.cat([targets[one + 1], stack.mask[one + 1][..., None]], -1).permute(2, 0, 1)[None]
-        found = grid_sample(images, grid, align_corners=False)[0, :, 0].T
-        inside = found[:, 3] > 0.999  # a hole there too
-        between.append((colors - found[:, :3]).abs().mean(-1)[inside])
-    return float(torch.cat(between).mean()), float(torch.cat(truth).mean())
-
-
-def test_geometry_is_calmer_than_views_completed_one_by_one() -> None:
-    height, width = 96, 128
-    camera = Camera.from_focal(0.85 * width, width, height)
-    box = torch.zeros(height, width, dtype=torch.bool)
-    box[height // 4 : height * 3 // 4, width * 3 // 8 : width * 5 // 8] = True
-    points = cast(camera, FAR)
-    front = torch.tensor([0.75, 0.3, 0.2]) + 0.1 * torch.sin(20 * points[..., :1])
-    scene = Scene(torch.where(box[..., None], front, pattern(points)), torch.where(box, 2.0, FAR), camera)
-    cameras = path_cameras(PathChoice("swipe", 0.4), camera, DepthRange.of(scene.base()), 8)
-    stack = render_views(scene.base(), camera, cameras, get_renderer())
-    completer = Completer(stack.base, camera, get_renderer())
-    guards = [completer.photo_guard()]
-    with torch.no_grad():
-        alone = torch.stack([completer.completed_view(view, guards)[1].rgb for view in cameras])
-    calm, off = flicker(stack, inpainter("geometry").complete(stack))
-    restless, other_off = flicker(stack, torch.where(stack.mask[..., None], alone, stack.rgb))
-    assert calm < restless / 3
-    assert off < 1.1 * other_off
+def test_an_unknown_inpainter_is_a_line() -> None:
+    with pytest.raises(InputError, match="inpainter nobody: unknown"):
+        get_inpainter("nobody", InpainterOptions())

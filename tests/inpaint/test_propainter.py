@@ -5,7 +5,6 @@ The networks are the published ones in full size, on the smallest pictures that 
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import shutil
 import sys
@@ -17,14 +16,11 @@ import pytest
 import torch
 from dataset_builds import build, content, refused, write_inputs
 from safetensors.torch import save_file
-from scenes import Scene, box_before_wall, shifted
 from torch import Tensor, nn
 
 from spackle.dataset import DatasetFiles
 from spackle.dataset.shards import load_manifest
-from spackle.dataset.views import render_views
 from spackle.errors import InputError
-from spackle.inpaint import ViewStack
 from spackle.inpaint.propainter import (
     DILATION,
     NETWORKS,
@@ -34,7 +30,6 @@ from spackle.inpaint.propainter import (
     weight_files,
 )
 from spackle.inpaint.protocol import InpainterOptions
-from spackle.render import get_renderer
 
 OPS = """
 from torch import nn
@@ -110,10 +105,12 @@ def inpainter(weights: Path) -> PropainterInpainter:
     return PropainterInpainter(InpainterOptions(weights, device="cpu"))
 
 
-def stack_of(scene: Scene, rights: list[float]) -> ViewStack:
-    """What cameras beside the photo's see."""
-    cameras = [scene.camera, *(shifted(scene.camera, right) for right in rights)]
-    return render_views(scene.base(), scene.camera, cameras, get_renderer())
+def views_of(count: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures, holes at their right, and no depth."""
+    rgb = torch.rand(count, height, width, 3, generator=torch.Generator().manual_seed(0))
+    hole = torch.zeros(count, height, width, dtype=torch.bool)
+    hole[:, 20:60, -40:-9] = True
+    return rgb, hole, torch.zeros(count, height, width)
 
 
 class Video:
@@ -137,51 +134,47 @@ def video(package: None, monkeypatch: pytest.MonkeyPatch) -> type[Video]:
 
 
 def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterInpainter) -> None:
-    stack = stack_of(box_before_wall(width=150, height=113), [0.3, -0.3, -0.4])
-    targets = inpainter.complete(stack)
+    rgb, hole, unknown = views_of(4, 113, 150)
+    painted = inpainter.paint(rgb, hole, unknown)
     frames, masks = video.given[0]
     assert frames.shape == (4, 3, 128, 152)
     assert masks.shape == (4, 1, 128, 152)
-    order = [1, 0, 2, 3]
-    torch.testing.assert_close(frames[:, :, :113, :150], 2 * stack.rgb[order].permute(0, 3, 1, 2) - 1)
-    assert torch.equal(masks[:, :, :113, :150], dilated(stack.mask[order, None].float()))
+    torch.testing.assert_close(frames[:, :, :113, :150], 2 * rgb.permute(0, 3, 1, 2) - 1)
+    assert torch.equal(masks[:, :, :113, :150], dilated(hole[:, None].float()))
     assert torch.equal(frames[:, :, 112:113].expand(-1, -1, 16, -1), frames[:, :, 112:])
-    assert torch.equal(targets[~stack.mask], stack.rgb[~stack.mask])
-    torch.testing.assert_close(targets[stack.mask], torch.full((int(stack.mask.sum()), 3), 0.75))
-    alone = {name: getattr(stack, name)[1:2] for name in ("cameras", "rgb", "depth", "alpha", "mask")}
-    torch.testing.assert_close(inpainter.complete(dataclasses.replace(stack, **alone)), targets[1:2])
+    assert torch.equal(painted[~hole], rgb[~hole])
+    torch.testing.assert_close(painted[hole], torch.full((int(hole.sum()), 3), 0.75))
+    torch.testing.assert_close(inpainter.paint(rgb[1:2], hole[1:2], unknown[1:2]), painted[1:2])
     assert video.given[1][0].shape == (2, 3, 128, 152)  # a video has two frames
-    whole = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
-    assert torch.equal(inpainter.complete(whole), stack.rgb)
+    assert torch.equal(inpainter.paint(rgb, torch.zeros_like(hole), unknown), rgb)
 
 
 def test_large_views_are_worked_on_in_small_and_no_hole_is_lost(video: type[Video], weights: Path) -> None:
-    stack = stack_of(box_before_wall(width=300, height=200), [0.2])
-    mask = torch.zeros_like(stack.mask)
-    mask[1, 50, :] = True  # one pixel high
-    stack = dataclasses.replace(stack, mask=mask)
+    rgb, hole, unknown = views_of(2, 200, 300)
+    hole = torch.zeros_like(hole)
+    hole[1, 50, :] = True  # one pixel high
     small = PropainterInpainter(InpainterOptions(weights, 150, "cpu"))
-    targets = small.complete(stack)
+    painted = small.paint(rgb, hole, unknown)
     assert video.given[0][0].shape == (2, 3, 128, 152)
-    assert torch.equal(targets[~mask], stack.rgb[~mask])
-    torch.testing.assert_close(targets[mask], torch.full((300, 3), 0.75))
+    assert torch.equal(painted[~hole], rgb[~hole])
+    torch.testing.assert_close(painted[hole], torch.full((300, 3), 0.75))
     assert "long side 150" in small.version
 
 
 def test_colours_that_are_none_are_refused(
     video: type[Video], inpainter: PropainterInpainter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = stack_of(box_before_wall(), [0.3])
+    views = views_of(2, 113, 150)
     monkeypatch.setattr(Video, "__iter__", lambda self: iter([self.frames * torch.nan]))
     with pytest.raises(InputError, match="not finite"):
-        inpainter.complete(seen)
+        inpainter.paint(*views)
 
     def short(self: Video) -> Iterator[Tensor]:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(Video, "__iter__", short)
     with pytest.raises(InputError, match="lower --inpainter-side"):
-        inpainter.complete(seen)
+        inpainter.paint(*views)
 
 
 # Weights ------------------------------------------------------------------------------------------

@@ -28,12 +28,12 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     InputError for options, photos or folders that cannot be used, and for another dataset in `output`.
     """
     options.check()
-    inpainter = Maker.of(options, output).inpainter  # fails before long work
-    if inpainter.notice:
-        reporter.log(inpainter.notice)
+    completion = Maker.of(options, output).completion  # fails before long work
+    if completion.notice:
+        reporter.log(completion.notice)
     with cluster(options) as ray:
         photos = _photos(source, options, reporter)
-        config = configuration(options, photos, inpainter)
+        config = configuration(options, photos, completion)
         with results_folder(output, (NAME,)), alone_in(output, "build"):
             manifest = _begin(output, config)
             return _Build(photos, output, options, reporter, manifest).run(ray)

@@ -20,14 +20,15 @@ import torch
 
 from spackle.bases.open import BaseError, OpenedBase, open_base
 from spackle.camera_path import DepthRange
+from spackle.dataset.completion import Completion, open_completion
 from spackle.dataset.options import DatasetOptions
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.sample import pack_sample
-from spackle.dataset.views import draw_path, path_cameras, render_views, scene_completion
+from spackle.dataset.views import draw_path, path_cameras, render_views
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import Inpainter, InpainterOptions, get_inpainter
+from spackle.inpaint import InpainterOptions
 from spackle.progress import timed
 from spackle.render import Renderer, get_renderer
 
@@ -59,21 +60,21 @@ def part_file(output: Path, index: int) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Maker:
-    """A base, a renderer and an inpainter, at work on one photo after the other."""
+    """A base, a renderer and a completion, at work on one photo after the other."""
 
     options: DatasetOptions
     output: Path
     base: OpenedBase
     renderer: Renderer
-    inpainter: Inpainter
+    completion: Completion
 
     @staticmethod
     def of(options: DatasetOptions, output: Path) -> Maker:
         """Set up; a network is loaded with the first photo. InputError where that cannot be."""
         base, renderer = open_base(options.base), get_renderer(options.base.device)
         device = None if options.base.device == "auto" else options.base.device
-        wishes = InpainterOptions(options.inpainter_weights, options.inpainter_side, device, scene_completion(renderer))
-        return Maker(options, output, base, renderer, get_inpainter(options.inpainter, wishes))
+        wishes = InpainterOptions(options.inpainter_weights, options.inpainter_side, device)
+        return Maker(options, output, base, renderer, open_completion(options.inpainter, wishes, renderer))
 
     def make(self, job: Job) -> Made:
         """Write a photo's sample, whole or not at all; InputError where no photo can be worked on or be written."""
@@ -104,14 +105,14 @@ class Maker:
                 raise InputError(f"{file.path}: no camera path: {error}") from error
             stack = render_views(base, camera, cameras, self.renderer, choices.threshold)
         with timed("inpaint", seconds):
-            targets = self.inpainter.complete(stack)
+            targets = self.completion.complete(stack)
         with timed("encode", seconds):
             lens = {"focal_source": prediction.lens_source or photo.focal_source}
             size = {"width": photo.width, "height": photo.height}
             facts = {
                 "photo": {"name": file.name, "sha256": file.sha256} | size | lens,
                 "base": {"gaussians": len(base), **prediction.notes},
-                "inpainter": {"name": self.inpainter.name, "version": self.inpainter.version},
+                "inpainter": {"name": self.completion.name, "version": self.completion.version},
                 "threshold": choices.threshold,
             }
             return pack_sample(key, resize_photo(photo).rgb, stack, targets, path, facts)

@@ -11,11 +11,12 @@ import spackle
 from spackle.bases.depth_map import find_depth
 from spackle.bases.open import NETWORKS, BaseSettings, kind_of
 from spackle.camera_path import MAX_DISPARITY, spelled
+from spackle.dataset.completion import COMPLETIONS, Completion
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import ViewChoices
 from spackle.digest import digest_of, fingerprint, weights_digest
-from spackle.errors import InputError
-from spackle.inpaint import Inpainter
+from spackle.errors import InputError, check_name
+from spackle.inpaint import INPAINTERS
 
 MAX_VIEWS = 100  # two digits name a view
 MAX_PHOTOS = 1_000_000  # six digits name a photo
@@ -30,13 +31,17 @@ class DatasetOptions:
     choices: ViewChoices
     images: Path | None = None  # where the photos of a COCO JSON lie
     sample: int | None = None  # so many photos; all where None
-    inpainter: str = "geometry"
-    inpainter_weights: Path | None = None  # a folder, for one with a network
+    inpainter: str = "geometry"  # of `COMPLETIONS`
+    inpainter_weights: Path | None = None  # a file or a folder, for one with a network
     inpainter_side: int | None = None  # pixels of the long side at which that works
     workers: int = 1  # processes
     ray: str | None = None  # the cluster where they are; this machine where None
     threads: int = 2  # of each
     shard_size: int = 50  # photos
+
+    @property
+    def paints_by_network(self) -> bool:
+        return self.inpainter in INPAINTERS and INPAINTERS[self.inpainter].network
 
     def check(self) -> None:
         """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
@@ -49,6 +54,11 @@ class DatasetOptions:
             )
         if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
             raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
+        check_name("--inpainter", self.inpainter, COMPLETIONS)
+        for option, given in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
+            if given is not None and not self.paints_by_network:
+                line = f"--inpainter-{option} {given}: the {self.inpainter} inpainter has no network"
+                raise InputError(f"{line}: leave the option out")
         low, high = self.choices.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
             raise InputError(
@@ -82,14 +92,14 @@ class DatasetOptions:
             return [photo.name, photo.sha256, "none"]
 
 
-def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter) -> dict[str, Any]:
+def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completion: Completion) -> dict[str, Any]:
     """Everything that decides what the shards hold, ready for JSON, without the places of files.
 
     Threads are part of it: SHARP's last bits depend on their number. Workers are not.
     """
     base, choices = options.base, options.choices
     inputs = digest_of([options.inputs_of(photo) for photo in photos])
-    weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
+    weights = {name: weights_digest(file) for name, file in completion.files.items()}
     return {
         "spackle": spackle.__version__,
         "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
@@ -101,7 +111,8 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainte
         },
         "views": dataclasses.asdict(choices)
         | {"disparity": list(choices.disparity), "trajectory": choices.trajectory and spelled(choices.trajectory)},
-        "inpainter": {"name": inpainter.name, "version": inpainter.version} | ({"weights": weights} if weights else {}),
+        "inpainter": {"name": completion.name, "version": completion.version}
+        | ({"weights": weights} if weights else {}),
         "shard_size": options.shard_size,
         "threads": options.threads,
     }

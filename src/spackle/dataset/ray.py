@@ -25,7 +25,6 @@ from spackle.dataset.photos import PhotoFile
 from spackle.dataset.shards import differences
 from spackle.digest import fingerprint
 from spackle.errors import InputError, reason_in_a_line
-from spackle.inpaint import INPAINTERS
 
 ANSWER_S = 30.0  # for a cluster to answer
 START_S = 600.0  # for a worker to start where there is none, on a cluster that has room for it
@@ -106,7 +105,7 @@ def _check_room(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> 
 def gpus_of(options: DatasetOptions, nodes: Sequence[Mapping[str, Any]]) -> int:
     """GPUs of each worker: 1 if any node has one and a network can use it, else 0."""
     there = any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes)
-    network = options.base.kind.network or INPAINTERS[options.inpainter].network
+    network = options.base.kind.network or options.paints_by_network
     return int(there and network and options.base.device != "cpu")
 
 
@@ -123,7 +122,7 @@ class RemoteMaker:
         """Set up; InputError if version or weights differ from the main process's."""
         try:
             self.maker = Maker.of(self.options, Path())
-            own = configuration(self.options, (), self.maker.inpainter)
+            own = configuration(self.options, (), self.maker.completion)
         except InputError as error:
             raise InputError(f"node {socket.gethostname()}: {error}") from error
         if lines := differences(expected, own):
@@ -180,7 +179,7 @@ class WorkerPool:
         """Start workers on `ray`, which is connected to a cluster."""
         self.ray, self.options, self.output, self.log = ray, options, output, log
         self.left, self.deaths = deque(jobs), Counter[int]()  # deaths by the index of the photo
-        self.expected = configuration(options, (), Maker.of(options, output).inpainter)
+        self.expected = configuration(options, (), Maker.of(options, output).completion)
         gpus = gpus_of(options, ray.nodes())
         self.kind = ray.remote(num_cpus=options.threads, num_gpus=gpus, max_restarts=0)(RemoteMaker)
         self.workers: list[_Worker] = []

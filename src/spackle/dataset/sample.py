@@ -23,12 +23,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from spackle.camera import Camera
-from spackle.dataset.views import PathChoice
+from spackle.dataset.views import PathChoice, ViewStack
 from spackle.errors import InputError
 from spackle.formats.camera_files import checked_camera
 from spackle.formats.png import to_bytes
 from spackle.gaussians import Gaussians
-from spackle.inpaint import ViewStack
 from spackle.render.protocol import Rendering
 
 COMPRESSION = 1  # zlib's: 6 takes three times as long and saves a tenth

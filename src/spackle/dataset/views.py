@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,12 +12,9 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
-from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
-from spackle.inpaint import SceneCompletion, ViewStack
 from spackle.render import Renderer
-from spackle.render.protocol import Rendering
-from spackle.residual import MASK_THRESHOLD, Completer, hole_mask
+from spackle.residual import MASK_THRESHOLD, hole_mask
 
 VIEWS = 20  # the paper's, the photo's own view among them
 DISPARITY = (0.1, 0.6)  # from a small move to the widest in the paper's figures
@@ -78,6 +75,19 @@ def _distance(one: Camera, other: Camera) -> float:
     return float((one.position.double() - other.position.double()).norm())
 
 
+@dataclasses.dataclass(frozen=True)
+class ViewStack:
+    """A photo's Gaussians and what V cameras see of them."""
+
+    base: Gaussians
+    photo_camera: Camera
+    cameras: Sequence[Camera]  # the first one is the photo's
+    rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
+    depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
+    alpha: Tensor  # [V, H, W] opacity
+    mask: Tensor  # [V, H, W] bool: uncovered
+
+
 @torch.no_grad()
 def render_views(
     base: Gaussians,
@@ -90,23 +100,3 @@ def render_views(
     drawn = [renderer.render(base, camera) for camera in cameras]
     rgb, depth, alpha = (torch.stack([getattr(view, name) for view in drawn]) for name in ("rgb", "depth", "alpha"))
     return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha, threshold))
-
-
-def scene_completion(renderer: Renderer) -> SceneCompletion:
-    """Completion of a whole scene, by seeds alone: each hole is filled in the widest view that shows it."""
-
-    def complete(base: Gaussians, photo_camera: Camera, cameras: Sequence[Camera]) -> Callable[[Camera], Tensor]:
-        aux = Completer(base, photo_camera, renderer).complete_scene(cameras, exact=True)
-        return lambda camera: _closed(renderer.render([base, aux], camera))
-
-    return complete
-
-
-def _closed(drawn: Rendering) -> Tensor:
-    """The colours [H, W, 3] of a view, the few pixels that are still uncovered grown from those around them."""
-    left = hole_mask(drawn.alpha)
-    known = ~left & (drawn.depth > 0)
-    if not bool(left.any()) or not bool(known.any()):
-        return drawn.rgb
-    inverse_depth = torch.where(known, 1.0 / drawn.depth.clamp_min(1e-6), 0.0)
-    return far_fill(inverse_depth, drawn.rgb.permute(2, 0, 1), known)[1].permute(1, 2, 0)

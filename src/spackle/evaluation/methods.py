@@ -14,7 +14,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.inpaint import Inpainter, InpainterOptions, ViewStack, get_inpainter
+from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet, hole_mask
@@ -99,10 +99,10 @@ def _dense(shot: Shot, network: ResidualNet | None, precision: Precision) -> Ite
 
 def _inpaint_2d(shot: Shot, inpainter: Inpainter) -> Iterator[View]:
     """The base's render with its hole inpainted as a flat picture."""
-    for camera, before in zip(shot.cameras, shot.before, strict=True):
-        flat = [image[None] for image in (before.rgb, before.depth, before.alpha, hole_mask(before.alpha))]
-        stack = ViewStack(shot.base, shot.prediction.camera, [camera], *flat)
-        yield View(inpainter.complete(stack)[0], None, None)
+    for before in shot.before:
+        hole = hole_mask(before.alpha)
+        flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
+        yield View(inpainter.paint(*(image[None] for image in flat))[0], None, None)
 
 
 def _direct_ft(shot: Shot, prediction: BasePrediction, unit: float) -> Iterator[View]:
@@ -127,7 +127,7 @@ METHODS = {
     "spackle-scene": MethodNames("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
     "seeds": MethodNames("seeds", "as Spackle, without a network: deltas of zero"),
     "dense": MethodNames("dense grid", "an aux Gaussian for every cell, in one pass"),
-    "inpaint2d": MethodNames("2D inpainting", "the base's render, its hole inpainted by OpenCV (Telea, radius 5)"),
+    "inpaint2d": MethodNames("2D inpainting", "the base's render, its hole inpainted as a flat picture"),
     "direct-ft": MethodNames("direct FT", "the base fine-tuned on completed views, no aux Gaussians"),
 }
 
@@ -137,6 +137,7 @@ def make_method(
     network: ResidualNet | None,
     direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None,
     precision: Precision = "auto",
+    inpainter: Inpainter | None = None,
 ) -> Method:
     """A method of `METHODS`.
 
@@ -145,16 +146,15 @@ def make_method(
         network: of the residual, run at `precision`; None for seeds alone.
         direct_ft: predicts the photo with the other base, and gives that one's unit of length in this one's.
         precision: see `network`.
-
-    Raises:
-        InputError: OpenCV is not installed, for inpaint2d.
+        inpainter: of inpaint2d.
     """
     if name == "direct-ft":
         assert direct_ft is not None
         prediction, unit = direct_ft()
         return partial(_direct_ft, prediction=prediction, unit=unit)
     if name == "inpaint2d":
-        return partial(_inpaint_2d, inpainter=get_inpainter("opencv", InpainterOptions()))
+        assert inpainter is not None
+        return partial(_inpaint_2d, inpainter=inpainter)
     methods: dict[str, Method] = {
         "base": lambda shot: (View(before.rgb, before.alpha, 0) for before in shot.before),
         "spackle": partial(_per_view, network=network, precision=precision),

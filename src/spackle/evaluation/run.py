@@ -151,8 +151,8 @@ def examine(case: Case, evaluation: Evaluation) -> tuple[ImageResult, dict[str, 
             return other, 1.0
         return other, alignment.scale / _align(loaded, other, evaluation, False).scale
 
-    network, precision = evaluation.network, options.base.precision
-    methods = {name: make_method(name, network, direct_ft, precision) for name in options.methods}
+    parts = (evaluation.network, direct_ft, options.base.precision, evaluation.inpainter)
+    methods = {name: make_method(name, *parts) for name in options.methods}
     measured = measure(prediction, wanted, methods, evaluation.gauges, evaluation.renderer)
     facts: dict[str, Any] = {
         "width": loaded.photo.width,

@@ -24,7 +24,7 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
-from spackle.inpaint.opencv import OpenCV
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.scene import ResidualChoice
@@ -48,6 +48,7 @@ class EvaluateOptions:
     base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too
     residual: str | None = None  # a file, "seeds", or None for the shipped weights if any
     direct_ft: Path | None = None  # weights of the method direct-ft
+    inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
     limit: int | None = None  # so many images, spread over the dataset
     download: bool = False  # pyiqa may fetch weights
@@ -80,6 +81,7 @@ class EvaluateOptions:
         check_name("--protocol", self.protocol, DEFAULT_METRICS)
         for method in self.methods:
             check_name("--methods", method, METHODS)
+        check_name("--inpainter", self.inpainter, INPAINTERS)
         for metric in self.metrics or ():
             check_name("--metrics", metric, METRICS)
             if METRICS[metric].truth and not self.near:
@@ -132,6 +134,7 @@ class Evaluation:
     base: OpenedBase  # see `open`
     direct: OpenedBase | None  # of the method direct-ft
     network: ResidualNet | None
+    inpainter: Inpainter | None  # of the method inpaint2d
     renderer: Renderer
     gauges: Gauges
     config: dict[str, Any]  # everything that decides the figures, ready for JSON; nothing of where files lie
@@ -153,7 +156,9 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)
-    network, direct, features = ResidualChoice(options.residual).load(), None, None
+    network, direct, features, inpainter = ResidualChoice(options.residual).load(), None, None, None
+    if "inpaint2d" in options.methods:
+        inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
     if options.direct_ft is not None:
         direct = open_base(dataclasses.replace(options.base, checkpoint=_there(options.direct_ft, "--direct-ft")))
     wanted = options.wanted_metrics
@@ -165,11 +170,13 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     states = dict.fromkeys(wanted, OWN) | found
     if "distance" in wanted and features is None:
         states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
-    if "inpaint2d" in options.methods:
-        OpenCV("--methods inpaint2d:", "or leave the method out")  # raises without the package, before any work
     config = _configuration(options, dataset, cases) | {"metrics": states}  # metric → who measures it, or why nobody
+    if inpainter is not None:
+        weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
+        config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
     base, renderer = open_base(options.opened), get_renderer(options.base.device)
-    return Evaluation(options, cases, base, direct, network, renderer, Gauges(wanted, published, features), config)
+    gauges = Gauges(wanted, published, features)
+    return Evaluation(options, cases, base, direct, network, inpainter, renderer, gauges, config)
 
 
 def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import InputError
-from spackle.inpaint.protocol import InpainterOptions, PlainInpainter, ViewStack
+from spackle.inpaint.protocol import InpainterOptions, PlainInpainter
 
 RADIUS = 5.0  # pixels around a hole's pixel that colour it
 
@@ -16,13 +16,12 @@ RADIUS = 5.0  # pixels around a hole's pixel that colour it
 class OpenCV:
     """The package, found once."""
 
-    def __init__(self, wanted_by: str, instead: str = "") -> None:
-        """Find it; InputError where it is not installed, which says what needs it and what to do without it."""
+    def __init__(self, wanted_by: str) -> None:
+        """Find it; InputError where it is not installed, which says what needs it."""
         try:
             import cv2
         except ImportError as error:
-            line = f"{wanted_by} needs a package: pip install 'spackle-nvs[opencv]'"
-            raise InputError(f"{line}; {instead}" if instead else line) from error
+            raise InputError(f"{wanted_by} needs a package: pip install 'spackle-nvs[opencv]'") from error
         self._cv2: Any = cv2
         self.version: str = cv2.__version__
         self._flow = self._cv2.DISOpticalFlow_create(self._cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -56,16 +55,16 @@ class OpencvInpainter(PlainInpainter):
 
     def __init__(self, options: InpainterOptions) -> None:
         """Find the package; InputError where it is not installed."""
-        self._opencv = OpenCV("--inpainter opencv", "geometry needs none")
+        self._opencv = OpenCV("inpainter opencv:")
         self.version = f"telea {RADIUS:g}, cv2 {self._opencv.version}"
 
-    def complete(self, views: ViewStack) -> Tensor:
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
         """Each view by itself, with 8 bits a channel in the holes."""
-        targets = []
-        for rgb, mask in zip(views.rgb, views.mask, strict=True):
-            filled = self._opencv.inpaint(rgb, mask, RADIUS) if bool(mask.any()) else rgb
-            targets.append(torch.where(mask[..., None], filled, rgb))
-        return torch.stack(targets)
+        painted = []
+        for view, mask in zip(rgb, hole, strict=True):
+            filled = self._opencv.inpaint(view, mask, RADIUS) if bool(mask.any()) else view
+            painted.append(torch.where(mask[..., None], filled, view))
+        return torch.stack(painted)
 
 
 def _bytes(rgb: Tensor) -> Tensor:

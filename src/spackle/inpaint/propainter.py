@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,11 +19,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
-from spackle.camera import Camera
 from spackle.device import enough_memory, pick_device
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import MAX_SIDE, check_file, working_size
-from spackle.inpaint.protocol import InpainterOptions, ViewStack
+from spackle.inpaint.protocol import InpainterOptions
 
 NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; so their files begin
 SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
@@ -35,7 +34,7 @@ ITERATIONS = 20  # of the flow, the authors' choice
 
 
 class PropainterInpainter:
-    """Completes all views of a photo at once, as the frames of one video."""
+    """Paints all views at once, as the frames of one video."""
 
     name = "propainter"
     network: ClassVar[bool] = True
@@ -60,29 +59,27 @@ class PropainterInpainter:
         self.version = f"1, pytorchcv {version}, long side {self._side}"
 
     @torch.no_grad()
-    def complete(self, views: ViewStack) -> Tensor:
-        """The colours of the completed video, in the holes.
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        """The colours of the completed video, whose frames the views are, in the holes.
 
         Raises:
             InputError: too little memory, or no finite colours.
         """
-        if not bool(views.mask.any()):
-            return views.rgb
-        height, width = views.mask.shape[1:]
+        if not bool(hole.any()):
+            return rgb
+        height, width = hole.shape[1:]
         small = working_size(width, height, self._side)[::-1]
-        order = path_order(views.cameras)
-        frames = F.interpolate(views.rgb[order].permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
-        holes = F.interpolate(views.mask[order, None].float(), small, mode="area") > 0  # a thin one is not lost
+        frames = F.interpolate(rgb.permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
+        holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # a thin one is not lost
         try:
             with enough_memory():
-                filled = self._fill(frames.clamp(0, 1), holes.float()).to(views.rgb)
+                filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         except InputError as error:
             raise InputError(f"ProPainter: too little memory at {self._side} pixels: lower --inpainter-side") from error
         if not bool(filled.isfinite().all()):
             raise InputError("ProPainter: its colours are not finite: give the published --inpainter-weights")
-        targets = torch.empty_like(views.rgb)
-        targets[order] = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
-        return torch.where(views.mask[..., None], targets, views.rgb)
+        painted = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
+        return torch.where(hole[..., None], painted, rgb)
 
     def _fill(self, frames: Tensor, holes: Tensor) -> Tensor:
         """Frames [V, 3, h, w] in 0..1, drawn anew in and around the holes [V, 1, h, w], which are 1."""
@@ -103,14 +100,6 @@ class PropainterInpainter:
         return (drawn[:count, :, :height, :width] + 1) / 2
 
 
-def path_order(cameras: Sequence[Camera]) -> list[int]:
-    """Views as a flight along the path meets them: the first one, the photo's, is put where it is the least detour."""
-    eyes = torch.stack([camera.position.double() for camera in cameras])
-    others = list(range(1, len(cameras)))
-    orders = [[*others[:place], 0, *others[place:]] for place in range(len(cameras))]
-    return min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))
-
-
 def padded(side: int) -> int:
     """Pixels of a side that the networks can take."""
     return max(MIN_SIDE, -(-side // MULTIPLE) * MULTIPLE)
@@ -129,9 +118,9 @@ def _package_version() -> str:
         import pytorchcv.models.propainter_stream
     except Exception as error:  # a torchvision of another build raises RuntimeError
         if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("pytorchcv"):
-            raise InputError("--inpainter propainter needs a package: pip install 'spackle-nvs[propainter]'") from error
+            raise InputError("inpainter propainter needs a package: pip install 'spackle-nvs[propainter]'") from error
         raise InputError(
-            f"--inpainter propainter: torchvision cannot be imported ({reason_in_a_line(error)}): "
+            f"inpainter propainter: torchvision cannot be imported ({reason_in_a_line(error)}): "
             f"install the one that was built for torch {torch.__version__}, from where this torch came"
         ) from error
     return str(pytorchcv.__version__)
@@ -158,7 +147,7 @@ def weight_files(folder: Path | None) -> dict[str, Path]:
     """
     wanted = f"{', '.join(NETWORKS)}: one .pth file of each, unpacked from {SOURCE}"
     if folder is None:
-        raise InputError(f"--inpainter propainter: has no weights: give --inpainter-weights FOLDER with {wanted}")
+        raise InputError(f"inpainter propainter: has no weights: give --inpainter-weights FOLDER with {wanted}")
     try:
         names = sorted(file.name for file in folder.iterdir())
     except (OSError, ValueError) as error:

@@ -3,44 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Protocol
 
+import torch
 from torch import Tensor
-
-from spackle.camera import Camera
-from spackle.gaussians import Gaussians
-
-# (base, photo's camera, V cameras) to a function that draws the completed scene, sRGB [H, W, 3], from any of them.
-SceneCompletion = Callable[[Gaussians, Camera, Sequence[Camera]], Callable[[Camera], Tensor]]
-
-
-@dataclasses.dataclass(frozen=True)
-class ViewStack:
-    """A photo's Gaussians and what V cameras see of them."""
-
-    base: Gaussians
-    photo_camera: Camera
-    cameras: Sequence[Camera]  # in a dataset the first one is the photo's
-    rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
-    depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
-    alpha: Tensor  # [V, H, W] opacity
-    mask: Tensor  # [V, H, W] bool: uncovered
 
 
 @dataclasses.dataclass(frozen=True)
 class InpainterOptions:
     """What inpainters are made of; each takes what it needs."""
 
-    weights: Path | None = None  # a folder
+    weights: Path | None = None  # a file or a folder; where None, those that `spackle weights get` brought
     side: int | None = None  # pixels of the long side at which a network works; its own default where None
     device: str | None = None  # "cpu" or "cuda"; where None, CUDA if there is any
-    complete_scene: SceneCompletion | None = None  # fills a scene's holes in 3D
 
 
 class Inpainter(Protocol):
-    """Turns renderings with holes into targets."""
+    """Fills the holes of pictures; the same input gives the same output."""
 
     name: str
     version: str  # another version may give other pixels
@@ -51,8 +32,17 @@ class Inpainter(Protocol):
     def __init__(self, options: InpainterOptions) -> None:
         """Find what it needs; InputError where that is missing."""
 
-    def complete(self, views: ViewStack) -> Tensor:
-        """Targets [V, H, W, 3] sRGB in 0..1: new colours where `views.mask` is, elsewhere `views.rgb` as it is."""
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        """New colours in the holes of V views of one scene, ordered as a camera that flies past would see them.
+
+        Args:
+            rgb: [V, H, W, 3] sRGB in 0..1.
+            hole: [V, H, W] bool.
+            inverse_depth: [V, H, W] 1/z of what the views show; 0 where it is unknown.
+
+        Returns:
+            [V, H, W, 3] sRGB in 0..1, outside of the holes `rgb` bit for bit.
+        """
         ...
 
 
@@ -62,3 +52,8 @@ class PlainInpainter:
     network: ClassVar[bool] = False
     notice: ClassVar[str] = ""
     files: Mapping[str, Path] = {}
+
+
+def known_inverse_depth(depth: Tensor, hole: Tensor) -> Tensor:
+    """`inverse_depth` for `Inpainter.paint` of renderings with depth [V, H, W]: 0 in the holes and where depth is 0."""
+    return torch.where(~hole & (depth > 0), 1 / depth.clamp_min(1e-6), 0.0)
