@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,23 +27,31 @@ from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import SHIPPED, load_residual, shipped_network
+from spackle.residual.texture import EXEMPLAR, Texture
 
 PATH_FRAMES = 60
 LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
+Fill = Literal["auto", "network", "exemplar", "none"]  # where the holes' texture comes from; none leaves them open
 Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or the paper's one for each
 
 
 @dataclasses.dataclass(frozen=True)
 class ResidualChoice:
-    """What fills the holes, as --residual names it."""
+    """What fills the holes, as --residual and --fill name it."""
 
     named: str | None = None  # a file, "seeds", "none", or None for the shipped weights if there are any
+    wanted: Fill = "auto"
+
+    @property
+    def fill(self) -> Fill:
+        """Where the texture comes from; "none" also where the residual is."""
+        return "none" if self.named == "none" else self.wanted
 
     @property
     def weights(self) -> str:
         """For reports: "shipped", a file, "seeds" or "none"."""
-        return self.named or ("shipped" if SHIPPED.is_file() else "seeds")
+        return "none" if self.fill == "none" else self.named or ("shipped" if SHIPPED.is_file() else "seeds")
 
     @property
     def file(self) -> Path | None:
@@ -131,6 +140,7 @@ def predict(
     kind: TrajectoryKind = "rotate_forward",
     disparity: float = 0.3,
     network: ResidualNet | Shipped | None = "shipped",
+    fill: Fill = "auto",
     renderer: Renderer | None = None,
 ) -> Scene:
     """A photo to a scene without holes along a camera path.
@@ -145,6 +155,7 @@ def predict(
         kind: the path that the scene is completed for.
         disparity: how far the path goes, see `spackle.camera_path.max_offset`.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
+        fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
 
     Raises:
@@ -161,7 +172,16 @@ def predict(
     if choice.note:
         LOG.info("%s: %s", loaded.path.name, choice.note)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
-    return complete(prediction, cameras, network=network, renderer=renderer)
+    return complete(prediction, cameras, network=network, fill=fill, renderer=renderer)
+
+
+@functools.cache
+def open_texture(fill: Fill) -> Texture | None:
+    """What gives the fill its texture: "exemplar" takes it from the view itself; None for "network" and "none".
+
+    "auto" is the exemplar.
+    """
+    return None if fill in ("network", "none") else EXEMPLAR
 
 
 def complete(
@@ -171,6 +191,7 @@ def complete(
     mode: Mode = "scene",
     exact: bool = False,
     network: ResidualNet | Shipped | None = "shipped",
+    fill: Fill = "auto",
     renderer: Renderer | None = None,
     precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
@@ -183,13 +204,16 @@ def complete(
         mode: "view" fills each view by itself, as the paper does, and leaves `Scene.aux` empty.
         exact: the views are these and no others between them; for scene mode.
         network: see `predict`.
+        fill: see `predict`.
         renderer: the CPU's where None.
         precision: of the network.
         progress: called with views done and their number.
     """
-    chosen = shipped_network() if network == "shipped" else network
     base, camera = prediction.gaussians, prediction.camera
-    completer = Completer(base, camera, renderer or get_renderer(), chosen, precision=precision)
+    if fill == "none":
+        return Scene(base, Gaussians.empty(), camera)
+    chosen = shipped_network() if network == "shipped" else network
+    completer = Completer(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
     if mode == "scene":
         return Scene(base, completer.complete_scene(cameras, exact=exact, progress=progress), camera)
     guards, by_view = [completer.photo_guard()], []

@@ -117,7 +117,7 @@ class _Run:
             completer.renderer,
             OpenCV("a clip").flow,
             align=completer.settings.depth is None,  # measured depth stays as it is
-            fill=completer.residual.weights != "none",
+            fill=completer.residual.fill != "none",
             network=completer.network,
             precision=completer.settings.precision,
         )
@@ -281,7 +281,9 @@ class ClipCompleter:
             before, aux = self.renderer.render(base, camera), Gaussians.empty()
             alone = before
             if self.fill:
-                completer = Completer(base, prediction.camera, self.renderer, self.network, precision=self.precision)
+                parts = (base, prediction.camera, self.renderer, self.network)
+                # Texture is found anew in each frame: it would flicker.
+                completer = Completer(*parts, texture=None, precision=self.precision)
                 aux, alone = completer.completed_view(camera, [guard], rendering=before)
         drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
         if self.fill:

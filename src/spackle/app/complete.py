@@ -22,7 +22,7 @@ from spackle.image import Photo, resize_photo
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.scene import Mode, ResidualChoice, Scene, complete
+from spackle.scene import Mode, ResidualChoice, Scene, complete, open_texture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +68,7 @@ class PhotoCompleter:
         path.check()
         self.settings, self.residual, self.path, self.mode = base, residual, path, mode
         self.network = residual.load()
+        open_texture(residual.fill)  # fails before long work
         self.given_views, self.keyframes = path.load()
         self.base = open_base(base)
         self.renderer = get_renderer(base.device)
@@ -128,15 +129,14 @@ class PhotoCompleter:
         return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}
 
     def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, str | None]:
-        """Fill the holes, as --mode and --residual say; in view mode also says which view the scene's file holds."""
-        if self.residual.weights == "none":
-            return Scene(prediction.gaussians, Gaussians.empty(), prediction.camera), None
+        """Fill the holes, as the options say; in view mode also says which view the scene's file holds."""
         scene = complete(
             prediction,
             views.cameras,
             mode=self.mode,
             exact=self.given_views is not None,
             network=self.network,
+            fill=self.residual.fill,
             renderer=self.renderer,
             precision=self.settings.precision,
             progress=step,

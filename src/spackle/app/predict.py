@@ -160,7 +160,12 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
     """A digest of what all photos share: version, options, and what their files hold; InputError for a missing file."""
     settings, residual, path = options.base, options.residual, options.path
     named = settings.named if settings.folder is None else "hf"  # its files tell, wherever they lie
-    own: dict[str, object] = {"spackle": spackle.__version__, "base": named, "residual": residual.weights}
+    own: dict[str, object] = {
+        "spackle": spackle.__version__,
+        "base": named,
+        "residual": residual.weights,
+        "fill": residual.fill,
+    }
     own |= {"render": options.render, "mode": options.mode, **options.lens}
     fields = {**dataclasses.asdict(settings), **dataclasses.asdict(path)}
     for name in ("name", "low_memory", "windows", "compiled"):  # recorded as `base`, or change last bits alone
@@ -218,7 +223,7 @@ def make_report(
         "focal_px": round(prediction.camera.focal[0], 3),
         "focal_source": prediction.lens_source or photo.focal_source,
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
-        "residual": {"weights": weights},
+        "residual": {"weights": weights, "fill": completer.residual.fill},
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
         "mode": completer.mode,

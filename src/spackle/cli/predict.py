@@ -68,6 +68,13 @@ def predict(
             help="Weights of the residual. seeds: without any; none: base alone. Default: shipped ones, else seeds.",
         ),
     ] = None,
+    fill: Annotated[
+        Literal["auto", "network", "exemplar", "none"],
+        typer.Option(
+            help="Texture of what fills the holes. exemplar: from the photo itself; network: none but the residual's; "
+            "none: holes stay open. auto: exemplar."
+        ),
+    ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
     path: PathOptions,
     mode: Annotated[
@@ -92,7 +99,9 @@ def predict(
     from spackle.scene import ResidualChoice
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, low_memory, windows, compiled, device)
-    options = PredictOptions(settings, ResidualChoice(residual), path, render, mode, focal_px, focal_mm, fov, overwrite)
+    options = PredictOptions(
+        settings, ResidualChoice(residual, fill), path, render, mode, focal_px, focal_mm, fov, overwrite
+    )
     if predict_all(photo, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

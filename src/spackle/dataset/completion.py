@@ -45,7 +45,7 @@ def open_completion(name: str, options: InpainterOptions, renderer: Renderer) ->
 @torch.no_grad()
 def draw_from_scene(views: ViewStack, renderer: Renderer) -> Tensor:
     """Each hole as one scene shows it, completed by seeds alone in the widest view: it stays where it is in all."""
-    aux = Completer(views.base, views.photo_camera, renderer).complete_scene(views.cameras, exact=True)
+    aux = Completer(views.base, views.photo_camera, renderer, texture=None).complete_scene(views.cameras, exact=True)
     targets = []
     for camera, target, hole in zip(views.cameras, views.rgb, views.mask, strict=True):
         if bool(hole.any()):

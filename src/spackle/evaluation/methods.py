@@ -23,6 +23,7 @@ from spackle.residual.hole_features import Cues
 from spackle.residual.network import predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
 from spackle.residual.seeds import Rim, make_seeds
+from spackle.residual.texture import EXEMPLAR, Texture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +44,11 @@ class Shot:
         """What the photo shows, which no completion may cover."""
         return self.completer(None).photo_guard()
 
-    def completer(self, network: ResidualNet | None, precision: Precision = "auto") -> Completer:
+    def completer(
+        self, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = EXEMPLAR
+    ) -> Completer:
         """What fills its holes; with seeds alone where there is no network."""
-        return Completer(self.base, self.prediction.camera, self.renderer, network, precision=precision)
+        return Completer(self.base, self.prediction.camera, self.renderer, network, texture, precision=precision)
 
     def draw(self, aux: Gaussians, index: int) -> View:
         """A view with aux Gaussians on top of the base."""
@@ -67,9 +70,11 @@ class View:
 Method = Callable[[Shot], Iterator[View]]  # the views of a shot, in its order, one at a time: there may be many
 
 
-def _per_view(shot: Shot, network: ResidualNet | None, precision: Precision = "auto") -> Iterator[View]:
+def _per_view(
+    shot: Shot, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = EXEMPLAR
+) -> Iterator[View]:
     """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
-    completer = shot.completer(network, precision)
+    completer = shot.completer(network, precision, texture)
     for camera, before in zip(shot.cameras, shot.before, strict=True):
         aux, drawn = completer.completed_view(camera, [shot.guard], rendering=before)
         yield View(drawn.rgb, drawn.alpha, len(aux))
@@ -125,6 +130,7 @@ METHODS = {
     "base": MethodNames("base alone", "the base's render, holes black"),
     "spackle": MethodNames("Spackle", "aux Gaussians for each view by itself, as in the paper"),
     "spackle-scene": MethodNames("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
+    "network": MethodNames("network", "as Spackle, without the exemplar's texture: the paper's method"),
     "seeds": MethodNames("seeds", "as Spackle, without a network: deltas of zero"),
     "dense": MethodNames("dense grid", "an aux Gaussian for every cell, in one pass"),
     "inpaint2d": MethodNames("2D inpainting", "the base's render, its hole inpainted as a flat picture"),
@@ -159,7 +165,8 @@ def make_method(
         "base": lambda shot: (View(before.rgb, before.alpha, 0) for before in shot.before),
         "spackle": partial(_per_view, network=network, precision=precision),
         "spackle-scene": partial(_one_scene, network=network, precision=precision),
-        "seeds": partial(_per_view, network=None),
+        "network": partial(_per_view, network=network, precision=precision, texture=None),
+        "seeds": partial(_per_view, network=None, texture=None),
         "dense": partial(_dense, network=network, precision=precision),
     }
     return methods[name]

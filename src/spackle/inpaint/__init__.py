@@ -6,7 +6,7 @@ To add an inpainter, write a class in a file of its own (see `Inpainter`), add a
 from __future__ import annotations
 
 from spackle.errors import check_name
-from spackle.inpaint.lama import LamaInpainter
+from spackle.inpaint.exemplar import ExemplarInpainter
 from spackle.inpaint.opencv import OpencvInpainter
 from spackle.inpaint.propainter import PropainterInpainter
 from spackle.inpaint.protocol import Inpainter, InpainterOptions, known_inverse_depth
@@ -14,7 +14,7 @@ from spackle.inpaint.protocol import Inpainter, InpainterOptions, known_inverse_
 __all__ = ["INPAINTERS", "Inpainter", "InpainterOptions", "get_inpainter", "known_inverse_depth"]
 
 INPAINTERS: dict[str, type[Inpainter]] = {
-    "lama": LamaInpainter,
+    "exemplar": ExemplarInpainter,
     "opencv": OpencvInpainter,
     "propainter": PropainterInpainter,
 }

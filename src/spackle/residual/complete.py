@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from spackle.camera import Camera
+from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
@@ -21,11 +22,13 @@ from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
 from spackle.residual.rim_underlay import rim_underlay
 from spackle.residual.seeds import Rim, make_seeds
+from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
 from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first, reach_of
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 WIDEST = 8  # views of a path whose own content stays in front from the first
+PAINTED_VIEWS = 2  # of a scene for which an inpainter paints: the widest ones
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
 
@@ -40,6 +43,7 @@ class Completer:
     photo_camera: Camera
     renderer: Renderer
     network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
+    texture: Texture | None = EXEMPLAR  # None: colours as the network or the seeds have them
     threshold: float = MASK_THRESHOLD
     precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
 
@@ -101,7 +105,7 @@ class Completer:
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
             view = self.renderer.render(self.base, cameras[index])
             guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
-        settled, aux = SettledFrames(len(cameras)), Gaussians.empty()
+        settled, aux, filled = SettledFrames(len(cameras)), Gaussians.empty(), 0
         enough = CLOSED_HAR if exact else QUIET_HAR
         for count, index in enumerate(order):
             if exact or not settled.known(index):
@@ -112,8 +116,9 @@ class Completer:
                 reach = float(holes == 0) if exact else reach_of(holes, view.alpha, self.threshold)
                 if not reach:
                     others = [guard for of, guard in guards.items() if of != index]
-                    chosen = dataclasses.replace(self, network=None) if holes < SEEDS_HAR and not exact else self
+                    chosen = self._seeds_alone if holes < SEEDS_HAR and not exact else self._for_view(filled)
                     new, view = chosen._fill(camera, others, [self.base, aux], view, enough, len(cameras) > 1)
+                    filled += 1
                     aux = Gaussians.cat([aux, new])
                     guards[index] = OcclusionGuard.of(view, camera, self.threshold)
                 settled.looked(index, reach)
@@ -134,7 +139,7 @@ class Completer:
         added = [Gaussians.empty()]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = self._propose(rendering, camera, self.network if turn == 0 else None, underlay)
+            new = (self._seeds_alone if turn else self)._propose(rendering, camera, underlay)
             if not len(new):
                 break
             new = push_behind(new, camera.position, guards)
@@ -145,14 +150,33 @@ class Completer:
                 break
         return Gaussians.cat(added), rendering
 
-    def _propose(self, rendering: Rendering, camera: Camera, network: ResidualNet | None, underlay: bool) -> Gaussians:
+    @property
+    def _seeds_alone(self) -> Completer:
+        return dataclasses.replace(self, network=None, texture=None)
+
+    def _for_view(self, number: int) -> Completer:
+        """An inpainter is asked for the first views of a scene; they show nearly all of what later ones need."""
+        if number < PAINTED_VIEWS or not isinstance(self.texture, PaintedTexture):
+            return self
+        return dataclasses.replace(self, texture=EXEMPLAR)
+
+    def _propose(self, rendering: Rendering, camera: Camera, underlay: bool) -> Gaussians:
         """Masked selection (eq. 7): one Gaussian for each masked cell of a rendering; and those beneath the rims."""
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return Gaussians.empty()
-        seeds, deltas = make_seeds(cues, camera, self.photo_camera), None
-        if network is not None:
-            rim = Rim.of(cues, seeds, camera, self.photo_camera)
-            deltas = predict_deltas(network, cues, seeds, rim, self.precision)[cues.mask]
-        new = compose(seeds.select(cues.mask), deltas, camera)
+        seeds = make_seeds(cues, camera, self.photo_camera)
+        chosen = seeds.select(cues.mask)
+        if self.network is None and self.texture is None:
+            new = compose(chosen, None, camera)
+        else:
+            rim, deltas = Rim.of(cues, seeds, camera, self.photo_camera), None
+            if self.network is not None:
+                deltas = predict_deltas(self.network, cues, seeds, rim, self.precision)[cues.mask]
+            new = compose(chosen, deltas, camera)
+            if self.texture is not None:
+                structure = cues.rgb.clone()
+                structure[cues.mask] = linear_to_srgb(new.colors)
+                colors = self.texture.colors(structure, rendering, cues, rim)[cues.mask]
+                new = dataclasses.replace(new, colors=srgb_to_linear(colors.clamp(0, 1)))
         return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new

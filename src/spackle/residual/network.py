@@ -24,9 +24,11 @@ from spackle.residual.sparse import Cells, conv_rows, crops_around, point_rows, 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
 MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
-IN_CHANNELS = MIRRORED.stop + 1  # and the distance to the rim
-COPIES = 2  # channels that say how much of each to take
+EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the exemplar's
+IN_CHANNELS = EXEMPLAR.stop + 1  # and how badly that fits
+COPIES = 3  # channels that say how much of each to take
 TYPICAL_DISTANCE = 16.0  # of a cell to the rim
+TYPICAL_MISMATCH = 0.1
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
@@ -83,7 +85,7 @@ class ResidualNet(nn.Module):
         _initialise(self)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features [B, 17, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
+        """Features [B, 21, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
         x, skips = self._encoded(features)
         for level in reversed(range(len(skips))):
             x = self._decoded(x, skips[level], level)
@@ -139,15 +141,17 @@ class ResidualNet(nn.Module):
 
 
 def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
-    """Features [1, 17, h, w], centred around zero; depths as log inverse depth over the view's median."""
+    """Features [1, 21, h, w], centred around zero; depths as log inverse depth over the view's median."""
     cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
     # Elsewhere the rim is the cell itself.
-    own, near, mirrored = (color_logit(colors[cues.mask]) for colors in (seeds.rgb, rim.rgb, rim.mirrored))
+    known = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar)
+    own, near, mirrored, patches = (color_logit(colors[cues.mask]) for colors in known)
     distance = (rim.distance[cues.mask] / TYPICAL_DISTANCE).log1p()[..., None]
     far = seeds.rgb.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-    far[cues.mask] = torch.cat([near - own, mirrored - own, distance], dim=-1)
+    mismatch = rim.mismatch[cues.mask][..., None] / TYPICAL_MISMATCH
+    far[cues.mask] = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
     channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
@@ -190,9 +194,10 @@ def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
 
 
 def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
-    """Deltas [B, 14, ...] from the outputs of the heads [B, 16, ...], the last two of which copy known colours."""
+    """Deltas [B, 14, ...] from the outputs of the heads [B, 17, ...], the last three of which copy known colours."""
     deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
-    taken = copies[:, :1] * features[:, FAR_RIM] + copies[:, 1:] * features[:, MIRRORED]
+    known = (FAR_RIM, MIRRORED, EXEMPLAR)
+    taken = sum(copies[:, [k]] * features[:, colors] for k, colors in enumerate(known))
     return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
 
 

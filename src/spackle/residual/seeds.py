@@ -17,6 +17,7 @@ from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.fill import FAR_BIAS, far_fill
+from spackle.inpaint.exemplar import exemplar
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
 
@@ -159,6 +160,8 @@ class Rim:
     rgb: Tensor  # [h, w, 3] sRGB at the far rim
     mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
+    exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that fit
+    mismatch: Tensor  # [h, w] how badly they fit: root of their mean squared difference; 0 elsewhere
 
     @staticmethod
     def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera) -> Rim:
@@ -178,7 +181,10 @@ class Rim:
         run_chunks(
             lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *cells), len(mask), GRAIN
         )
-        return Rim(*(torch.from_numpy(image).to(seeds.rgb) for image in cells))
+        guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
+        texture = exemplar(guess, cues.mask, seeds.inverse_depth)
+        grids = (*map(torch.from_numpy, cells), texture.rgb, texture.mismatch)
+        return Rim(*(grid.to(seeds.rgb) for grid in grids))
 
 
 @kernel

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spackle.blur import blurred
 from spackle.training.features import FeatureNet
 
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
@@ -27,10 +28,17 @@ TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero,
 PAPER_WEIGHTS = {"color": 10.0, "alpha": 0.5, "perceptual": 1.0, "preserve": 5.0}  # how much each term counts
 
 
-def color_loss(rgb: Tensor, target: Tensor, hole: Tensor) -> Tensor:
-    """[] mean |rgb - target| over a hole's pixels and the channels."""
-    apart = torch.where(hole[..., None], rgb - target, 0).abs()
-    return _mean_of_images(apart.mean(-1), hole)
+def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
+    """[] mean |rgb - target| over a hole's pixels and the channels.
+
+    With `blur`, a standard deviation in pixels, the difference is blurred within the hole first: then low frequencies
+    alone count, and texture, which nobody can know, is left to the perceptual term.
+    """
+    apart = torch.where(hole[..., None], rgb - target, 0)
+    if blur > 0:
+        mass = blurred(hole[..., None].to(rgb), blur).clamp_min(TINY)
+        apart = torch.where(hole[..., None], blurred(apart, blur) / mass, 0)
+    return _mean_of_images(apart.abs().mean(-1), hole)
 
 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
@@ -56,6 +64,7 @@ def perceptual_loss(
     *,
     dilation: int = 21,
     size: int | None = 512,
+    gram: float = 1.0,
 ) -> Tensor:
     """[] feature reconstruction and Gram statistics near the hole.
 
@@ -74,6 +83,7 @@ def perceptual_loss(
         rgb, target, hole: as above.
         dilation: side of the max-pool in pixels of `hole`, odd; 1 grows nothing.
         size: the longer side of the images that the network sees; None leaves them as they are.
+        gram: how much the second term counts.
 
     Raises:
         ValueError: an even dilation.
@@ -85,7 +95,7 @@ def perceptual_loss(
     with torch.no_grad():
         theirs = features(_resized(target, size))
     terms = [_layer_terms(f, t, covered(near, f)) for f, t in zip(ours, theirs, strict=True)]
-    return torch.stack([term for both in terms for term in both]).sum()
+    return torch.stack([layer + gram * texture for layer, texture in terms]).sum()
 
 
 def total_loss(
@@ -99,6 +109,8 @@ def total_loss(
     weights: Mapping[str, float] = PAPER_WEIGHTS,
     dilation: int = 21,
     size: int | None = 512,
+    blur: float = 0.0,
+    gram: float = 1.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum that is minimised, eq. 6.
 
@@ -106,18 +118,19 @@ def total_loss(
         rgb, alpha, target, base_rgb, hole: as above.
         features: None leaves the perceptual term out.
         weights: one number for each term, by its name.
-        dilation, size: as in `perceptual_loss`.
+        dilation, size, gram: as in `perceptual_loss`.
+        blur: as in `color_loss`.
 
     Returns:
         [] the loss, and its terms by name, each [], unweighted and detached.
     """
     terms = {
-        "color": color_loss(rgb, target, hole),
+        "color": color_loss(rgb, target, hole, blur),
         "alpha": alpha_loss(alpha, hole),
         "preserve": preserve_loss(rgb, base_rgb, hole),
     }
     if features is not None:
-        terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size)
+        terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size, gram=gram)
     total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
     return total, {name: term.detach() for name, term in terms.items()}
 

@@ -96,8 +96,16 @@ class Objective:
     def total(self, batch: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss [], and its terms [] unweighted; where the feature network is."""
         views = {name: tensor.to(self.device) for name, tensor in vars(batch).items()}
-        weights, dilation, size = vars(self.loss), self.loss.dilation, self.loss.feature_size
-        return total_loss(**views, features=self.features, weights=weights, dilation=dilation, size=size)
+        loss = self.loss
+        return total_loss(
+            **views,
+            features=self.features,
+            weights=vars(loss),
+            dilation=loss.dilation,
+            size=loss.feature_size,
+            blur=loss.color_blur,
+            gram=loss.gram,
+        )
 
 
 class ViewMethod(Method):

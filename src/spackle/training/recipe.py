@@ -101,6 +101,8 @@ class LossRecipe:
     features_path: Place = None
     feature_size: Annotated[int, Range(64, 4096)] | None = 512  # the longer side of what it sees; None: the crop's own
     dilation: Annotated[int, Range(1, 1001)] = 21  # pixels
+    color_blur: Annotated[float, Range(0, 64)] = 0.0  # pixels; above 0 the colour term sees low frequencies alone
+    gram: Share = 1.0  # how much the perceptual term's Gram statistics count
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,6 +28,7 @@ FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which a
 HALVED: tuple[str, ...] = ("base.quats", "base.scales", "base.opacities", "base.colors")
 HALVED += ("rendering.rgb", "rendering.depth", "rendering.alpha", "cues.rgb", "cues.inverse_depth", "cues.alpha")
 HALVED += ("seeds.slope", "seeds.rgb", "rim.rgb", "rim.mirrored", "rim.distance")
+HALVED += ("rim.exemplar", "rim.mismatch")
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
 
 

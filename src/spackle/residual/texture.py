@@ -1,0 +1,72 @@
+"""Colours of what fills a hole: structure is the residual's, texture comes from a picture whose hole is painted.
+
+The paper has none of this: its network learns from an inpainter's pictures. A network that learns from true views stays
+smooth where the truth is ambiguous.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from spackle.blur import blurred
+from spackle.inpaint import Inpainter, known_inverse_depth
+from spackle.render.protocol import Rendering
+from spackle.residual.hole_features import CELL, Cues, hole_mask
+from spackle.residual.seeds import SPREAD_PX, Rim
+
+TEXTURE_CELLS = 2.5  # standard deviation: what this blur takes away is texture, what it leaves is structure
+GAIN = 0.7  # of the texture: more of what cannot fit the truth looks no better, and is farther from it
+OVERLAP_CELLS = SPREAD_PX / CELL  # standard deviation of a blob
+STEPS = 2
+
+
+class Texture(Protocol):
+    """Gives the cells of a hole their colours."""
+
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+        """Colours [h, w, 3] sRGB of blobs: those of masked cells count; `structure` [h, w, 3] is the residual's."""
+        ...
+
+
+class ExemplarTexture:
+    """High frequencies of patches of the view itself, over the residual's structure."""
+
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+        """See `Texture.colors`."""
+        fine = rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)
+        return sharpened(structure, 1) + sharpened(GAIN * fine)
+
+
+EXEMPLAR = ExemplarTexture()
+
+
+@dataclasses.dataclass(frozen=True)
+class PaintedTexture:
+    """The picture that an inpainter makes of the view, structure and all."""
+
+    painter: Inpainter
+
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+        """See `Texture.colors`."""
+        hole = hole_mask(rendering.alpha)
+        views = (rendering.rgb[None], hole[None], known_inverse_depth(rendering.depth, hole)[None])
+        painted = self.painter.paint(*views)[0].permute(2, 0, 1)
+        share = avg_pool2d(hole[None].to(painted), CELL, ceil_mode=True)[0, ..., None]
+        cells = avg_pool2d(painted * hole, CELL, ceil_mode=True).permute(1, 2, 0) / share.clamp_min(1e-6)
+        return sharpened(torch.where(cues.mask[..., None], cells, cues.rgb))
+
+
+def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
+    """Colours [h, w, c] of blobs that show the wanted ones [h, w, c] where they overlap, by Jacobi steps.
+
+    A cell shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_CELLS.
+    """
+    colors = wanted
+    for _ in range(steps):
+        colors = colors + wanted - blurred(colors, OVERLAP_CELLS)
+    return colors
