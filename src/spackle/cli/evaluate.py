@@ -50,7 +50,8 @@ def evaluate(
     methods: Annotated[
         str,
         typer.Option(
-            metavar="A,B,…", help="Of base, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft; with commas."
+            metavar="A,B,…",
+            help="Of base, spackle, spackle-scene, network, seeds, dense, inpaint2d, direct-ft; with commas.",
         ),
     ] = "base,spackle",
     disparity: Disparity = "0.3,0.4,0.5",

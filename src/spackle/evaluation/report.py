@@ -36,7 +36,7 @@ QUALITY = 85  # of WebP
 MOST = 8  # images of a page
 LEAST = 2  # of each evaluation, however many there are
 # A slider has the first of these that there are: all methods of all images would make a page too large.
-SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "seeds", "direct-ft", "spackle-scene", "dense")
+SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "network", "seeds", "direct-ft", "spackle-scene", "dense")
 MOST_SHOWN = 6
 TITLES = {
     "tab:large_view_nr_iqa": "Quality of large views, without a truth",

@@ -15,8 +15,15 @@ from spackle.evaluation.table import EMPTY, Line, Table, mark_best
 
 NOT_RUN = "not run"
 PAPER_ROW = "{} (paper)"
-FILLING = ("spackle", "spackle-scene", "seeds", "dense", "direct-ft")  # methods that leave an opacity to measure
-ADDING = ("spackle", "spackle-scene", "seeds", "dense")
+FILLING = (
+    "spackle",
+    "spackle-scene",
+    "network",
+    "seeds",
+    "dense",
+    "direct-ft",
+)  # methods that leave an opacity to measure
+ADDING = ("spackle", "spackle-scene", "network", "seeds", "dense")
 LARGE_VIEWS = (
     "Views: the two ends of a swipe at that disparity, where the eye is farthest left and farthest right and looks at "
     "the focus point (spackle.camera_path.extremes), at the photo's working size with both sides even; means over views"
