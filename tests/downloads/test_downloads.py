@@ -484,6 +484,14 @@ def test_get_in_one_line_where_it_fails(site: Site, weights: Path) -> None:
     assert not weights.exists()
 
 
+def test_get_refuses_another_file_than_the_published_one(site: Site, weights: Path) -> None:
+    result = weights_command("get", "lama", "--url", site.url)
+    assert result.code == 2
+    assert all(part in result.err.splitlines()[-1] for part in (site.url, "e3aa4aaa15225a33ec84f9f4bc47e500"))
+    assert "Apache" in result.err
+    assert not weights.exists() or os.listdir(weights) == []
+
+
 def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*args: object) -> None:
         raise KeyboardInterrupt

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.table import Table
 from safetensors.torch import save_file
+from torch import Tensor
 
 from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
 from spackle.bases.sharp.layers import CONFIGS
@@ -25,6 +26,7 @@ from spackle.downloads import (
 )
 from spackle.errors import InputError
 from spackle.formats import atomic_path
+from spackle.inpaint import lama_network
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 
@@ -49,7 +51,7 @@ def get_weights(
     if new:
         with results_folder(path.parent, [path.name]):
             record = _download(known, known.url if url is None else url, path, reporter)
-        hint = "" if output is None else "; --checkpoint names it to predict"
+        hint = "" if output is None else f"; {known.named_by}"
         reporter.log(f"{_summary(known, record)} -> {path}{hint}")
     else:
         with reporter.stage("check", {}):
@@ -66,20 +68,25 @@ def get_weights(
 
 
 def make_weights(output: Path, size: str, reporter: Reporter) -> None:
-    """Write `deterministic_weights`, "full" or "tiny", as .pt or .safetensors; InputError for another suffix."""
+    """Write random weights of SHARP, "full" or "tiny", or of "lama"; InputError for a suffix but .pt, .safetensors."""
     suffix = output.suffix.lower()
     if suffix not in (".pt", ".safetensors"):
         raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
     with atomic_path(output) as temporary:
-        tensors = deterministic_weights(expected_shapes(CONFIGS[size]))
+        tensors = lama_weights() if size == "lama" else deterministic_weights(expected_shapes(CONFIGS[size]))
         if suffix == ".pt":
             torch.save(tensors, temporary)
         else:
             save_file(tensors, temporary)
     count = sum(tensor.numel() for tensor in tensors.values())
-    reporter.log(
-        f"sharp ({size}): {count / 1e6:.2f} M random numbers, the same each time; they show no scene -> {output}"
-    )
+    name, numbers = size if size == "lama" else f"sharp ({size})", f"{count / 1e6:.2f} M random numbers"
+    reporter.log(f"{name}: {numbers}, the same each time; they show no scene -> {output}")
+
+
+def lama_weights(width: int = lama_network.WIDTH, blocks: int = lama_network.BLOCKS) -> dict[str, Tensor]:
+    """`deterministic_weights` of LaMa's generator, with variances around one."""
+    made = deterministic_weights(lama_network.expected_shapes(width, blocks))
+    return {name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()}
 
 
 def list_weights(reporter: Reporter, console: Console) -> None:
@@ -110,7 +117,7 @@ def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> 
             step(done, total)
 
         try:
-            return download(url, path, advance)
+            return download(url, path, advance, known.md5)
         except KeyboardInterrupt:
             if noticed:
                 reporter.log(f"{known.name}: what has come is kept; the same command goes on from there")

@@ -46,13 +46,13 @@ def dataset_build(
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),
     inpainter: Annotated[
-        str, typer.Option(help="What completes the views: geometry, opencv, propainter; none leaves the holes.")
+        str, typer.Option(help="What completes the views: geometry, lama, opencv, propainter; none leaves the holes.")
     ] = "geometry",
     inpainter_weights: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Its weights: propainter's three .pth files.")
+        Path | None, typer.Option(metavar="PATH", help="Its weights: propainter's folder, or a file of lama's.")
     ] = None,
     inpainter_side: Annotated[
-        int | None, typer.Option(help="Long side in pixels at which it works; default: propainter's 640.")
+        int | None, typer.Option(help="Long side in pixels at which it works; default: propainter 640, lama 1024.")
     ] = None,
     workers: Annotated[int, typer.Option(help="Processes; each holds its own base.")] = 1,
     ray: Annotated[

@@ -14,7 +14,7 @@ weights = typer.Typer(help="Weights that others publish: fetch them, list them."
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[str, typer.Argument(help="Which weights: sharp.")],
+    name: Annotated[str, typer.Argument(help="Which weights: sharp or lama.")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
@@ -33,9 +33,11 @@ def weights_get(
 @weights.command("make")
 def weights_make(
     output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
-    size: Annotated[Literal["full", "tiny"], typer.Option(help="The published size, or one for tests.")] = "full",
+    size: Annotated[
+        Literal["full", "tiny", "lama"], typer.Option(help="SHARP's published size, one for tests, or LaMa's.")
+    ] = "full",
 ) -> None:
-    """Make random weights of SHARP's shape, the same each time, to try everything without Apple's."""
+    """Make random weights of SHARP's or LaMa's shape, the same each time, to try everything without theirs."""
     from spackle.app.weights import make_weights
     from spackle.progress import Reporter
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import os
 import sys
 from collections.abc import Iterator
@@ -42,15 +43,18 @@ def weights_folder() -> Path:
         raise InputError("no home folder for downloaded weights: name a folder in SPACKLE_WEIGHTS") from error
 
 
-def download(url: str, path: str | os.PathLike[str], progress: Progress | None = None) -> DownloadRecord:
+def download(
+    url: str, path: str | os.PathLike[str], progress: Progress | None = None, md5: str | None = None
+) -> DownloadRecord:
     """Fetch `url` (http or https, without a password) to `path` in a folder that exists, and write its record.
 
     A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
     Ctrl-C the next call asks for the rest only, unless the remote file has changed or the server cannot do that.
-    `progress` gets the bytes done, those of earlier calls among them, and their number.
+    `progress` gets the bytes done, those of earlier calls among them, and their number; `md5` is the file's where it
+    is known.
 
     Raises:
-        InputError: the file cannot be had or not be written, or another process is at it.
+        InputError: the file cannot be had or not be written, is another one, or another process is at it.
     """
     check_url(url)
     target = _real(path)
@@ -60,6 +64,10 @@ def download(url: str, path: str | os.PathLike[str], progress: Progress | None =
     try:
         with hold(_beside(target, ".lock")):
             record = DownloadRecord(url, *receive(url, part, progress or (lambda done, total: None)))
+            if md5 is not None and hashlib.md5(part.read_bytes(), usedforsecurity=False).hexdigest() != md5:
+                part.unlink()
+                version_file(part).unlink()
+                raise InputError(f"{url}: what came has not the MD5 {md5}, so it is another file: take another address")
             # The record first: a kill in between leaves a file that its record refuses, not one without.
             write_json(dataclasses.asdict(record), _beside(target, ".json"))
             os.replace(part, target)
@@ -126,6 +134,8 @@ class KnownWeights:
     file: str  # its name in the folder of weights
     licence: str  # in a few words
     notice: tuple[str, ...]  # lines that a person sees before the download
+    named_by: str  # the option that names a copy elsewhere
+    md5: str | None = None  # where it was published with the file
 
 
 WEIGHTS = {
@@ -139,7 +149,20 @@ WEIGHTS = {
             "for non-commercial scientific research only. Spackle's own licence does not cover them.",
             "Read its terms: https://github.com/apple/ml-sharp/blob/main/LICENSE_MODEL",
         ),
-    )
+        named_by="--checkpoint names it to predict",
+    ),
+    "lama": KnownWeights(
+        name="lama",
+        url="https://github.com/Sanster/models/releases/download/add_big_lama/big-lama.pt",
+        file="big-lama.pt",
+        licence="Apache-2.0",
+        notice=(
+            "LaMa's weights are its authors' (Suvorov et al., 2022), under the Apache License 2.0:",
+            "https://github.com/advimman/lama/blob/main/LICENSE",
+        ),
+        named_by="--inpainter-weights names it to dataset build",
+        md5="e3aa4aaa15225a33ec84f9f4bc47e500",
+    ),
 }
 
 

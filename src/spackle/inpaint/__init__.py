@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from spackle.errors import check_name
 from spackle.inpaint.exemplar import ExemplarInpainter
+from spackle.inpaint.lama import LamaInpainter
 from spackle.inpaint.opencv import OpencvInpainter
 from spackle.inpaint.propainter import PropainterInpainter
 from spackle.inpaint.protocol import Inpainter, InpainterOptions, known_inverse_depth
@@ -15,6 +16,7 @@ __all__ = ["INPAINTERS", "Inpainter", "InpainterOptions", "get_inpainter", "know
 
 INPAINTERS: dict[str, type[Inpainter]] = {
     "exemplar": ExemplarInpainter,
+    "lama": LamaInpainter,
     "opencv": OpencvInpainter,
     "propainter": PropainterInpainter,
 }

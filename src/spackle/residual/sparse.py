@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear, pad
 
+from spackle.crop import Crop
+
 Mask = NDArray[np.bool_]
 
 CHUNK = 8192  # cells whose surroundings are gathered at once: they should stay in the cache
@@ -128,36 +130,6 @@ def _corners(cells: Cells) -> list[tuple[Tensor, Tensor, Tensor]]:
         far = 0.25 + 0.5 * (places % 2 == 0).float()  # of the higher one: three quarters where the cell is even
         sides.append(((low.clamp_min(0), 1 - far), ((low + 1).clamp_max(size // 2 - 1), far)))
     return [(row, column, wr * wc) for row, wr in sides[0] for column, wc in sides[1]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Crop:
-    """A rectangle of cells; the last row and column are exclusive."""
-
-    top: int
-    left: int
-    bottom: int
-    right: int
-
-    @property
-    def area(self) -> int:
-        """In cells."""
-        return (self.bottom - self.top) * (self.right - self.left)
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """To index [h, w, ...] with."""
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-    def moved(self, down: int, right: int) -> Crop:
-        """The same rectangle elsewhere."""
-        return Crop(self.top + down, self.left + right, self.bottom + down, self.right + right)
-
-    def grown(self, margin: int, step: int, height: int, width: int) -> Crop:
-        """With a margin, outwards to multiples of `step`, as far as the grid goes."""
-        top, left = (max(place - margin, 0) // step * step for place in (self.top, self.left))
-        far = ((self.bottom, height), (self.right, width))
-        return Crop(top, left, *(min(-(-(place + margin) // step) * step, end) for place, end in far))
 
 
 def crops_around(mask: Tensor, step: int, margin: int = MARGIN) -> list[tuple[Crop, Crop]]:
