@@ -68,7 +68,7 @@ def evaluate(
     low_memory: LowMemory = False,
     residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
-    inpainter: Annotated[str, typer.Option(metavar="NAME", help="Of inpaint2d: opencv, lama, propainter.")] = "opencv",
+    inpainter: Annotated[str, typer.Option(metavar="NAME", help="Of inpaint2d: exemplar, lama, opencv, …")] = "opencv",
     features: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="SqueezeNet, for distance.")] = None,
     limit: Limit = None,
     download_metrics: Annotated[
