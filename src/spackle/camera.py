@@ -57,6 +57,13 @@ class Camera:
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The width×height pixels of this view that begin at (left, top)."""
+        K = self.K.clone()
+        K[0, 2] -= left
+        K[1, 2] -= top
+        return dataclasses.replace(self, K=K, width=width, height=height)
+
     def even(self) -> Camera:
         """The same view with an even width and height: an odd side grows by one."""
         return self.resized(self.width + self.width % 2, self.height + self.height % 2)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
+from spackle.photo_frame import PhotoFrame, find_frame
 
 T = TypeVar("T")
 
@@ -44,6 +45,7 @@ class Photo:
     focal_px: float  # in pixels of `rgb`
     focal_source: str  # "--focal-px", "--focal-mm", "--fov", "EXIF" or "default 30 mm"
     path: Path
+    frame: PhotoFrame | None = None  # that the file has around `rgb`, in the file's pixels
 
     @property
     def height(self) -> int:
@@ -52,6 +54,12 @@ class Photo:
     @property
     def width(self) -> int:
         return int(self.rgb.shape[1])
+
+    @property
+    def framed_size(self) -> tuple[int, int]:
+        """(width, height) of the file's picture, of a photo at its full size."""
+        left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
+        return self.width + left + right, self.height + top + bottom
 
     @property
     def camera(self) -> Camera:
@@ -65,6 +73,7 @@ def load_photo(
     focal_px: float | None = None,
     focal_mm: float | None = None,
     fov: float | None = None,
+    keep_frame: bool = True,
 ) -> Photo:
     """Read a JPEG, PNG, WebP, HEIC, TIFF or any other picture that Pillow opens.
 
@@ -77,6 +86,7 @@ def load_photo(
         focal_px: focal length in pixels of the upright photo.
         focal_mm: focal length as its 35 mm film equivalent, by the diagonal.
         fov: horizontal field of view in degrees.
+        keep_frame: otherwise a uniform frame around the picture is cut off.
 
     Raises:
         InputError: a missing, broken or too large file, or a senseless focal length.
@@ -89,9 +99,14 @@ def load_photo(
         return _to_rgb(_upright(image), path), tags
 
     rgb, exif = read_image(path, read)
+    frame = None if keep_frame else find_frame(rgb)
     height, width = rgb.shape[:2]
+    if frame is not None:
+        # A frame is added after the picture was taken: lens and principal point are those of the picture inside.
+        rgb = frame.inside(rgb, width, height)
+        height, width = rgb.shape[:2]
     focal, source = focal_length(path, width, height, exif, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
-    return Photo(rgb, focal, source, Path(path))
+    return Photo(rgb, focal, source, Path(path), frame)
 
 
 def focal_length(

@@ -142,6 +142,7 @@ def predict(
     network: ResidualNet | Shipped | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
+    keep_frame: bool = False,
 ) -> Scene:
     """A photo to a scene without holes along a camera path.
 
@@ -157,6 +158,7 @@ def predict(
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
+        keep_frame: otherwise a uniform frame around a file's picture is cut off, and the logger is told.
 
     Raises:
         InputError: a photo or a depth map that cannot be used, or a base's name in place of a base.
@@ -166,7 +168,9 @@ def predict(
         raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
     if isinstance(base, str):
         raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
-    loaded = photo if isinstance(photo, Photo) else load_photo(photo)
+    loaded = photo if isinstance(photo, Photo) else load_photo(photo, keep_frame=keep_frame)
+    if loaded.frame is not None:
+        LOG.info("%s: %s", loaded.path.name, loaded.frame.note)
     source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
     prediction, choice = (open_base(BaseSettings(depth=source)) if base is None else open_loaded(base)).predict(loaded)
     if choice.note:

@@ -31,6 +31,7 @@ from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
 from spackle.fill import far_fill
 from spackle.image import Photo
+from spackle.photo_frame import PhotoFrame
 from spackle.render import CpuRenderer
 from spackle.residual import hole_area_ratio, hole_mask
 
@@ -172,6 +173,12 @@ def test_the_lens_is_the_calibrations_where_there_is_one_and_else_the_photos() -
     assert (found.camera.width, found.camera.height) == (64, 48)
     uv, _ = found.camera.project(found.gaussians.means[: 64 * 48])
     torch.testing.assert_close(uv, found.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
+    # Nothing moves where a frame has been cut off.
+    framed = dataclasses.replace(photo, rgb=photo.rgb[6:-4, 2:-10], frame=PhotoFrame(2, 6, 10, 4, "dark"))
+    inside = RgbdBase(half).predict(framed)
+    assert inside.camera.K.tolist() == [[140, 0, 28], [0, 140, 19], [0, 0, 1]]
+    means = found.gaussians.means[: 64 * 48].reshape(48, 64, 3)[6:-4, 2:-10]
+    torch.testing.assert_close(inside.gaussians.means[: 52 * 38], means.reshape(-1, 3), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("disparity", [0.1, 0.2, 0.5])

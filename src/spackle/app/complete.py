@@ -75,6 +75,8 @@ class PhotoCompleter:
 
     def complete(self, photo: Photo, reporter: Reporter, seconds: dict[str, float]) -> CompletedPhoto:
         """A photo at its full size to its completed scene; InputError for a photo or depth map that cannot be used."""
+        if photo.frame is not None:
+            reporter.log(f"{photo.path.name}: {photo.frame.note}; --keep-frame keeps it")
         with reporter.stage("prepare", seconds):
             base = self.base.load(photo, log=reporter.log)
         with reporter.stage("base", seconds) as step:

@@ -49,6 +49,7 @@ class PredictOptions:
     focal_mm: float | None = None
     fov: float | None = None
     overwrite: bool = False  # in a folder, do again what is done already
+    keep_frame: bool = False  # a uniform frame around a photo is part of it
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -109,7 +110,7 @@ def predict_one(
     """
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
-        photo = load_photo(path, **options.lens)
+        photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
     with contextlib.ExitStack() as folders:
         folders.enter_context(results_folder(folder, options.files))
         if completer.given_views:
@@ -166,7 +167,7 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
         "residual": residual.weights,
         "fill": residual.fill,
     }
-    own |= {"render": options.render, "mode": options.mode, **options.lens}
+    own |= {"render": options.render, "mode": options.mode, "keep_frame": options.keep_frame, **options.lens}
     fields = {**dataclasses.asdict(settings), **dataclasses.asdict(path)}
     for name in ("name", "low_memory", "windows", "compiled"):  # recorded as `base`, or change last bits alone
         del fields[name]
@@ -234,6 +235,8 @@ def make_report(
         "request": request if choice.lasting else None,  # None: the next run does it again
         "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
     }
+    if photo.frame is not None:
+        report["photo"]["frame_cut_off"] = dataclasses.asdict(photo.frame)
     if choice.failures:
         report["base"]["passed_over"] = list(choice.failures)
     if weights == "seeds":

@@ -46,6 +46,7 @@ class ViewOptions:
     host: str = HOST
     port: int = 0  # any that is free
     browser: bool = True  # open one
+    keep_frame: bool = False  # a uniform frame around a photo is part of it
 
     def completer(self, base: BaseSettings) -> PhotoCompleter:
         """Completes photos by a base; InputError for an option that cannot be used."""
@@ -97,7 +98,7 @@ def _first(
     if depth is None:
         uploads.completer = completer  # it holds the network
     with reporter.stage("load", seconds):
-        photo = load_photo(target, focal_px=options.focal_px, fov=options.fov)
+        photo = load_photo(target, focal_px=options.focal_px, fov=options.fov, keep_frame=options.keep_frame)
         if depth is not None:
             completer.base.load(photo)  # what is wrong with a depth map is known before a page opens
 
@@ -138,7 +139,7 @@ class Uploads:
         self.completer = self.completer or self._options.completer(self._base)
         seconds: dict[str, float] = {}
         with teller.stage("load", seconds):
-            photo = load_photo(path)
+            photo = load_photo(path, keep_frame=self._options.keep_frame)
         return complete_for_page(photo, name, self.completer, teller)
 
 

@@ -49,17 +49,19 @@ class RgbdBase:
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the photo's pixels at its working size; InputError for a map of another aspect ratio."""
-        self.depth.check_shape(photo.height, photo.width, photo.path)
+        depth, (width, height) = self.depth, photo.framed_size
+        depth.check_shape(height, width, photo.path)
+        own = None if depth.K is None else Camera(depth.K, torch.eye(4), *depth.depth.shape[::-1])
+        if photo.frame is not None:
+            frame = photo.frame
+            values, valid = (frame.inside(grid, width, height) for grid in (depth.depth, depth.valid))
+            depth = dataclasses.replace(depth, depth=values, valid=valid)
+            own = own and own.resized(width, height).cropped(frame.left, frame.top, photo.width, photo.height)
         photo = resize_photo(photo)
-        camera = photo.camera
-        if self.depth.K is not None:
-            height, width = self.depth.depth.shape
-            camera = Camera(self.depth.K, torch.eye(4), width, height).resized(photo.width, photo.height)
-        prediction = lift(photo.rgb, self.depth, camera)
-        notes = prediction.notes | ({"depth": self.depth.note} if self.depth.note else {})
-        return dataclasses.replace(
-            prediction, notes=notes, lens_source="" if self.depth.K is None else self.lens_source
-        )
+        camera = photo.camera if own is None else own.resized(photo.width, photo.height)
+        prediction = lift(photo.rgb, depth, camera)
+        notes = prediction.notes | ({"depth": depth.note} if depth.note else {})
+        return dataclasses.replace(prediction, notes=notes, lens_source="" if own is None else self.lens_source)
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:

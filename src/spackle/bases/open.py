@@ -296,10 +296,11 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
     else:
         read = functools.partial(load_depth, find_depth(source, photo.path), calib=settings.calib)
         found = read()
-    found.check_shape(photo.height, photo.width, photo.path)
+    width, height = photo.framed_size
+    found.check_shape(height, width, photo.path)
     if found.K is None or not photo.focal_source.startswith("--"):  # an option of the command line
         return RgbdBase(found, "the photo's depth" if found.note else "calibration")
-    focal = photo.focal_px * (found.depth.shape[1] / photo.width)
+    focal = photo.focal_px * (found.depth.shape[1] / width)
     return RgbdBase(read(focal_px=focal) if read else found.with_focal(focal), "")
 
 

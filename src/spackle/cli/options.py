@@ -23,6 +23,9 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[DeviceName, typer.Option(help="Where to compute.")]
+KeepFrameOption = Annotated[
+    bool, typer.Option("--keep-frame", help="Leave a scan's margin or letterbox bars around a photo on it.")
+]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="For scripts: print each result, and an error, as a line of JSON.")
 ]

@@ -11,6 +11,7 @@ from spackle.cli.options import (
     CheckpointOption,
     DeviceOption,
     JsonOption,
+    KeepFrameOption,
     PrecisionName,
     VerboseOption,
     with_path_options,
@@ -85,6 +86,7 @@ def predict(
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the photo.")] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
+    keep_frame: KeepFrameOption = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="In a folder: do again what is done already.")] = False,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
@@ -99,9 +101,8 @@ def predict(
     from spackle.scene import ResidualChoice
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, low_memory, windows, compiled, device)
-    options = PredictOptions(
-        settings, ResidualChoice(residual, fill), path, render, mode, focal_px, focal_mm, fov, overwrite
-    )
+    choice = ResidualChoice(residual, fill)
+    options = PredictOptions(settings, choice, path, render, mode, focal_px, focal_mm, fov, overwrite, keep_frame)
     if predict_all(photo, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

@@ -14,6 +14,7 @@ from spackle.cli.options import (
     CheckpointOption,
     DeviceOption,
     JsonOption,
+    KeepFrameOption,
     VerboseOption,
     with_path_options,
 )
@@ -71,6 +72,7 @@ def view(
     disparity: Annotated[float, typer.Option(help="How far photos are completed: 0 to 2; 0.3 is large.")] = 0.3,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
+    keep_frame: KeepFrameOption = False,
     device: DeviceOption = "auto",
     host: Annotated[
         str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets everybody in the network in.")
@@ -87,7 +89,7 @@ def view(
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
-    options = ViewOptions(settings, disparity, focal_px, fov, host, port, browser)
+    options = ViewOptions(settings, disparity, focal_px, fov, host, port, browser, keep_frame)
     reporter = Reporter(verbose, as_json=as_json)
     if view_target(target, options, reporter):
         raise typer.Exit(INTERRUPTED)
