@@ -96,7 +96,7 @@ FRAMELESS = {
     "one colour": 0 * PLAIN,
     "a sky that fades to its horizon": np.where(Y < 25, (0.3, 0.5, 0.9) + 0.01 * Y, scene()),
     "a blue sky above a wall's straight edge": np.where(Y < 25, (0.3, 0.5, 0.9), scene()),
-    "a white sky above roofs": np.where(Y < 25 + 8 * np.sin(X / 9), 1.0, scene()),
+    "a white sky above roofs": np.where(25 + 8 * np.sin(X / 9) > Y, 1.0, scene()),
     "a disc on white": np.where(DISC, scene(), 1.0),
     "a tilted box on white": np.where((abs(X - 90 + Y / 9) < 70) & (abs(Y - 60 - X / 9) < 40), scene(), 1.0),
     "a long box on white": np.where((Y > 15) & (Y < 105) & (abs(X - 90 + 40 * np.cos(Y / 20)) < 40), scene(), 1.0),
