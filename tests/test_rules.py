@@ -138,6 +138,7 @@ TWINS = {
     "bases/sky.py": "test_sky.py",
     "evaluation/naive_renderer.py": "test_suite.py",
     "fill.py": "test_fill.py",
+    "inpaint/exemplar.py": "test_exemplar.py",
     "render": "test_render.py",
     "residual/occlusion_guard.py": "test_occlusion_guard.py",
     "residual/hole_features.py": "test_hole_features.py",

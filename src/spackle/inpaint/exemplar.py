@@ -37,7 +37,9 @@ JUMPS = (8, 4, 2, 1)  # cells to the neighbours whose matches are tried, one sea
 MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
 TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
 FADING = 0.8  # weight of a cell in a patch, for each cell that it lies deeper in the hole
+FAINTEST_CELL = np.float32(1e-30)  # weight of the deepest: still far from what float32 rounds to nothing
 DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.04, math.sqrt(2), 0.05
+LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
 SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
 FAINTEST_VOTE, LEAST_COST = np.float32(1e-6), 1e-8
 FAR = 1 << 14  # cells to a place that is not there
@@ -121,7 +123,7 @@ class _Matches:
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
     """The finest level first. The hole starts as what is mirrored at its rim, where that is the same surface."""
     log = inverse_depth.clamp_min(1e-9).log()
-    depth = log / max(float(log[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, 1e-6)
+    depth = log / max(float(log[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
     levels: list[_Level] = []
     rgb, tone = guess, guess
     for number in itertools.count():
@@ -130,11 +132,11 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
             mirrored = rgb.numpy().copy()
             _mirror(mirrored, hole.numpy(), depth.numpy(), near)
             rgb = torch.from_numpy(mirrored)
-        tones = math.sqrt(2) * blurred(tone, max(TONE_CELLS / 2**number, 0.5))
+        tones = TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2**number, 0.5))
         traits = torch.cat([tones, DEPTH_WEIGHT * depth[..., None]], dim=-1)
         weights = np.zeros([size + 2 * RADIUS for size in hole.shape], np.float32)
         inside = np.hypot(*(near - np.indices(hole.shape)).astype(np.float32))
-        weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.float32(FADING) ** inside
+        weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.maximum(np.float32(FADING) ** inside, FAINTEST_CELL)
         levels.append(_Level(rgb.numpy().copy(), np.ascontiguousarray(traits.numpy()), hole.numpy(), weights))
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
         if min(hole.shape) < 2 * COARSEST or bool(coarse_hole.all()) or not bool(hole.any()):
@@ -190,7 +192,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 
 def _fit(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
-    """Search and vote in turn, the level's colours in place; None, or the coarser matches, where no patch is known."""
+    """Search and vote in turn, the level's colours in place; None where there is no hole, or no patch for it."""
     known = torch.from_numpy(~level.hole)[None, None].float()
     usable = max_pool2d(1 - known, SIDE, stride=1, padding=RADIUS)[0, 0].numpy() == 0
     usable[:RADIUS] = usable[-RADIUS:] = False
