@@ -18,21 +18,23 @@ from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajectory
 from spackle.device import Precision
+from spackle.downloads import installed
 from spackle.errors import InputError
 from spackle.formats import save_ply, save_video
 from spackle.formats.video import check_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
+from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import SHIPPED, load_residual, shipped_network
-from spackle.residual.texture import EXEMPLAR, Texture
+from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
 
 PATH_FRAMES = 60
 LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
-Fill = Literal["auto", "network", "exemplar", "none"]  # where the holes' texture comes from; none leaves them open
+Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # of the texture in holes
 Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or the paper's one for each
 
 
@@ -179,13 +181,20 @@ def predict(
     return complete(prediction, cameras, network=network, fill=fill, renderer=renderer)
 
 
-@functools.cache
 def open_texture(fill: Fill) -> Texture | None:
-    """What gives the fill its texture: "exemplar" takes it from the view itself; None for "network" and "none".
+    """What gives the fill its texture: "lama" paints the widest views, "exemplar" takes it from the view itself.
 
-    "auto" is the exemplar.
+    "auto" is LaMa where its weights have been downloaded, else the exemplar. "network" and "none" give None.
+    InputError for "lama" without its weights.
     """
-    return None if fill in ("network", "none") else EXEMPLAR
+    if fill == "lama" or (fill == "auto" and installed("lama")):
+        return _lama()
+    return EXEMPLAR if fill in ("auto", "exemplar") else None
+
+
+@functools.cache
+def _lama() -> Texture:
+    return PaintedTexture(get_inpainter("lama", InpainterOptions()))
 
 
 def complete(

@@ -70,10 +70,10 @@ def predict(
         ),
     ] = None,
     fill: Annotated[
-        Literal["auto", "network", "exemplar", "none"],
+        Literal["auto", "network", "exemplar", "lama", "none"],
         typer.Option(
-            help="Texture of what fills the holes. exemplar: from the photo itself; network: none but the residual's; "
-            "none: holes stay open. auto: exemplar."
+            help="Texture of what fills the holes. lama: its inpainting (`spackle weights get lama`); exemplar: of the "
+            "photo itself; network: none. none: holes stay open. auto: lama if its weights are here, else exemplar."
         ),
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,

@@ -33,7 +33,7 @@ RADIUS = 3  # patches have 7×7 cells
 SIDE = 2 * RADIUS + 1
 COARSEST = 48  # cells of the short side; no level is smaller
 ROUNDS = 6  # of search and vote at each level
-JUMPS = (8, 4, 2, 1)  # cells to the neighbours whose matches are tried, one search after the other
+JUMPS = (4, 1)  # cells to the neighbours whose matches are tried, one search after the other
 MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
 TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
 FADING = 0.8  # weight of a cell in a patch, for each cell that it lies deeper in the hole
@@ -127,7 +127,7 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
     levels: list[_Level] = []
     rgb, tone = guess, guess
     for number in itertools.count():
-        near = _nearest_known(hole.numpy())
+        near = nearest_known(hole.numpy())
         if not number:
             mirrored = rgb.numpy().copy()
             _mirror(mirrored, hole.numpy(), depth.numpy(), near)
@@ -152,7 +152,7 @@ def _halved(image: Tensor) -> Tensor:
     return avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)
 
 
-def _nearest_known(hole: Bools) -> Ints:
+def nearest_known(hole: Bools) -> Ints:
     """[2, h, w] row and column of the nearest known cell, nearly always; far away where there is none."""
     near = np.where(hole, -FAR, np.indices(hole.shape)).astype(np.int32)
     _carry(hole, near)

@@ -177,6 +177,6 @@ class Completer:
             if self.texture is not None:
                 structure = cues.rgb.clone()
                 structure[cues.mask] = linear_to_srgb(new.colors)
-                colors = self.texture.colors(structure, rendering, cues, rim)[cues.mask]
+                colors = self.texture.colors(structure, rendering, cues, seeds, rim)[cues.mask]
                 new = dataclasses.replace(new, colors=srgb_to_linear(colors.clamp(0, 1)))
         return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new

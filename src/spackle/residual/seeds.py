@@ -162,6 +162,7 @@ class Rim:
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
     exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that fit
     mismatch: Tensor  # [h, w] how badly they fit: root of their mean squared difference; 0 elsewhere
+    beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
 
     @staticmethod
     def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera) -> Rim:
@@ -183,8 +184,9 @@ class Rim:
         )
         guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
         texture = exemplar(guess, cues.mask, seeds.inverse_depth)
-        grids = (*map(torch.from_numpy, cells), texture.rgb, texture.mismatch)
-        return Rim(*(grid.to(seeds.rgb) for grid in grids))
+        far, near, steps = (torch.from_numpy(grid).to(seeds.rgb) for grid in cells)
+        beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
+        return Rim(far, near, steps, texture.rgb, texture.mismatch, beyond)
 
 
 @kernel

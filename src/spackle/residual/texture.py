@@ -15,12 +15,14 @@ from torch.nn.functional import avg_pool2d
 
 from spackle.blur import blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
+from spackle.inpaint.exemplar import nearest_known
 from spackle.render.protocol import Rendering
 from spackle.residual.hole_features import CELL, Cues, hole_mask
-from spackle.residual.seeds import SPREAD_PX, Rim
+from spackle.residual.seeds import SPREAD_PX, Rim, Seeds
 
 TEXTURE_CELLS = 2.5  # standard deviation: what this blur takes away is texture, what it leaves is structure
 GAIN = 0.7  # of the texture: more of what cannot fit the truth looks no better, and is farther from it
+CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
 OVERLAP_CELLS = SPREAD_PX / CELL  # standard deviation of a blob
 STEPS = 2
 
@@ -28,18 +30,18 @@ STEPS = 2
 class Texture(Protocol):
     """Gives the cells of a hole their colours."""
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
         """Colours [h, w, 3] sRGB of blobs: those of masked cells count; `structure` [h, w, 3] is the residual's."""
         ...
 
 
 class ExemplarTexture:
-    """High frequencies of patches of the view itself, over the residual's structure."""
+    """High frequencies of the view itself over the residual's structure; at its border the photo goes on."""
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
         """See `Texture.colors`."""
         fine = rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)
-        return sharpened(structure, 1) + sharpened(GAIN * fine)
+        return sharpened(continued(structure, cues, seeds, rim), 1) + sharpened(GAIN * fine)
 
 
 EXEMPLAR = ExemplarTexture()
@@ -51,7 +53,7 @@ class PaintedTexture:
 
     painter: Inpainter
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, rim: Rim) -> Tensor:
+    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
         """See `Texture.colors`."""
         hole = hole_mask(rendering.alpha)
         views = (rendering.rgb[None], hole[None], known_inverse_depth(rendering.depth, hole)[None])
@@ -59,6 +61,19 @@ class PaintedTexture:
         share = avg_pool2d(hole[None].to(painted), CELL, ceil_mode=True)[0, ..., None]
         cells = avg_pool2d(painted * hole, CELL, ceil_mode=True).permute(1, 2, 0) / share.clamp_min(1e-6)
         return sharpened(torch.where(cues.mask[..., None], cells, cues.rgb))
+
+
+def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+    """Colours [h, w, 3] that beyond the photo's border begin as the nearest cell of the photo, if it is as far away.
+
+    Behind an object the nearest cell is the object's, and nothing is continued.
+    """
+    near = torch.from_numpy(nearest_known(cues.mask.cpu().numpy())).to(cues.mask.device).long()
+    own = torch.stack(torch.meshgrid(*(torch.arange(size) for size in cues.mask.shape), indexing="ij")).to(near)
+    row, column = (place.clamp_min(0) for place in near)
+    apart = (seeds.inverse_depth / cues.inverse_depth[row, column].clamp_min(1e-9)).log()
+    fading = torch.exp((1 - (near - own).float().norm(dim=0)) / CONTINUED_CELLS - (apart / SAME_DEPTH).square())
+    return torch.lerp(structure, cues.rgb[row, column], (fading * rim.beyond)[..., None])
 
 
 def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
