@@ -60,7 +60,7 @@ class PaintedTexture:
         painted = self.painter.paint(*views)[0].permute(2, 0, 1)
         share = avg_pool2d(hole[None].to(painted), CELL, ceil_mode=True)[0, ..., None]
         cells = avg_pool2d(painted * hole, CELL, ceil_mode=True).permute(1, 2, 0) / share.clamp_min(1e-6)
-        return sharpened(torch.where(cues.mask[..., None], cells, cues.rgb))
+        return sharpened(torch.where(share > 0, cells, cues.rgb))
 
 
 def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:

@@ -1,0 +1,104 @@
+"""Colours of blobs: those that the blended picture shows, from patches of the view or from an inpainter."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from holes import CPU, box_view, features_of
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from spackle.blur import blurred
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, trajectory
+from spackle.inpaint import InpainterOptions
+from spackle.inpaint.protocol import PlainInpainter
+from spackle.residual import CELL, Completer, Seeds, hole_mask
+from spackle.residual.complete import PAINTED_VIEWS
+from spackle.residual.compose import compose
+from spackle.residual.seeds import cell_centers
+from spackle.residual.texture import EXEMPLAR, GAIN, TEXTURE_CELLS, ExemplarTexture, PaintedTexture, sharpened
+
+
+@pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # cells
+def test_sharpened_blobs_blend_to_the_wanted_colours(period: float) -> None:
+    """On a rough wall: where blobs lie one behind the other in a row, the nearer ones also shift the picture."""
+    camera = Camera.from_focal(80, 96, 72)
+    uv = cell_centers(camera)
+    x, y = (2 * torch.pi / (CELL * period) * uv).unbind(-1)
+    wanted = 0.5 + 0.12 * torch.stack([x.sin(), y.cos(), (x + 1).sin()], dim=-1)
+    depths = 4 + 0.01 * torch.randn(uv.shape[:2], generator=torch.Generator().manual_seed(0))
+
+    def shown(colors: Tensor) -> Tensor:
+        grid = (uv, 1 / depths, torch.zeros_like(uv), colors)
+        blobs = compose(Seeds(*(field.flatten(0, 1) for field in grid)), None, camera)
+        return avg_pool2d(CPU.render(blobs, camera).rgb.permute(2, 0, 1), CELL).permute(1, 2, 0)[4:-4, 4:-4]
+
+    plain, sharp, truth = shown(wanted), shown(sharpened(wanted)), wanted[4:-4, 4:-4]
+    assert (plain - truth).norm() > 1.1 * (sharp - truth).norm()
+    assert plain.std() < 0.9 * truth.std()
+    assert float(sharp.std() / truth.std()) == pytest.approx(1, abs=0.03)
+
+
+class Paint(PlainInpainter):
+    """Paints a ramp, and keeps what it was asked for."""
+
+    name, version = "paint", "1"
+
+    def __init__(self, options: InpainterOptions) -> None:
+        self.asked: list[tuple[Tensor, ...]] = []
+
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        self.asked.append((rgb, hole, inverse_depth))
+        return torch.where(hole[..., None], ramp(*hole.shape[1:]), rgb)
+
+
+def ramp(height: int, width: int) -> Tensor:
+    """[height, width, 3] of colours that no scene here has."""
+    across = torch.linspace(0.2, 0.8, width).expand(height, width)
+    return torch.stack([0.1 + 0 * across, across, 0.2 + 0 * across], dim=-1)
+
+
+def painted_box(size: tuple[int, int]) -> tuple[Completer, Camera, Paint]:
+    subject, camera = box_view(0.3, width=size[0], height=size[1])
+    painter = Paint(InpainterOptions())
+    return dataclasses.replace(subject, texture=PaintedTexture(painter)), camera, painter
+
+
+@pytest.mark.parametrize("size", [(96, 72), (95, 71)])
+@pytest.mark.parametrize("threshold", [0.95, 0.98])
+def test_a_painted_picture_is_asked_for_once_and_reaches_the_hole(size: tuple[int, int], threshold: float) -> None:
+    subject, camera, painter = painted_box(size)
+    view = CPU.render(subject.base, camera)
+    new, drawn = dataclasses.replace(subject, threshold=threshold).completed_view(camera, rendering=view)
+    hole = hole_mask(view.alpha)
+    ((rgb, asked, inverse_depth),) = painter.asked
+    assert torch.equal(rgb[0], view.rgb)
+    assert torch.equal(asked[0], hole)
+    assert torch.equal(inverse_depth[0] > 0, ~hole)
+    torch.testing.assert_close(inverse_depth[0][~hole], 1 / view.depth[~hole])
+    inner = max_pool2d((~hole).float()[None], 5, 1, 2)[0] == 0
+    assert int(inner.sum()) > 2000
+    assert float((drawn.rgb - ramp(*hole.shape))[inner].abs().mean()) < 0.01
+    assert bool((new.colors.sum(-1) > 0).all())  # no black where a cell is masked by a threshold of its own
+
+
+def test_a_scene_asks_for_its_widest_views_and_goes_on_from_the_exemplar(monkeypatch: pytest.MonkeyPatch) -> None:
+    subject, _, painter = painted_box((96, 72))
+    later: list[Tensor] = []
+    monkeypatch.setattr(ExemplarTexture, "colors", lambda self, structure, *_: later.append(structure) or structure)
+    path = trajectory("rotate_forward", subject.photo_camera, 0.4, DepthRange.of(subject.base), 9)
+    subject.complete_scene(path, exact=True)
+    assert (len(painter.asked), len(later) > 0) == (PAINTED_VIEWS, True)
+
+
+def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None:
+    subject, camera = box_view(0.3)
+    cues, _, rim = features_of(subject.base, camera, subject.photo_camera)
+    view = CPU.render(subject.base, camera)
+    structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
+    found = EXEMPLAR.colors(structure, view, cues, rim) - sharpened(structure, 1)
+    torch.testing.assert_close(found, GAIN * sharpened(rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)))
+    assert float(blurred(found, 4 * TEXTURE_CELLS).abs().max()) < 0.1 * float(found.abs().max())

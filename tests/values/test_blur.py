@@ -1,0 +1,24 @@
+"""The Gaussian blur: of pictures and of stacks of them, and where the border is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from spackle.blur import blurred
+
+
+@pytest.mark.parametrize(("size", "sigma"), [((9, 13), 0.65), ((9, 13), 2.5), ((2, 5), 4.0), ((1, 1), 1.0)])
+def test_a_blur_is_that_of_a_plain_loop_and_nothing_lies_beyond_the_border(size: tuple[int, int], sigma: float) -> None:
+    pictures = torch.rand(2, 1, *size, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected, reach = torch.empty_like(pictures), int(np.ceil(3 * sigma))
+    for y, x in np.ndindex(size):
+        total, mass = torch.zeros(2, 1, 3, dtype=torch.float64), 0.0
+        for v in range(max(y - reach, 0), min(y + reach + 1, size[0])):
+            for u in range(max(x - reach, 0), min(x + reach + 1, size[1])):
+                weight = float(np.exp(-((v - y) ** 2 + (u - x) ** 2) / (2 * sigma**2)))
+                total, mass = total + weight * pictures[..., v, u, :], mass + weight
+        expected[..., y, x, :] = total / mass
+    torch.testing.assert_close(blurred(pictures, sigma), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(blurred(pictures[1, 0].float(), sigma), expected[1, 0].float())
