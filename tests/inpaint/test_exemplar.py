@@ -22,7 +22,7 @@ PATTERNS = {
 
 
 @pytest.mark.parametrize(("size", "share"), [((1, 9), 0.5), ((23, 31), 0.9), ((40, 17), 0.997), ((30, 30), 0.1)])
-def test_thenearest_known_cell_is_that_of_brute_force(size: tuple[int, int], share: float) -> None:
+def test_the_nearest_known_cell_is_that_of_brute_force(size: tuple[int, int], share: float) -> None:
     hole = np.random.default_rng(1).random(size) < share
     hole[0, 0] = False
     near, here = room.nearest_known(hole), np.indices(size)
@@ -47,16 +47,10 @@ def test_costs_are_the_formulas_and_a_search_comes_near_the_best(size: tuple[int
     ask = (*subject.target[:2], subject.level.traits, *subject.target[3:], *cells[7], *places[7])
     assert [room._cost(*ask, costs[7] * np.float32(k)) for k in (1.01, 0.99)] == [costs[7], np.inf]
     for turn in range(24):
-        state = (
-            places.copy(),
-            costs.copy(),
-            subject.valid,
-            subject.pool,
-            JUMPS[turn % len(JUMPS)],
-            np.uint32(turn * 7919),
-        )
+        jump, before = JUMPS[turn % len(JUMPS)], (places.copy(), costs.copy())
+        state = (*before, subject.valid, subject.pool, jump, np.uint32(turn * 7919))
         room._search(0, len(costs), cells, subject.numbers, *state, *subject.target, places, costs)
-        assert (costs <= state[1]).all()
+        assert (costs <= before[1]).all()
     np.testing.assert_allclose(costs, subject.expected(), rtol=1e-4)
     assert costs.mean() < 1.06 * np.mean([subject.formula(*cell).min() for cell in cells])
 

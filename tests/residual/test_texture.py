@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -19,7 +20,17 @@ from spackle.residual import CELL, Completer, Seeds, hole_mask
 from spackle.residual.complete import PAINTED_VIEWS
 from spackle.residual.compose import compose
 from spackle.residual.seeds import cell_centers
-from spackle.residual.texture import EXEMPLAR, GAIN, TEXTURE_CELLS, ExemplarTexture, PaintedTexture, sharpened
+from spackle.residual.texture import (
+    CONTINUED_CELLS,
+    EXEMPLAR,
+    GAIN,
+    SAME_DEPTH,
+    TEXTURE_CELLS,
+    ExemplarTexture,
+    PaintedTexture,
+    continued,
+    sharpened,
+)
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # cells
@@ -96,9 +107,27 @@ def test_a_scene_asks_for_its_widest_views_and_goes_on_from_the_exemplar(monkeyp
 
 def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None:
     subject, camera = box_view(0.3)
-    cues, _, rim = features_of(subject.base, camera, subject.photo_camera)
-    view = CPU.render(subject.base, camera)
+    cues, seeds, rim = features_of(subject.base, camera, subject.photo_camera)
     structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
-    found = EXEMPLAR.colors(structure, view, cues, rim) - sharpened(structure, 1)
-    torch.testing.assert_close(found, GAIN * sharpened(rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)))
-    assert float(blurred(found, 4 * TEXTURE_CELLS).abs().max()) < 0.1 * float(found.abs().max())
+    found = EXEMPLAR.colors(structure, CPU.render(subject.base, camera), cues, seeds, rim)
+    fine = found - sharpened(continued(structure, cues, seeds, rim), 1)
+    torch.testing.assert_close(fine, GAIN * sharpened(rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)))
+    assert float(blurred(fine, 4 * TEXTURE_CELLS).abs().max()) < 0.1 * float(fine.abs().max())
+
+
+def test_beyond_the_photos_border_its_nearest_cells_go_on_if_they_are_as_far_away() -> None:
+    subject, camera = box_view(0.3)
+    cues, seeds, rim = features_of(subject.base, camera, subject.photo_camera)
+    assert 100 < int(rim.beyond.sum()) < int(cues.mask.sum()) - 100
+    structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
+    found, known = continued(structure, cues, seeds, rim), (~cues.mask).nonzero()
+    assert torch.equal(found[~rim.beyond], structure[~rim.beyond])
+    uv, z = subject.photo_camera.project(camera.unproject(seeds.uv, 1 / seeds.inverse_depth))
+    outside = (uv < 0).any(-1) | (uv[..., 0] > 96) | (uv[..., 1] > 72) | (z <= 0)
+    assert torch.equal(rim.beyond, outside & cues.mask)
+    for y, x in rim.beyond.nonzero()[::17].tolist():
+        apart = (known - torch.tensor([y, x])).double().norm(dim=-1)
+        row, column = known[apart.argmin()].tolist()
+        depths = math.log(float(seeds.inverse_depth[y, x] / cues.inverse_depth[row, column])) / SAME_DEPTH
+        share = math.exp((1 - float(apart.min())) / CONTINUED_CELLS - depths**2)
+        torch.testing.assert_close(found[y, x], (1 - share) * structure[y, x] + share * cues.rgb[row, column])
