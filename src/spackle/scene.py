@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import logging
@@ -47,8 +48,8 @@ class ResidualChoice:
 
     @property
     def fill(self) -> Fill:
-        """Where the texture comes from; "none" also where the residual is."""
-        return "none" if self.named == "none" else self.wanted
+        """Where the texture comes from, "auto" resolved; "none" also where the residual is."""
+        return "none" if self.named == "none" else resolved(self.wanted)
 
     @property
     def weights(self) -> str:
@@ -181,15 +182,22 @@ def predict(
     return complete(prediction, cameras, network=network, fill=fill, renderer=renderer)
 
 
+def resolved(fill: Fill) -> Fill:
+    """What "auto" means: "lama" where its weights have been downloaded, else "exemplar"."""
+    if fill != "auto":
+        return fill
+    with contextlib.suppress(InputError):  # a machine without a home folder
+        return "lama" if installed("lama") else "exemplar"
+    return "exemplar"
+
+
 def open_texture(fill: Fill) -> Texture | None:
     """What gives the fill its texture: "lama" paints the widest views, "exemplar" takes it from the view itself.
 
-    "auto" is LaMa where its weights have been downloaded, else the exemplar. "network" and "none" give None.
-    InputError for "lama" without its weights.
+    "auto" is one of both, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
     """
-    if fill == "lama" or (fill == "auto" and installed("lama")):
-        return _lama()
-    return EXEMPLAR if fill in ("auto", "exemplar") else None
+    chosen = resolved(fill)
+    return _lama() if chosen == "lama" else EXEMPLAR if chosen == "exemplar" else None
 
 
 @functools.cache

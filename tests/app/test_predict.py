@@ -26,8 +26,14 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.image import film_to_pixels
-from spackle.residual import ResidualNet
+from spackle.bases.open import BaseSettings, open_base
+from spackle.downloads import known_weights
+from spackle.gaussians import Gaussians
+from spackle.image import film_to_pixels, load_photo
+from spackle.residual import Completer, ResidualNet
+from spackle.residual.network import shipped_network
+from spackle.residual.texture import EXEMPLAR
+from spackle.scene import ResidualChoice
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -51,7 +57,7 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     assert report["aux"]["gaussians"] == merged - base > 0
     assert report["aux"]["share"] == pytest.approx((merged - base) / base)
     assert report["merged"] == merged
-    assert report["residual"] == {"weights": "shipped"}
+    assert report["residual"] == {"weights": "shipped", "fill": "exemplar"}
     assert (report["focal_source"], report["mode"], report["disparity"]) == ("default 30 mm", "scene", 0.3)
     assert report["views"] == "rotate-forward"
     assert report["focal_px"] == pytest.approx(film_to_pixels(30, WIDTH, HEIGHT), abs=1e-3)
@@ -80,7 +86,7 @@ def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     predicted(photo, depth, tmp_path, "--residual", "none", "--no-render")
     assert names_in(tmp_path / "photo") == FILES - {"video.mp4"}
     report, bare = report_of(tmp_path / "photo"), read_ply(tmp_path / "photo" / "scene.ply")
-    assert (report["aux"], report["residual"]) == ({"gaussians": 0, "share": 0.0}, {"weights": "none"})
+    assert (report["aux"], report["residual"]) == ({"gaussians": 0, "share": 0.0}, {"weights": "none", "fill": "none"})
     assert ("video" in report["seconds"], report["video"]) == (False, None)
     assert bare == read_ply(tmp_path / "photo" / "base.ply")
     assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
@@ -149,9 +155,42 @@ def test_the_seeds_alone_can_be_had_and_fill_the_holes_where_no_weights_came_wit
     weights = tmp_path / "random.safetensors"
     save_file({name: 0.02 * torch.randn_like(value) for name, value in ResidualNet().state_dict().items()}, weights)
     predicted(*write_pair(tmp_path), tmp_path / "named", "--residual", weights)
-    assert report_of(tmp_path / "named" / "photo")["residual"] == {"weights": str(weights)}
+    assert report_of(tmp_path / "named" / "photo")["residual"]["weights"] == str(weights)
     assert (tmp_path / "named" / "photo" / "base.ply").read_bytes() == (plain[0] / "base.ply").read_bytes()
     assert (tmp_path / "named" / "photo" / "scene.ply").read_bytes() != seeds.read_bytes()
+
+
+@pytest.mark.parametrize("fill", ["none", "network", "exemplar"])
+def test_the_texture_of_the_fill_is_chosen_named_and_part_of_what_is_asked_for(
+    tmp_path: Path, plain: tuple[Path, Run], fill: str
+) -> None:
+    photo, depth = write_pair(tmp_path)
+    views = camera_file(tmp_path / "views.json", rights=[0.4])
+    requests = []
+    for chosen in ("auto", fill):
+        predicted(photo, depth, tmp_path, "--cameras", views, "--no-render", "--fill", chosen)
+        requests.append(report_of(tmp_path / "photo")["request"])
+    report, camera = report_of(tmp_path / "photo"), spackle.load_cameras(views)[0]
+    assert report["residual"] == {"weights": "none" if fill == "none" else "shipped", "fill": fill}
+    assert (requests[0] == requests[1]) == (fill == "exemplar")  # which is what auto comes to
+    base = open_base(BaseSettings(depth=depth)).predict(load_photo(photo))[0]
+    texture = EXEMPLAR if fill == "exemplar" else None
+    completer = Completer(base.gaussians, base.camera, spackle.get_renderer(), shipped_network(), texture)
+    aux = Gaussians.empty() if fill == "none" else completer.complete_scene([camera], exact=True)
+    assert report["aux"]["gaussians"] == len(aux)
+    drawn = spackle.get_renderer().render([base.gaussians, aux], camera).rgb
+    assert np.abs(pixels(tmp_path / "photo" / "views" / "0000.png") - 255 * drawn.numpy()).max() <= 0.51
+
+
+def test_lamas_weights_are_painted_with_where_they_are_and_missed_where_they_are_named(
+    tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--fill", "lama", named="spackle weights get lama")
+    assert (ResidualChoice().fill, ResidualChoice(None, "network").fill) == ("exemplar", "network")
+    (tmp_path / known_weights("lama").file).write_text("not LaMa's")
+    assert (ResidualChoice().fill, ResidualChoice("none").fill) == ("lama", "none")
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], named=known_weights("lama").file)
 
 
 @pytest.mark.parametrize(

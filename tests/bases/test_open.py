@@ -33,6 +33,7 @@ from spackle.bases.sharp.layers import TINY
 from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
+from spackle.scene import ResidualChoice
 
 pytestmark = pytest.mark.usefixtures("shipped")
 NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here"
@@ -128,6 +129,7 @@ def test_a_machine_without_a_home_has_no_sharp(photo: Path, monkeypatch: pytest.
     for name in ("SPACKLE_WEIGHTS", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     assert pick(photo)[1].why == f"{NO_DEPTH}, {NO_SHARP}"
+    assert ResidualChoice().fill == "exemplar"  # nor LaMa
     with pytest.raises(InputError, match="SPACKLE_WEIGHTS"):
         pick(photo, name="sharp")
 

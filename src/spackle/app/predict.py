@@ -27,6 +27,7 @@ from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
 from spackle.bases.sharp import SharpBase
 from spackle.camera_path import spelled
 from spackle.digest import digest_of, fingerprint
+from spackle.downloads import installed
 from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
@@ -173,7 +174,7 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
         del fields[name]
     choices = {name: value for name, value in fields.items() if not isinstance(value, Path)}
     files = {"calibration": settings.calib, "camera file": path.cameras, "path file": path.path}
-    files["weights"] = residual.file
+    files |= {"weights": residual.file, "LaMa": installed("lama") if residual.fill == "lama" else None}
     prints = [file and fingerprint(file, kind) for kind, file in files.items()]
     return digest_of([choices | own, base.fingerprints, *prints])
 
