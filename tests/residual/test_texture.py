@@ -24,6 +24,7 @@ from spackle.residual.texture import (
     CONTINUED_CELLS,
     EXEMPLAR,
     GAIN,
+    GOOD_FIT,
     SAME_DEPTH,
     TEXTURE_CELLS,
     ExemplarTexture,
@@ -111,7 +112,8 @@ def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None
     structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
     found = EXEMPLAR.colors(structure, CPU.render(subject.base, camera), cues, seeds, rim)
     fine = found - sharpened(continued(structure, cues, seeds, rim), 1)
-    torch.testing.assert_close(fine, GAIN * sharpened(rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)))
+    gain = GAIN * torch.exp(-rim.mismatch / GOOD_FIT)[..., None]
+    torch.testing.assert_close(fine, sharpened(gain * (rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS))))
     assert float(blurred(fine, 4 * TEXTURE_CELLS).abs().max()) < 0.1 * float(fine.abs().max())
 
 

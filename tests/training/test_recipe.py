@@ -24,9 +24,10 @@ def written(folder: Path, text: str = PLAIN) -> Path:
 
 
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
-def test_every_packaged_recipe_can_be_read_and_has_the_papers_weights(name: str) -> None:
+def test_every_packaged_recipe_can_be_read_and_all_but_the_small_machines_have_the_papers_weights(name: str) -> None:
     recipe = load_recipe(Recipe, name)
-    assert vars(recipe.loss).items() >= PAPER_WEIGHTS.items()
+    papers = {**PAPER_WEIGHTS, "color_blur": 0, "gram": 1}
+    assert (vars(recipe.loss).items() >= papers.items()) == (name != "cpu")
     assert recipe.data.photos is not None or recipe.data.pseudo is not None
     assert recipe.loss.dilation == 21
     if name == "paper":

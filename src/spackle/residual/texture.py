@@ -20,8 +20,8 @@ from spackle.render.protocol import Rendering
 from spackle.residual.hole_features import CELL, Cues, hole_mask
 from spackle.residual.seeds import SPREAD_PX, Rim, Seeds
 
-TEXTURE_CELLS = 2.5  # standard deviation: what this blur takes away is texture, what it leaves is structure
-GAIN = 0.7  # of the texture: more of what cannot fit the truth looks no better, and is farther from it
+TEXTURE_CELLS = 1.5  # standard deviation: what this blur takes away is texture, what it leaves is structure
+GAIN, GOOD_FIT = 0.9, 0.15  # of texture that fits perfectly; mismatch at which a third of it is left
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
 OVERLAP_CELLS = SPREAD_PX / CELL  # standard deviation of a blob
 STEPS = 2
@@ -41,7 +41,8 @@ class ExemplarTexture:
     def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
         """See `Texture.colors`."""
         fine = rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)
-        return sharpened(continued(structure, cues, seeds, rim), 1) + sharpened(GAIN * fine)
+        gain = GAIN * (-rim.mismatch / GOOD_FIT).exp()[..., None]
+        return sharpened(continued(structure, cues, seeds, rim), 1) + sharpened(gain * fine)
 
 
 EXEMPLAR = ExemplarTexture()
