@@ -218,8 +218,8 @@ def shot_of(*sides: float) -> Shot:
 
 def test_each_method_starts_from_the_same_base() -> None:
     shot = shot_of(0.4, -0.4)
-    names = ("base", "seeds", "spackle-scene", "dense")
-    alone, per_view, scene, dense = (list(make_method(name, None)(shot)) for name in names)
+    names = ("base", "seeds", "spackle-scene", "dense", "network", "spackle")
+    alone, per_view, scene, dense, network, spackle = (list(make_method(name, None)(shot)) for name in names)
     for index, before in enumerate(shot.before):
         covered = ~hole_mask(before.alpha)
         assert torch.equal(alone[index].rgb, before.rgb)
@@ -231,6 +231,9 @@ def test_each_method_starts_from_the_same_base() -> None:
         whole = before.alpha.numel() / 4
         assert 0.97 * whole <= (dense[index].aux or 0) <= whole
         assert (per_view[index].aux or 0) < 0.5 * whole
+        assert torch.equal(network[index].rgb, per_view[index].rgb)  # without weights both are the seeds
+        assert not torch.equal(network[index].rgb, spackle[index].rgb)  # which get texture
+        assert torch.equal(network[index].alpha, spackle[index].alpha)
     assert scene[0].aux == scene[1].aux  # one set for both
 
 
@@ -300,7 +303,7 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
         return lambda image: image.mean() if name == "niqe" else torch.tensor(math.nan)
 
     fake_pyiqa(monkeypatch, create)
-    methods = f"base,{FLAT}seeds,spackle,spackle-scene"
+    methods = f"base,{FLAT}seeds,network,spackle,spackle-scene"
     done = evaluate(scenes, tmp_path, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3", "0.5")
     assert done.code == 0, done.err
     assert names_in(tmp_path) == OUTPUTS
@@ -309,7 +312,7 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02
-        for method in ("seeds", "spackle", "spackle-scene"):
+        for method in ("seeds", "network", "spackle", "spackle-scene"):
             assert mean_of(found, setting, method, "har") < 0.05 * before
             assert mean_of(found, setting, method, "merged") > mean_of(found, setting, "base", "merged")
         dark, filled = (mean_of(found, setting, method, "niqe") for method in ("base", "spackle"))

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spackle.render import get_renderer
 from spackle.training.losses import (
     PAPER_WEIGHTS,
     alpha_loss,
@@ -22,6 +23,8 @@ from spackle.training.losses import (
     preserve_loss,
     total_loss,
 )
+from spackle.training.method import Objective, ViewBatch
+from spackle.training.recipe import LossRecipe
 
 RGB = torch.tensor([[[[0.1, 0.2, 0.3], [0.5, 0.5, 0.5]]]])  # [1, 1, 2, 3]: one row of two pixels
 TARGET = torch.tensor([[[[0.2, 0.2, 0.0], [1.0, 0.0, 0.9]]]])
@@ -59,6 +62,24 @@ def test_color_is_the_mean_difference_in_each_images_hole_then_over_images() -> 
     assert color_loss(rgb, target, hole).item() == pytest.approx(sum(each) / 3)
 
 
+def test_a_blurred_color_loss_sees_the_low_frequencies_of_the_holes_differences_alone() -> None:
+    rgb, target = pictures(2, 7, 9)
+    hole, sigma = torch.rand(2, 7, 9, generator=torch.Generator().manual_seed(4)) < 0.5, 1.2
+    each = []
+    for one, other, mask in zip(rgb.detach(), target, hole, strict=True):
+        cells = mask.nonzero()
+        apart, far = (one - other)[mask], (cells[:, None] - cells).double()
+        weights = torch.exp(-far.square().sum(-1) / (2 * sigma**2)) * (far.abs().amax(-1) <= math.ceil(3 * sigma))
+        each.append(float((weights @ apart / weights.sum(1, keepdim=True)).abs().mean()))
+    assert color_loss(rgb, target, hole, sigma).item() == pytest.approx(sum(each) / 2, rel=1e-5)
+    stripes = torch.tensor([-0.5, 0.5]).repeat(8)[None, None, :, None].expand(1, 8, 16, 3)
+    middle = torch.zeros(1, 8, 16, dtype=torch.bool)
+    middle[..., 2:14] = True
+    assert color_loss(stripes, 0 * stripes, middle).item() == pytest.approx(0.5)
+    assert color_loss(stripes, 0 * stripes, middle, 2.0).item() < 0.05
+    assert color_loss(stripes + 0.5, stripes, middle, 2.0).item() == pytest.approx(0.5)
+
+
 def test_alpha_is_cross_entropy_towards_one_clamped_and_counts_images_alike() -> None:
     alpha, hole = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]]), torch.tensor([[[True, False]], [[True, True]]])
     assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
@@ -89,14 +110,17 @@ FEATURE_TERM = (1 + 0.5 + 0) / math.sqrt(0.5) / 3
 GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1) of the prediction, of nine
 
 
+@pytest.mark.parametrize("gram", [1.0, 0.25, 0.0])
 @pytest.mark.parametrize("factors", [(1,), (1, 100, 0.01)])
-def test_perceptual_sums_feature_and_gram_terms_of_layers_and_counts_images_alike(factors: tuple[float, ...]) -> None:
+def test_perceptual_sums_feature_and_gram_terms_of_layers_and_counts_images_alike(
+    factors: tuple[float, ...], gram: float
+) -> None:
     rgb, target = perceptual_example()
-    expected = len(factors) * (FEATURE_TERM + GRAM_TERM)
-    loss = perceptual_loss(Pixels(*factors), rgb, target, LEFT, dilation=1, size=None)
+    expected = len(factors) * (FEATURE_TERM + gram * GRAM_TERM)
+    loss = perceptual_loss(Pixels(*factors), rgb, target, LEFT, dilation=1, size=None, gram=gram)
     assert loss.item() == pytest.approx(expected, rel=1e-5)
     both = (tensor.repeat(2, 1, 1, 1) for tensor in (rgb, target))
-    loss = perceptual_loss(Pixels(*factors), *both, torch.cat([LEFT, NO_HOLE]), dilation=1, size=None)
+    loss = perceptual_loss(Pixels(*factors), *both, torch.cat([LEFT, NO_HOLE]), dilation=1, size=None, gram=gram)
     assert loss.item() == pytest.approx(expected / 2, rel=1e-5)
 
 
@@ -132,6 +156,7 @@ def test_dilation_is_a_square_and_a_mask_is_pooled_by_area() -> None:
 
 LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
     "color": color_loss,
+    "blurred color": lambda rgb, target, hole: color_loss(rgb, target, hole, 1.5),
     "alpha": lambda rgb, _, hole: alpha_loss(rgb[..., 0], hole),
     "preserve": preserve_loss,
     "perceptual": lambda rgb, target, hole: perceptual_loss(Pixels(1, 2), rgb, target, hole, dilation=3, size=12),
@@ -164,6 +189,19 @@ def test_the_total_is_the_weighted_sum_of_its_terms(weights: dict[str, float]) -
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(values, rel=1e-5)
     assert loss.item() == pytest.approx(sum(weights[name] * value for name, value in values.items()), rel=1e-5)
     assert set(total_loss(rgb, alpha, target, base, LEFT)[1]) == {"color", "alpha", "preserve"}
+
+
+@pytest.mark.parametrize(("blur", "gram"), [(0.0, 1.0), (1.5, 0.25)])
+def test_the_options_of_a_recipe_reach_the_loss(blur: float, gram: float) -> None:
+    rgb, target = perceptual_example()
+    recipe = LossRecipe(features="none", dilation=1, feature_size=None, color_blur=blur, gram=gram)
+    objective = Objective(recipe, Pixels(1), get_renderer(), torch.float32, torch.device("cpu"))
+    hole = torch.tensor([[[True, True]]])
+    _, terms = objective.total(ViewBatch(rgb, torch.ones(1, 1, 2), rgb, target, hole))
+    assert terms["color"].item() == pytest.approx(color_loss(rgb, target, hole, blur).item())
+    expected = perceptual_loss(Pixels(1), rgb, target, hole, dilation=1, size=None, gram=gram)
+    assert terms["perceptual"].item() == pytest.approx(expected.item())
+    assert (color_loss(rgb, target, hole, blur) == color_loss(rgb, target, hole)) == (blur == 0)
 
 
 def test_distance_is_between_directions_of_feature_vectors() -> None:

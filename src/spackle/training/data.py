@@ -22,7 +22,7 @@ from spackle.training.sample import Sample, random_crops, save_sample
 from spackle.training.sources import PseudoViews, View, composite_view, frame_view, right_view, stereo_view
 
 TRAIN, VALIDATION = "train", "validation"
-SAMPLES_VERSION = 3  # goes up whenever the same recipe would make other samples
+SAMPLES_VERSION = 4  # goes up whenever the same recipe would make other samples
 Step = Callable[[int, int], None]  # (done, of how many)
 
 
