@@ -43,7 +43,7 @@ def test_the_demo_leaves_a_scene_and_fills_the_hole_better_than_2d_inpainting(tm
     hole = {name: score["in_hole"] for name, score in psnr.items()}
     assert max(hole[INPAINTING], hole["base"]) < hole[SPACKLE] < hole[TRAINED]
     assert hole[SPACKLE] >= 16.3
-    assert ssim[TRAINED] > ssim[SPACKLE] + 0.005  # both have texture, which SSIM does not like
+    assert min(ssim[SPACKLE], ssim[TRAINED]) > ssim[INPAINTING] + 0.03  # sharp texture gains none over smooth seeds
     assert psnr["base"]["outside"] - psnr[SPACKLE]["outside"] <= 0.1
     assert psnr["base"]["outside"] - psnr[TRAINED]["outside"] <= 0.05
     before, after = (report["hole_area_ratio"][key] for key in ("before", "after"))
