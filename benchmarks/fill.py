@@ -139,7 +139,7 @@ class Pair:
         self.hole = hole_mask(self.before.alpha)
         self.paths = {
             kind: scene_path(self.prediction.gaussians, camera, kind, DISPARITY, FRAMES)
-            for kind in ("swipe", "rotate_forward")
+            for kind in ("swipe", "rotate-forward")
         }
         self.crossings = {kind: [self._crossings(end) for end in ends(path)] for kind, path in self.paths.items()}
 
@@ -186,7 +186,7 @@ class Pair:
 
     def flicker(self, draw: Draw) -> float:
         """Along rotate-forward, in 255ths."""
-        path, changes = self.paths["rotate_forward"], []
+        path, changes = self.paths["rotate-forward"], []
         for index in PAIRS:
             camera, following = path[index], path[index + 1]
             one, other, hole = draw(camera), draw(following), hole_mask(self.base(camera).alpha)

@@ -194,7 +194,7 @@ def main() -> None:
         weights, photo = make_inputs(chosen.weights, chosen.photo, folder)
         common = {"weights": weights, "photo": photo, "device": chosen.device}
         contenders: dict[str, dict[str, Any]] = {"original": {"checkout": chosen.original}} if chosen.original else {}
-        contenders |= {"Spackle": {}, "Spackle, --low-memory": {"low_memory": True}}
+        contenders |= {"Spackle": {}, "Spackle, --sharp windows=1": {"windows": 1}}
         contenders |= {"Spackle, fp32": {"precision": "fp32"}}
         outputs = {label: folder / f"{index}.ply" for index, label in enumerate(contenders)}
         results = []

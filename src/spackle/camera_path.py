@@ -14,7 +14,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 
-TrajectoryKind = Literal["swipe", "shake", "rotate", "rotate_forward"]
+TrajectoryKind = Literal["swipe", "shake", "rotate", "rotate-forward"]
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 PathUnit = Literal["metres", "disparity"]
 UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
@@ -23,7 +23,7 @@ NEAR_QUANTILE = 0.001  # z_near: sets how far the eye may go
 FOCUS_QUANTILE = 0.1  # depth that the camera keeps looking at
 MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
 MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
-MAX_ZOOM = 0.15  # forward motion of rotate_forward, in units of z_near
+MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
 UP = (0.0, -1.0, 0.0)  # by default the photo's
@@ -57,9 +57,12 @@ class DepthRange:
         return DepthRange(near, focus)
 
 
-def spelled(kind: TrajectoryKind) -> str:
-    """A trajectory as --trajectory spells it, and as everything does that a person reads."""
-    return kind.replace("_", "-")
+def trajectory_kind(name: str) -> TrajectoryKind:
+    """A trajectory by its name; `rotate_forward`, as it was spelled once, is accepted. ValueError for an unknown one."""
+    kind = name.replace("_", "-")
+    if kind not in TRAJECTORIES:
+        raise ValueError(f"unknown trajectory {name!r}: choose one of {', '.join(TRAJECTORIES)}")
+    return kind
 
 
 def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> float:
@@ -75,7 +78,7 @@ def trajectory(
 
     Args:
         kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle) or
-            rotate_forward (left-right while moving in and out).
+            rotate-forward (left-right while moving in and out).
         camera: the photo's camera at the world's origin.
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
@@ -106,8 +109,7 @@ def _flight(
     kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, frames: int
 ) -> tuple[Tensor, Tensor]:
     """Eye positions [frames, 3] and what they look at, [3]."""
-    if kind not in TRAJECTORIES:
-        raise ValueError(f"unknown trajectory {kind!r}: choose one of {', '.join(TRAJECTORIES)}")
+    kind = trajectory_kind(kind)
     if not 0 <= disparity <= MAX_DISPARITY:
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if frames < 1:

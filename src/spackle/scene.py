@@ -87,7 +87,7 @@ class Scene:
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     def path(
-        self, kind: TrajectoryKind = "rotate_forward", disparity: float = 0.3, frames: int = PATH_FRAMES
+        self, kind: TrajectoryKind = "rotate-forward", disparity: float = 0.3, frames: int = PATH_FRAMES
     ) -> list[Camera]:
         """Cameras of a video around the photo's eye, both sides of the picture even."""
         return scene_path(self.base, self.camera, kind, disparity, frames)
@@ -123,7 +123,7 @@ class Scene:
     def save_video(
         self,
         path: str | os.PathLike[str],
-        kind: TrajectoryKind = "rotate_forward",
+        kind: TrajectoryKind = "rotate-forward",
         disparity: float = 0.3,
         frames: int = PATH_FRAMES,
         fps: float = 30,
@@ -140,7 +140,7 @@ def predict(
     depth: str | os.PathLike[str] | DepthMap | None = None,
     *,
     base: Base | None = None,
-    kind: TrajectoryKind = "rotate_forward",
+    kind: TrajectoryKind = "rotate-forward",
     disparity: float = 0.3,
     network: ResidualNet | Shipped | None = "shipped",
     fill: Fill = "auto",

@@ -376,7 +376,7 @@ def test_bad_cameras(tmp_path: Path, pair: tuple[Path, Path], scene: Path) -> No
         *((("--disparity", value), "--disparity") for value in ("-0.1", "2.1", "nan")),
         *((("--frames", value), "--frames") for value in ("0", "1000000")),
         (("--precision", "bf16"), "--precision"),
-        (("--low-memory", ""), "--low-memory"),
+        (("--sharp", "windows=1"), "--sharp windows=1"),
         (("--base", "sharp9"), "--base"),
         (("--device", "cuda"), "--device"),
         (("-c", "weights.pt"), "-c"),

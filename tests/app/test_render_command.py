@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,11 @@ def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Pa
     assert (ours[0].width, ours[0].height, ours[0].format.name) == (WIDTH, HEIGHT, "yuv420p")
     first = [frames[0].to_ndarray(format="rgb24").astype(float) for frames in (ours, predicted)]
     assert np.abs(first[0] - first[1]).mean() < 1  # the path starts at the photo's place
+    far = run(
+        "render", scene, "-o", tmp_path / "far.mp4", "--trajectory", "swipe", "--disparity", 1.5, "--json", *SHORT
+    )
+    assert "the scene was completed for --disparity 0.3" in far.err
+    assert json.loads(far.out)["open"] > 0.01
 
 
 def test_render_at_another_size_squeezes_nothing(tmp_path: Path, scene: Path) -> None:

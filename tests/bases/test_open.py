@@ -114,7 +114,7 @@ def test_weights_and_options_that_a_person_gave_reach_sharp(
     assert (choice.base, choice.why, quick.pop()["path"]) == ("sharp", "-c", given)
     words: dict[str, Any] = {"precision": "fp32", "windows": 9, "compiled": True}
     assert pick(photo, **words)[1].base == "sharp"
-    assert quick == [{"path": sharp, "low_memory": False, "device": None, **words}]
+    assert quick == [{"path": sharp, "device": None, **words}]
     assert pick(portrait(tmp_path / "p.jpg"), **words)[1].base == "rgbd"
     sharp.unlink()
     assert pick(photo, **words)[1].base == "lite"
@@ -296,7 +296,7 @@ def test_depth_that_is_given_or_named_has_no_fallback(tmp_path: Path, photo: Pat
         ({"name": "lite", "depth": Path("d.npy")}, "--depth d.npy: the lite base"),
         ({"name": "lite", "checkpoint": Path("gone.safetensors")}, "gone.safetensors"),
         ({"name": "hf:a/b", "checkpoint": Path("x.pt")}, "-c x.pt: the hf base"),
-        ({"name": "hf:a/b", "compiled": True}, "--compile: the hf base"),
+        ({"name": "hf:a/b", "compiled": True}, "--sharp compile=yes: the hf base"),
         ({"name": "hf:"}, "names no model"),
         ({"name": "shrap"}, r"did you mean sharp\?"),
         ({"name": "sharp"}, "spackle weights get sharp.*-c FILE"),
@@ -304,10 +304,9 @@ def test_depth_that_is_given_or_named_has_no_fallback(tmp_path: Path, photo: Pat
         ({"name": "rgbd", "checkpoint": Path("x.pt")}, "-c x.pt: the rgbd base"),
         ({"checkpoint": Path("gone.pt")}, "gone.pt"),
         ({"calib": Path("c.txt")}, "--calib c.txt: is for a disparity map"),
-        ({"depth": Path("d.npy"), "low_memory": True}, "--low-memory: the rgbd base"),
+        ({"depth": Path("d.npy"), "windows": 1}, "--sharp windows=1: the rgbd base"),
         ({"precision": "fp8"}, "fp8"),
-        ({"windows": 36}, "--windows must be between 1 and 35, got 36"),
-        ({"windows": 2, "low_memory": True}, "--windows 2: low memory"),
+        ({"windows": 36}, "--sharp windows must be between 1 and 35, got 36"),
     ],
     ids=str,
 )

@@ -34,7 +34,7 @@ def same(one: SharpOutput, other: SharpOutput) -> bool:
 # --- windows at once
 
 
-@pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"low_memory": True}, WINDOWS)])
+@pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)])
 def test_so_many_windows_go_at_once(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
     SharpBase(micro_network(), **options).look(PHOTO, lambda done, total: seen.append(done))
@@ -92,7 +92,7 @@ def test_without_a_compiler_one_line_says_so_and_the_photo_is_done_all_the_same(
 
     base = SharpBase(micro_network(), compiled=True)  # too little memory is no missing compiler
     monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: short)
-    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --low-memory"):
+    with pytest.raises(spackle.InputError, match="not enough memory for the network: try --sharp windows=1"):
         base.predict(PHOTO)
     assert base.compiled
 

@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from command import FILES, SHORT, decode, names_in, report_of, run
+from command import FILES, SHORT, decode, names_in, refuses, report_of, run
 from photos import (
     metres,
     read_ply,
@@ -91,11 +91,23 @@ def test_a_killed_run_leaves_whole_files_and_the_next_one_finishes(tmp_path: Pat
 
 
 def test_every_command_has_a_help() -> None:
-    named = {"predict": "--input", "export": "--output", "view": "SCENE_OR_PHOTO"}  # in the examples
+    named = {"predict": "PHOTO", "export": "--output", "view": "SCENE_OR_PHOTO"}  # in the examples
     for command in COMMANDS:
         result = run(command, "--help")
         assert (result.code, f"spackle {command}" in result.out.splitlines()[0]) == (0, True)
         assert named.get(command, "") in result.out
+    first, everything = (run("predict", option).out.splitlines() for option in ("--help", "--help-all"))
+    counts = [sum(line.startswith("  -") for line in lines) for lines in (first, everything)]
+    assert counts[0] <= 20 < counts[1]
+    assert len(run("--help").out.splitlines()) <= 24
+
+
+def test_an_input_is_an_argument_or_follows_i(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    refuses(run("predict", pair[0], "-i", pair[1], "-o", tmp_path / "out"), pair[1])
+    refuses(run("render", "-o", tmp_path / "out"), "SCENE.ply")
+    for words in (("--sharp", "windws=1"), ("--sharp", "windows=many"), ("--sharp", "compile")):
+        refuses(run("predict", pair[0], "-o", tmp_path / "out", *words), "--sharp")
+    assert not (tmp_path / "out").exists()
 
 
 def test_each_result_and_each_error_is_a_line_of_json_on_the_standard_output(tmp_path: Path) -> None:
@@ -104,7 +116,7 @@ def test_each_result_and_each_error_is_a_line_of_json_on_the_standard_output(tmp
     write_depth(photos / "photo.npy", metres(32, 24))
     (photos / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     options = ("--depth", photos, "-o", tmp_path / "out", "--frames", 2, "--residual", "seeds", "--json")
-    first, again = (run("predict", "-i", photos, *options) for _ in range(2))
+    first, again = (run("predict", photos, *options) for _ in range(2))
     assert first.code == again.code == 1
     report, bad = (json.loads(line) for line in first.out.splitlines())
     assert report == {"folder": str(tmp_path / "out" / "photo"), **report_of(tmp_path / "out" / "photo")}
@@ -114,9 +126,9 @@ def test_each_result_and_each_error_is_a_line_of_json_on_the_standard_output(tmp
     assert (result.code, len(result.lines)) == (2, 1)
     assert "torn.png" in json.loads(result.out)["error"]
     scene = tmp_path / "out" / "photo" / "scene.ply"
-    rendered = run("render", "-i", scene, "-o", tmp_path / "film.mp4", "--frames", 2, "--json")
+    rendered = run("render", scene, "-o", tmp_path / "film.mp4", "--frames", 2, "--json")
     assert json.loads(rendered.out)["file"] == str(tmp_path / "film.mp4")
-    exported = run("export", scene, "-o", tmp_path / "a.splat", "-o", tmp_path / "a.spz", "--json")
+    exported = run("export", scene, "-o", tmp_path / "new" / "folder" / "a.splat", "-o", tmp_path / "a.spz", "--json")
     files = [json.loads(line) for line in exported.out.splitlines()]
     assert [Path(line["file"]).stat().st_size for line in files] == [line["bytes"] for line in files]
     assert [line["gaussians"] for line in files] == [report["merged"]] * 2

@@ -55,12 +55,12 @@ def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not
     arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
     assert run(*arguments).err.count("done already") == 2
-    assert run(*arguments, "--low-memory").err.count("done already") == 2
-    assert run(*arguments, "--windows", 9, "--compile").err.count("done already") == 2
+    assert run(*arguments, "--sharp", "windows=1").err.count("done already") == 2
+    assert run(*arguments, "--sharp", "windows=9", "--sharp", "compile=yes").err.count("done already") == 2
     changed = tiny_weights()
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
-    result = run(*arguments, "--precision", "fp32", "--low-memory")
+    result = run(*arguments, "--precision", "fp32", "--sharp", "windows=1")
     assert (result.code, "done already" in result.err) == (0, False)
     assert report_of(tmp_path / "out" / "a")["base"]["precision"] == "fp32"
 

@@ -315,7 +315,7 @@ def test_bad_requests_leave_nothing(scene: Path, tmp_path: Path) -> None:
     before = scene.read_bytes()
     for source, outputs, says in [
         ("scene.ply", ["a.spz", "a.obj"], r"a\.obj: which format"),
-        ("scene.ply", ["a.spz", "none/a.sog"], "does not exist"),
+        ("text.ply", ["a.spz", "none/a.sog"], "not a PLY"),
         ("scene.ply", ["a.spz", "a.spz"], "named twice"),
         ("scene.ply", ["a.spz", "scene.ply"], r"scene\.ply: is the scene itself"),
         ("scene.ply", ["a.spz", "link.ply"], r"scene\.ply: is the scene itself"),

@@ -36,7 +36,7 @@ def holes_of(camera: Camera, *gaussians: Gaussians) -> float:
 
 
 def path_of(
-    completer: Completer, kind: TrajectoryKind = "rotate_forward", disparity: float = 0.3, frames: int = FRAMES
+    completer: Completer, kind: TrajectoryKind = "rotate-forward", disparity: float = 0.3, frames: int = FRAMES
 ) -> list[Camera]:
     return trajectory(kind, completer.photo_camera, disparity, DepthRange.of(completer.base), frames)
 
@@ -159,7 +159,7 @@ class Counting(CpuRenderer):
         return CPU.render(gaussians, camera, **part)
 
 
-@pytest.mark.parametrize(("kind", "most"), [("rotate_forward", 30), ("rotate", 60), ("swipe", 20)])
+@pytest.mark.parametrize(("kind", "most"), [("rotate-forward", 30), ("rotate", 60), ("swipe", 20)])
 def test_few_frames_of_a_path_are_looked_at_all_of_them_are_closed_and_what_the_widest_show_stays(
     kind: TrajectoryKind, most: int
 ) -> None:

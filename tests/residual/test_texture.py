@@ -101,7 +101,7 @@ def test_a_scene_asks_for_its_widest_views_and_goes_on_from_the_exemplar(monkeyp
     subject, _, painter = painted_box((96, 72))
     later: list[Tensor] = []
     monkeypatch.setattr(ExemplarTexture, "colors", lambda self, structure, *_: later.append(structure) or structure)
-    path = trajectory("rotate_forward", subject.photo_camera, 0.4, DepthRange.of(subject.base), 9)
+    path = trajectory("rotate-forward", subject.photo_camera, 0.4, DepthRange.of(subject.base), 9)
     subject.complete_scene(path, exact=True)
     assert (len(painter.asked), len(later) > 0) == (PAINTED_VIEWS, True)
 

@@ -189,11 +189,14 @@ def test_paths_have_their_closed_forms(kind: str, frames: int) -> None:
         assert uv.tolist() == pytest.approx([200, 150], abs=1e-3)
         assert torch.equal(camera.K, PHOTO.K)
         assert camera.position.tolist() == pytest.approx(closed_form(kind, 0.8, 2.0, k, frames), abs=1e-6)
+    old = trajectory("rotate_forward", PHOTO, 0.4, RANGE, 3)  # type: ignore[arg-type]
+    new = trajectory("rotate-forward", PHOTO, 0.4, RANGE, 3)
+    assert all(torch.equal(a.world_to_camera, b.world_to_camera) for a, b in zip(old, new, strict=True))
 
 
 def test_impossible_paths_are_refused() -> None:
     for kind, disparity, frames, says in (
-        ("spiral", 0.3, 60, "rotate_forward"),
+        ("spiral", 0.3, 60, "rotate-forward"),
         ("swipe", 3, 60, "disparity"),
         ("swipe", 0.3, 0, "at least one frame"),
     ):

@@ -115,7 +115,7 @@ def test_near_is_bright_holes_are_grey_and_the_scale_is_linear_in_inverse_depth(
 def test_one_scale_serves_all_views_of_a_video() -> None:
     scene = box_before_wall(near=2.0, far=6.0)
     base = scene.base()
-    path = scene_path(base, scene.camera, "rotate_forward", 0.3, 5)
+    path = scene_path(base, scene.camera, "rotate-forward", 0.3, 5)
     scale = DepthColors.over(base, path)
     assert (scale.near, scale.far) == pytest.approx((2.0, 6.0), rel=0.25)
     film = FrameMaker.of(VideoOptions(show="depth"), base, path, Path("x"))

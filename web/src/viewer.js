@@ -2,7 +2,7 @@
 import { Stage } from "./stage.js";
 import { disparityOf, eyeOnPath, held, pulledTo } from "./views.js";
 
-export const KINDS = ["swipe", "shake", "rotate", "rotate_forward"];
+export const KINDS = ["swipe", "shake", "rotate", "rotate-forward"];
 const TURN_S = 8; // seconds that a path takes, there and back where it is open
 const GLIDE_S = 0.7; // seconds from where the eye is to the path
 const MOST_PIXELS = 2.6e6;
@@ -14,7 +14,7 @@ export class Viewer extends EventTarget {
     super();
     this.canvas = canvas;
     this.stage = new Stage(canvas, () => this.refresh());
-    this.kind = "rotate_forward";
+    this.kind = "rotate-forward";
     this.t = 0; // on the path, 0..1
     this.disparity = USUAL;
     this.onPath = true; // false where a hand holds the eye

@@ -1,4 +1,4 @@
-"""`spackle predict -i clip.mp4`: each frame seen from a camera that moves, its depth and its filled holes kept calm."""
+"""`spackle predict clip.mp4`: each frame seen from a camera that moves, its depth and its filled holes kept calm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spackle.app.video import PathOptions, VideoOptions
 from spackle.bases.open import BaseSettings, Choice
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, TrajectoryKind, spelled, view_at
+from spackle.camera_path import DepthRange, TrajectoryKind, view_at
 from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
@@ -199,7 +199,7 @@ class _Run:
             "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
             "residual": {"weights": self._setting.residual.weights},
             "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # the mean over the frames
-            "views": spelled(self._setting.path.trajectory),
+            "views": self._setting.path.trajectory,
             "disparity": self._setting.path.disparity,
             "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
             # In units of 1/255; None where no frame has the figure.

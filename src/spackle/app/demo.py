@@ -49,7 +49,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
             f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
         )
         base, camera = prediction.gaussians, prediction.camera
-        cameras = scene_path(base, camera, "rotate_forward", DISPARITY)
+        cameras = scene_path(base, camera, "rotate-forward", DISPARITY)
         sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
         with reporter.stage("complete", seconds) as step:
             scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import time
@@ -19,6 +20,7 @@ from spackle.formats.ply import read_header
 from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, at_origin
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.image import focal_length
+from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.viewer import PageScene, page_scene, single_html
 
@@ -29,11 +31,20 @@ WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
-    """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
+    """Write a PLY in the formats that the outputs' names end in; creates their folders; each file is whole or not at all.
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
     writers = [writer_of(output) for output in outputs]
+    with contextlib.ExitStack() as folders:
+        for output in outputs:
+            folders.enter_context(results_folder(output.parent, [output.name]))
+        _export(scene, outputs, writers, reporter)
+
+
+def _export(
+    scene: Path, outputs: Sequence[Path], writers: Sequence[Callable[[SceneFile, Path], None]], reporter: Reporter
+) -> None:
     targets = [check_writable(output) for output in outputs]
     twice = [output for output, target in zip(outputs, targets, strict=True) if targets.count(target) > 1]
     if twice:

@@ -25,7 +25,6 @@ from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
 from spackle.bases.sharp import SharpBase
-from spackle.camera_path import spelled
 from spackle.digest import digest_of, fingerprint
 from spackle.downloads import installed
 from spackle.errors import InputError
@@ -170,7 +169,7 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
     }
     own |= {"render": options.render, "mode": options.mode, "keep_frame": options.keep_frame, **options.lens}
     fields = {**dataclasses.asdict(settings), **dataclasses.asdict(path)}
-    for name in ("name", "low_memory", "windows", "compiled"):  # recorded as `base`, or change last bits alone
+    for name in ("name", "windows", "compiled"):  # recorded as `base`, or change last bits alone
         del fields[name]
     choices = {name: value for name, value in fields.items() if not isinstance(value, Path)}
     files = {"calibration": settings.calib, "camera file": path.cameras, "path file": path.path}
@@ -229,7 +228,7 @@ def make_report(
         "aux": {"gaussians": aux, "share": aux / base},
         "merged": base + aux,
         "mode": completer.mode,
-        "views": given.name if given else spelled(path.trajectory),
+        "views": given.name if given else path.trajectory,
         "disparity": None if given else path.disparity,
         "video": video,
         "hole_area_ratio": holes,

@@ -16,14 +16,17 @@ from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_png, save_video
+from spackle.formats.ply import load_ply_disparity
 from spackle.formats.video import FORMATS
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
+from spackle.residual import hole_area_ratio
 
 DEFAULT_SIZE = (1280, 720)
+TOLERATED = 0.01  # holes of a frame that nobody need be told of
 
 
 def render_scene(
@@ -44,24 +47,27 @@ def render_scene(
     renderer = get_renderer(device)
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
-        views, keyframes = path.load()
+        given, keyframes = path.load()
         gaussians = load_ply(scene)
-        cameras = views or _fly(scene, gaussians, path, keyframes, focal_px, reporter)
+        cameras = given or _fly(scene, gaussians, path, keyframes, focal_px, reporter)
         # A path has the video's size already.
         maker = FrameMaker.of(dataclasses.replace(path.video, size=None), gaussians, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
-    names = [f"{index:04d}.png" for index in range(len(cameras))] if views and not single else []
+    names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
     problem = video_problem(cameras)
     if problem and not names:
-        hint = "give a folder with -o for pictures only" if views else "give --size"
+        hint = "give a folder with -o for pictures only" if given else "give --size"
         raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
+    open_shares: list[float] = []
     with results_folder(target.parent, [*names, target.name]), reporter.stage("video", seconds) as step:
 
         def frames() -> Iterator[Tensor]:
             """The frames of the video, each also saved as a picture, where these are wanted."""
             for index, camera in enumerate(cameras):
                 with torch.no_grad():
-                    frame = maker.frame([renderer.render([gaussians], eye) for eye in maker.eyes(camera)])
+                    views = [renderer.render([gaussians], eye) for eye in maker.eyes(camera)]
+                    frame = maker.frame(views)
+                open_shares.append(max(hole_area_ratio(view.alpha) for view in views))
                 if names:
                     save_png(frame, target.parent / names[index])
                 yield frame
@@ -72,7 +78,16 @@ def render_scene(
                 pass
         else:
             save_video(frames(), target, path.video.rate, path.video.loop)
-    result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds["video"]}
+    widest = max(open_shares)
+    result = {
+        "gaussians": len(gaussians),
+        "frames": len(cameras),
+        "seconds": seconds["video"],
+        "open": round(widest, 5),
+    }
+    if widest > TOLERATED:
+        mean = sum(open_shares) / len(open_shares)
+        reporter.log(f"{scene.name}: holes take up to {widest:.1%} of a frame, {mean:.1%} on average{_reach(scene)}")
     if problem:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
@@ -81,6 +96,12 @@ def render_scene(
         f"{scene.name}: {len(gaussians):,} Gaussians, {len(cameras)} frames in {seconds['video']:.1f} s -> {target}"
     )
     reporter.result({"file": target, **result})
+
+
+def _reach(scene: Path) -> str:
+    """How far a scene was completed, where its file says it."""
+    disparity = load_ply_disparity(scene)
+    return "" if disparity is None else f": the scene was completed for --disparity {disparity:g}"
 
 
 def _fly(

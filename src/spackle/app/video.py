@@ -96,7 +96,7 @@ class VideoOptions:
 class PathOptions:
     """Which way the camera goes, and the video along it."""
 
-    trajectory: TrajectoryKind = "rotate_forward"
+    trajectory: TrajectoryKind = "rotate-forward"
     disparity: float = 0.3
     cameras: Path | None = None  # exactly these views in place of a trajectory
     path: Path | None = None  # keyframes in place of a trajectory

@@ -72,7 +72,7 @@ def make_weights(output: Path, size: str, reporter: Reporter) -> None:
     suffix = output.suffix.lower()
     if suffix not in (".pt", ".safetensors"):
         raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
-    with atomic_path(output) as temporary:
+    with results_folder(output.parent, [output.name]), atomic_path(output) as temporary:
         tensors = lama_weights() if size == "lama" else deterministic_weights(expected_shapes(CONFIGS[size]))
         if suffix == ".pt":
             torch.save(tensors, temporary)

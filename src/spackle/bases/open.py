@@ -56,27 +56,23 @@ class BaseKind:
 
 
 _OWN_DEPTH = {"--depth": "finds depth itself", "--calib": "finds depth itself"}
-_SHARPS_SPEED = ("--windows", "--compile")
 KINDS = {
     "rgbd": BaseKind(
         f"the dataset's own depth, map or points, lifted; {NOT_SHARP}",
-        {"-c": "has no checkpoint"} | dict.fromkeys(("--precision", "--low-memory", *_SHARPS_SPEED), "has no network"),
+        {"-c": "has no checkpoint"} | dict.fromkeys(("--precision", "--sharp"), "has no network"),
         network=False,
     ),
     "sharp": BaseKind("Apple's network, from the photo alone", _OWN_DEPTH, slow=True),
     "lite": BaseKind(
         f"Spackle's own small depth networks, from the photo alone, lifted; {NOT_SHARP}",
-        _OWN_DEPTH
-        | {"--precision": "always computes in fp32", "--low-memory": "takes little as it is"}
-        | dict.fromkeys(_SHARPS_SPEED, "is fast as it is"),
+        _OWN_DEPTH | {"--precision": "always computes in fp32", "--sharp": "is fast as it is"},
     ),
     ANY_HF: BaseKind(
         f"a depth model of transformers, from the photo alone, lifted; {NOT_SHARP}",
         {
             **_OWN_DEPTH,
-            **dict.fromkeys(_SHARPS_SPEED, "is not SHARP, whose speed it is about"),
+            "--sharp": "is not SHARP, whose speed it is about",
             "-c": "has no checkpoint but the model that --base names",
-            "--low-memory": "cannot do with less: name a smaller model",
         },
     ),
 }
@@ -111,8 +107,7 @@ class BaseSettings:
     calib: Path | None = None  # calibration of a disparity map
     checkpoint: Path | None = None  # weights of SHARP or of lite
     precision: Precision = "auto"  # of the network
-    low_memory: bool = False
-    windows: int | None = None  # that SHARP computes at once
+    windows: int | None = None  # that SHARP computes at once; 1 takes the least memory
     compiled: bool = False
     device: str = "auto"
 
@@ -180,17 +175,15 @@ class BaseSettings:
             "--depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
             "--calib": self.calib,
             "-c": self.checkpoint,
-            "--windows": self.windows,
             "--precision": None if self.precision == "auto" else self.precision,
-            "--low-memory": "" if self.low_memory else None,
-            "--compile": "" if self.compiled else None,
+            "--sharp": "compile=yes" if self.compiled else self.windows and f"windows={self.windows}",
         }
         refuses = {} if self.named == AUTO else self.kind.refuses
         for option, value in options.items():
             if option in refuses and value is not None:
                 given, who = f"{option} {value}".rstrip(), self.named.partition(":")[0]
                 raise InputError(f"{given}: the {who} base {refuses[option]}; leave the option out")
-        check_windows("--windows", self.windows, self.low_memory)
+        check_windows("--sharp windows", self.windows)
         if self.calib is not None and self.depth is None:
             raise InputError(f"--calib {self.calib}: is for a disparity map: give that with --depth")
         if self.named == "sharp" and not self.files:
@@ -274,7 +267,6 @@ def _load(name: str, settings: BaseSettings, files: Mapping[str, Path], prints: 
         base = SharpBase.load(
             files["checkpoint"],
             precision=settings.precision,
-            low_memory=settings.low_memory,
             windows=settings.windows,
             compiled=settings.compiled,
             device=device,

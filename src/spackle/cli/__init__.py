@@ -16,20 +16,20 @@ from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError
 
 EXAMPLES = (
-    ("spackle predict -i photo.jpg -o out", "a scene, a video, a report"),
+    ("spackle predict photo.jpg -o out", "a scene, a video, a report"),
     ("spackle view photo.jpg", "look at it in the browser"),
     ("spackle export out/photo/scene.ply -o photo.html", "one file to send"),
 )
 OPTIONS = (
     ("--install-completion", "Completion for the shell that this is"),
-    ("--version", "Which version this is"),
     ("-h, --help", "This; after a command, what it takes"),
 )
+RESEARCH = ("train", "dataset", "evaluate", "tables", "bench")
 WIDTH = 80
 
 
 class Overview(TyperGroup):
-    """A group of commands whose help is one line each, below examples."""
+    """Commands whose help is one line each, below examples; those of RESEARCH come last."""
 
     def format_help(self, ctx: typer.Context, formatter: object) -> None:  # type: ignore[override]
         """Write it; whatever the terminal's height, 24 lines of 80 characters show all."""
@@ -39,9 +39,11 @@ class Overview(TyperGroup):
         write(f"{self.help}\n\n")
         for line, meaning in EXAMPLES:
             write(f"  {line:<50}{meaning}\n")
-        write("\nCommands:\n")
-        for name, command in rows:
-            write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
+        for title, wanted in (("Commands", False), ("Research", True)):
+            write(f"\n{title}:\n")
+            for name, command in rows:
+                if (name in RESEARCH) == wanted:
+                    write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
         write("\nOptions:\n")
         for name, meaning in OPTIONS:
             write(f"  {name:<22}{meaning}\n")
@@ -59,10 +61,11 @@ app = typer.Typer(
 
 
 app.command(short_help="Photos, or a clip, to completed scenes and videos")(predict.predict)
-app.command(short_help="A saved scene to a video")(render.render)
 app.command(short_help="Look at a scene, or at a photo that becomes one")(render.view)
+app.command(short_help="A saved scene to a video")(render.render)
 app.command(short_help="A scene for other viewers, or as one page to send")(render.export)
 app.command(short_help="The Middlebury Motorcycle, against its true second photo")(predict.demo)
+app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 app.command(short_help="Train the residual or SHARP's decoder")(train.train)
 app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure on a dataset, in the paper's protocols")(
     evaluate.evaluate
@@ -74,7 +77,6 @@ app.command(context_settings=evaluate.EXTRA_WORDS, short_help="What Spackle cost
 app.add_typer(
     dataset.dataset, name="dataset", short_help="Photos to views with holes and completed targets, to train on"
 )
-app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 
 
 def _version(asked: bool) -> None:

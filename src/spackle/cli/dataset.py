@@ -12,6 +12,7 @@ from spackle.cli.options import (
     DeviceOption,
     PrecisionOption,
     VerboseOption,
+    given_input,
     trajectory_option,
 )
 
@@ -23,9 +24,14 @@ DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folde
 
 @dataset.command("build")
 def dataset_build(
+    *,
     photos: Annotated[
-        Path, typer.Option(metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.", show_default=False
+        ),
+    ] = None,
+    given: Annotated[Path | None, typer.Option("--photos", hidden=True)] = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a build in it goes on.")],
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
@@ -85,7 +91,7 @@ def dataset_build(
         threads=threads,
         shard_size=shard_size,
     )
-    if build_dataset(photos, output, options, Reporter(verbose)) == "stopped":
+    if build_dataset(given_input("FOLDER", photos, given), output, options, Reporter(verbose)) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 

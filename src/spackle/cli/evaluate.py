@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from spackle.cli.options import INTERRUPTED, DeviceOption, JsonOption, PrecisionOption, VerboseOption
+from spackle.cli.options import (
+    INTERRUPTED,
+    DeviceOption,
+    JsonOption,
+    PrecisionOption,
+    SharpOption,
+    VerboseOption,
+    sharp_speed,
+)
 from spackle.errors import InputError
 
 # Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_with_words`.
@@ -27,7 +34,6 @@ Dataset = Annotated[str, _DATASET]
 Root = Annotated[Path, _ROOT]
 BaseName = Annotated[str, typer.Option(help="sharp, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
-LowMemory = Annotated[bool, typer.Option("--low-memory", help="Take less memory for the base's network.")]
 Residual = Annotated[
     str | None,
     typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
@@ -65,7 +71,7 @@ def evaluate(
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
     precision: PrecisionOption = "auto",
-    low_memory: LowMemory = False,
+    sharp: SharpOption = None,
     residual: Residual = None,
     direct_ft: Annotated[Path | None, typer.Option(metavar="FILE", help="Weights of the method direct-ft.")] = None,
     inpainter: Annotated[str, typer.Option(metavar="NAME", help="Of inpaint2d: exemplar, lama, opencv, …")] = "opencv",
@@ -93,7 +99,7 @@ def evaluate(
         methods=split_words(methods),
         disparities=parse_disparities(_with_words(context, disparity)),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
-        base=BaseSettings(base, None, None, checkpoint, precision, low_memory, device=device),
+        base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
         residual=residual,
         direct_ft=direct_ft,
         inpainter=inpainter,
@@ -133,12 +139,6 @@ def bench(
     only: Annotated[
         str | None, typer.Option(metavar="A,B,…", help="Of the suite's sections: an unknown one lists all.")
     ] = None,
-    compiled: Annotated[
-        bool, typer.Option("--compile", help="In the suite: time SHARP through torch.compile.")
-    ] = False,
-    windows: Annotated[
-        int | None, typer.Option(help="In the suite: so many of SHARP's windows at once, 1 to 35.")
-    ] = None,
     side: Annotated[
         int, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
     ] = 1536,
@@ -146,7 +146,7 @@ def bench(
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
     precision: PrecisionOption = "auto",
-    low_memory: LowMemory = False,
+    sharp: SharpOption = None,
     residual: Residual = None,
     limit: Limit = None,
     runs: Annotated[int, typer.Option(help="How often everything behind the base is timed.")] = 5,
@@ -172,14 +172,13 @@ def bench(
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     _check_choice(suite, given)
     disparities = parse_disparities(_with_words(context, disparity))
-    bases = BaseSettings(base, None, None, checkpoint, precision, low_memory, device=device)
+    bases = BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp))
     if dataset is None or root is None:
-        sharp = dataclasses.replace(bases, windows=windows, compiled=compiled)
         asked = SuiteOptions(
             only=split_words(only or ""),
             runs=runs,
             device=device,
-            sharp=sharp if {"--base", "--checkpoint"} & given else None,
+            sharp=bases if {"--base", "--checkpoint"} & given else None,
             base_runs=base_runs,
             residual=ResidualChoice(residual).file,
             side=side,
@@ -204,15 +203,14 @@ def bench(
 def _check_choice(suite: bool, given: set[str]) -> None:
     """InputError where the options `given`, by their long names, ask for no dataset and no suite, or for both."""
     of_dataset = ("--dataset", "--root", "--limit", "--disparity")
-    of_suite = ("--only", "--compile", "--windows", "--side")
+    of_suite = ("--only", "--side")
     if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):
         raise InputError(f"{' and '.join(missing)} missing: give --dataset NAME --root DIR, or --suite")
     for name in of_dataset if suite else of_suite:
         if name in given:
             raise InputError(f"{name} is {'not for --suite' if suite else 'for --suite alone'}: leave one of them out")
-    for name in ("--windows", "--compile"):
-        if name in given and not {"--base", "--checkpoint"} & given:
-            raise InputError(f"{name} is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")
+    if suite and "--sharp" in given and not {"--base", "--checkpoint"} & given:
+        raise InputError("--sharp is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")
 
 
 def _given(context: typer.Context) -> set[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperOption
 
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name
 
 if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.app.video import PathOptions
@@ -21,6 +22,7 @@ SPELLINGS = ["swipe", "shake", "rotate", "rotate-forward"]  # of trajectories
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
+InputOption = Annotated[Path | None, typer.Option("-i", "--input", hidden=True)]  # as the argument was given once
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[DeviceName, typer.Option(help="Where to compute.")]
 KeepFrameOption = Annotated[
@@ -33,13 +35,62 @@ VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how lo
 CheckpointOption = Annotated[
     Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), or of lite.")
 ]
+SharpOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sharp",
+        metavar="KEY=VALUE",
+        help="Speed of SHARP. windows=N: so many of its 35 at once, 1 takes the least memory (default: 5, on a GPU "
+        "all); compile=yes: through torch.compile, minutes once, for many photos.",
+        hidden=True,
+    ),
+]
+
+
+def _help_all(context: typer.Context, asked: bool) -> None:
+    """Show the hidden options, too."""
+    if asked:
+        for parameter in context.command.params:
+            if isinstance(parameter, TyperOption):
+                parameter.hidden = parameter.name == "given"
+        print(context.get_help())
+        raise typer.Exit()
+
+
+HelpAllOption = Annotated[
+    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show this with all options.")
+]
+
+
+def given_input(name: str, argument: Path | None, option: Path | None) -> Path:
+    """A command's input, as an argument or by -i; InputError for none, or both."""
+    if argument is not None and option is not None:
+        raise InputError(f"{option}: {argument} is given already: leave one of them out")
+    if (found := argument or option) is None:
+        raise InputError(f"{name} missing: name it after the command")
+    return found
+
+
+def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
+    """`windows` and `compiled` of `BaseSettings` by what --sharp says; InputError for anything else."""
+    speed: dict[str, Any] = {}
+    for word in words or ():
+        key, _, value = word.partition("=")
+        check_name("--sharp", key, ("windows", "compile"))
+        if key == "windows" and value.isdecimal():
+            speed["windows"] = int(value)
+        elif key == "compile" and value in ("yes", "no"):
+            speed["compiled"] = value == "yes"
+        else:
+            raise InputError(f"--sharp {word}: give windows=N, compile=yes or compile=no")
+    return speed
 
 
 def trajectory_named(text: str) -> str:
-    """A trajectory as Python spells it, from either spelling; BadParameter for another name."""
+    """A trajectory by its name, with hyphens; BadParameter for an unknown one."""
     if text.replace("_", "-") not in SPELLINGS:
         raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, SPELLINGS))}.")
-    return text.replace("-", "_")
+    return text.replace("_", "-")
 
 
 def trajectory_option(words: str, default: str | None = None) -> Any:
@@ -62,10 +113,12 @@ def path_options(
     ] = None,
     path: Annotated[
         Path | None,
-        typer.Option("--path", metavar="FILE.json", help="A camera path of your own: keyframes, see docs/video.md."),
+        typer.Option(
+            "--path", metavar="FILE.json", hidden=True, help="A camera path of your own: keyframes, see docs/video.md."
+        ),
     ] = None,
     cameras: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Exactly these views in place of a path.")
+        Path | None, typer.Option(metavar="FILE.json", hidden=True, help="Exactly these views in place of a path.")
     ] = None,
     frames: Annotated[
         int | None, typer.Option(help="Frames of the path.", show_default="60, or the keyframes' seconds")
@@ -74,30 +127,41 @@ def path_options(
         Literal["mp4", "webm", "gif", "webp"] | None,
         typer.Option("--format", help="Kind of video.", show_default="mp4"),
     ] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames a second.", show_default="30")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second.", show_default="30", hidden=True)] = None,
     loop: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Show the video N times; 0: for ever.", show_default="0 for gif and webp, else 1"
+            metavar="N",
+            help="Show the video N times; 0: for ever.",
+            show_default="0 for gif and webp, else 1",
+            hidden=True,
         ),
     ] = None,
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the video (of one eye's view), e.g. 1280x720.")
     ] = None,
     show: Annotated[
-        Literal["color", "depth"], typer.Option(help="The scene's colours, or its depth as colours (near is bright).")
+        Literal["color", "depth"],
+        typer.Option(hidden=True, help="The scene's colours, or its depth as colours (near is bright)."),
     ] = "color",
     stereo: Annotated[
         Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"] | None,
-        typer.Option(help="Two eyes: side by side, over-under, or for red-cyan glasses."),
+        typer.Option(hidden=True, help="Two eyes: side by side, over-under, or for red-cyan glasses."),
     ] = None,
     ipd: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="Distance of the two eyes.", show_default="as suits the scene's depth"),
+        typer.Option(
+            hidden=True, metavar="METRES", help="Distance of the two eyes.", show_default="as suits the scene's depth"
+        ),
     ] = None,
     convergence: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="Depth at which the screen stands.", show_default="what the path looks at"),
+        typer.Option(
+            hidden=True,
+            metavar="METRES",
+            help="Depth at which the screen stands.",
+            show_default="what the path looks at",
+        ),
     ] = None,
 ) -> PathOptions:
     """The way of the camera and the video of it, as one value.
@@ -107,7 +171,7 @@ def path_options(
     """
     from spackle.app.video import PathOptions, VideoOptions, parse_size
 
-    given = {"--trajectory": trajectory and trajectory.replace("_", "-"), "--disparity": disparity}
+    given = {"--trajectory": trajectory, "--disparity": disparity}
     says = f"--path {path}: is a camera path of its own"
     if cameras is not None and path is None:
         given["--frames"] = frames
@@ -115,23 +179,26 @@ def path_options(
     for option, value in given.items():
         if value is not None and (path is not None or cameras is not None):
             raise InputError(f"{says}: leave {option} {value} out")
-    kind: TrajectoryKind = trajectory or "rotate_forward"  # type: ignore[assignment]  # one of them, by its parser
+    kind: TrajectoryKind = trajectory or "rotate-forward"  # type: ignore[assignment]  # one of them, by its parser
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, show, stereo, ipd, convergence)
     return PathOptions(kind, DEFAULT_DISPARITY if disparity is None else disparity, cameras, path, frames, video)
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of `path_options` in place of its parameter `path`, which gets their value."""
+    """The command with the options of `path_options` in place of its parameter `path`, which gets their value; and --help-all."""
     own = inspect.signature(command, eval_str=True, locals={"PathOptions": object}).parameters
     shared = inspect.signature(path_options, eval_str=True, locals={"PathOptions": object}).parameters
     parameters: list[inspect.Parameter] = []
     for name, parameter in own.items():
         found = shared.values() if name == "path" else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
         parameters += found
+    kind = inspect.Parameter.KEYWORD_ONLY
+    parameters.append(inspect.Parameter("help_all", kind, default=False, annotation=HelpAllOption))
 
     def expanded(**values: Any) -> None:
         path = path_options(**{name: values.pop(name) for name in shared})
+        del values["help_all"]
         command(**values, path=path)
 
     expanded.__name__, expanded.__doc__ = command.__name__, command.__doc__

@@ -10,10 +10,14 @@ import typer
 from spackle.cli.options import (
     CheckpointOption,
     DeviceOption,
+    InputOption,
     JsonOption,
     KeepFrameOption,
     PrecisionName,
+    SharpOption,
     VerboseOption,
+    given_input,
+    sharp_speed,
     with_path_options,
 )
 
@@ -25,8 +29,9 @@ if TYPE_CHECKING:
 def predict(
     *,
     photo: Annotated[
-        Path, typer.Option("-i", "--input", metavar="PHOTO_OR_FOLDER", help="A photo, a clip, or a folder.")
-    ],
+        Path | None, typer.Argument(metavar="PHOTO", help="A photo, a clip, or a folder of photos.", show_default=False)
+    ] = None,
+    given: InputOption = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")],
     base: Annotated[
         str,
@@ -45,27 +50,18 @@ def predict(
         ),
     ] = None,
     calib: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
+        Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
     ] = None,
     checkpoint: CheckpointOption = None,
     precision: Annotated[
-        PrecisionName, typer.Option(help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
+        PrecisionName, typer.Option(hidden=True, help="Of sharp and hf; auto: bf16 where the hardware multiplies it.")
     ] = "auto",
-    low_memory: Annotated[bool, typer.Option("--low-memory", help="Take less memory for sharp.")] = False,
-    windows: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Of sharp: so many of its 35 windows at once. Default: 5, on a GPU all."),
-    ] = None,
-    compiled: Annotated[
-        bool,
-        typer.Option(
-            "--compile", help="Sharp through torch.compile, on a GPU as one CUDA graph: minutes once, for many photos."
-        ),
-    ] = False,
+    sharp: SharpOption = None,
     residual: Annotated[
         str | None,
         typer.Option(
             metavar="PATH|seeds|none",
+            hidden=True,
             help="Weights of the residual. seeds: without any; none: base alone. Default: shipped ones, else seeds.",
         ),
     ] = None,
@@ -80,10 +76,10 @@ def predict(
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
-        typer.Option(help="scene: one set of Gaussians for all views; view: one for each (the paper's)."),
+        typer.Option(hidden=True, help="scene: one set of Gaussians for all views; view: one for each (the paper's)."),
     ] = "scene",
     device: DeviceOption = "auto",
-    focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the photo.")] = None,
+    focal_px: Annotated[float | None, typer.Option(hidden=True, help="Focal length in pixels of the photo.")] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
     keep_frame: KeepFrameOption = False,
@@ -100,10 +96,10 @@ def predict(
     from spackle.progress import Reporter
     from spackle.scene import ResidualChoice
 
-    settings = BaseSettings(base, depth, calib, checkpoint, precision, low_memory, windows, compiled, device)
+    settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
     choice = ResidualChoice(residual, fill)
     options = PredictOptions(settings, choice, path, render, mode, focal_px, focal_mm, fov, overwrite, keep_frame)
-    if predict_all(photo, output, options, Reporter(verbose, as_json=as_json)):
+    if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
 

@@ -13,9 +13,11 @@ from spackle.cli.options import (
     INTERRUPTED,
     CheckpointOption,
     DeviceOption,
+    InputOption,
     JsonOption,
     KeepFrameOption,
     VerboseOption,
+    given_input,
     with_path_options,
 )
 
@@ -26,7 +28,10 @@ if TYPE_CHECKING:
 @with_path_options
 def render(
     *,
-    scene: Annotated[Path, typer.Option("-i", "--input", metavar="SCENE.ply", help="A 3D Gaussian scene.")],
+    scene: Annotated[
+        Path | None, typer.Argument(metavar="SCENE.ply", help="A 3D Gaussian scene.", show_default=False)
+    ] = None,
+    given: InputOption = None,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
@@ -38,7 +43,9 @@ def render(
     from spackle.app.render import render_scene
     from spackle.progress import Reporter
 
-    render_scene(scene, output, path, focal_px, device, Reporter(verbose, as_json=as_json))
+    render_scene(
+        given_input("SCENE.ply", scene, given), output, path, focal_px, device, Reporter(verbose, as_json=as_json)
+    )
 
 
 def export(

@@ -10,7 +10,7 @@ from typing import Any
 import spackle
 from spackle.bases.depth_map import find_depth
 from spackle.bases.open import NETWORKS, BaseSettings, kind_of
-from spackle.camera_path import MAX_DISPARITY, spelled
+from spackle.camera_path import MAX_DISPARITY
 from spackle.dataset.completion import COMPLETIONS, Completion
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import ViewChoices
@@ -109,8 +109,7 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completi
             "precision": base.precision,
             "device": base.device,
         },
-        "views": dataclasses.asdict(choices)
-        | {"disparity": list(choices.disparity), "trajectory": choices.trajectory and spelled(choices.trajectory)},
+        "views": dataclasses.asdict(choices) | {"disparity": list(choices.disparity), "trajectory": choices.trajectory},
         "inpainter": {"name": completion.name, "version": completion.version}
         | ({"weights": weights} if weights else {}),
         "shard_size": options.shard_size,

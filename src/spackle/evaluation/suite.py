@@ -136,7 +136,7 @@ def _inputs(name: str, options: SuiteOptions) -> Record | None:
         return {}
     if base is None or (options.only and name not in options.only):
         return None
-    settings = {"precision": base.precision, "low_memory": base.low_memory, "windows": base.windows}
+    settings = {"precision": base.precision, "windows": base.windows}
     weights = weights_digest(base.files["checkpoint"])
     return {"weights": weights, **settings, "compiled": base.compiled, "runs": options.base_runs or 1}
 

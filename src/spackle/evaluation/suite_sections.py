@@ -172,7 +172,7 @@ def video_section(
     frames: int = FRAMES,
     device: torch.device = CPU,
 ) -> Section:
-    """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate_forward`: as one scene, and frame by frame.
+    """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate-forward`: as one scene, and frame by frame.
 
     Frame by frame, each is rendered and completed from scratch, its occlusion guard included, and shares nothing with
     the others but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most
@@ -180,7 +180,7 @@ def video_section(
     """
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
-    path = trajectory("rotate_forward", prediction.camera.even(), DISPARITY, depths, frames)
+    path = trajectory("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
     completer = Completer(prediction.gaussians, prediction.camera, renderer, network)
 
     def scene(lap: Lap) -> None:

@@ -42,15 +42,14 @@ class SharpBase:
         self,
         network: SharpNetwork,
         *,
-        low_memory: bool = False,
         windows: int | None = None,
         compiled: bool = False,
         weights: str = "",
     ) -> None:
         """Use a network that is loaded already, on its device; `weights` is what the report calls it."""
-        check_windows("windows", windows, low_memory)
+        check_windows("windows", windows)
         self.network = network
-        self.windows = 1 if low_memory else windows or usual_windows(self.device)
+        self.windows = windows or usual_windows(self.device)
         self.weights = weights
         self.compiled = compiled  # as long as nothing comes between
         self.compile_problem = ""  # what came
@@ -61,7 +60,6 @@ class SharpBase:
         path: str | os.PathLike[str],
         *,
         precision: Precision = "auto",
-        low_memory: bool = False,
         windows: int | None = None,
         compiled: bool = False,
         device: torch.device | str | None = None,
@@ -72,7 +70,6 @@ class SharpBase:
             path: Apple's .pt file, a safetensors file with the same names, or the decoder that
                 `spackle train --method direct-ft` wrote, which names the checkpoint for the rest.
             precision: of the heavy arithmetic; auto is bf16 where the hardware multiplies it natively.
-            low_memory: take less memory and a little more time to predict: one window at a time.
             windows: of the 35 of a photo, how many go through the transformer at once; None: 5 on a processor, all on
                 a GPU. The last bits depend on it.
             compiled: let `torch.compile` translate the network with the first photo, which takes minutes, and replay
@@ -84,11 +81,11 @@ class SharpBase:
                 little memory. Nothing in the file is executed.
             ValueError: an unknown precision.
         """
-        check_windows("windows", windows, low_memory)  # before anything is read
+        check_windows("windows", windows)  # before anything is read
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
         name = Path(path).name
-        return SharpBase(network, low_memory=low_memory, windows=windows, compiled=compiled, weights=name)
+        return SharpBase(network, windows=windows, compiled=compiled, weights=name)
 
     @property
     def device(self) -> torch.device:
@@ -105,7 +102,7 @@ class SharpBase:
 
         `progress` is called with windows done and their number.
         """
-        advice = [] if self.windows == 1 else ["try --low-memory"]
+        advice = [] if self.windows == 1 else ["try --sharp windows=1"]
         with enough_memory(*advice):
             gaussians = to_processor(to_metric(self.look(photo, progress), photo))
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
@@ -126,7 +123,7 @@ class SharpBase:
                     if memory_is_short(error):
                         raise
                     self.compiled, self._translation, self.compile_problem = False, None, reason_in_a_line(error)
-                    LOG.warning("SHARP runs without --compile: %s", self.compile_problem)
+                    LOG.warning("SHARP runs without torch.compile: %s", self.compile_problem)
             output: SharpOutput = self.network(image, factor, self.windows, progress)
             return output
 
@@ -136,12 +133,10 @@ def usual_windows(device: torch.device) -> int:
     return WINDOWS_AT_ONCE if device.type == "cpu" else WINDOWS
 
 
-def check_windows(option: str, windows: int | None, low_memory: bool) -> None:
+def check_windows(option: str, windows: int | None) -> None:
     """InputError for a number of windows that cannot be; `option` is what the person calls it."""
     if windows is not None and not 1 <= windows <= WINDOWS:
         raise InputError(f"{option} must be between 1 and {WINDOWS}, got {windows}")
-    if windows is not None and low_memory:
-        raise InputError(f"{option} {windows}: low memory means one window at a time: leave one of the two out")
 
 
 def to_metric(output: SharpOutput, photo: Photo) -> Gaussians:
