@@ -58,7 +58,7 @@ class DepthRange:
 
 
 def trajectory_kind(name: str) -> TrajectoryKind:
-    """A trajectory by its name; `rotate_forward`, as it was spelled once, is accepted. ValueError for an unknown one."""
+    """A trajectory by its name, or by its old spelling with `_`. ValueError for an unknown one."""
     kind = name.replace("_", "-")
     if kind not in TRAJECTORIES:
         raise ValueError(f"unknown trajectory {name!r}: choose one of {', '.join(TRAJECTORIES)}")

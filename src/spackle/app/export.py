@@ -31,7 +31,7 @@ WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
-    """Write a PLY in the formats that the outputs' names end in; creates their folders; each file is whole or not at all.
+    """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
