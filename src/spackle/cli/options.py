@@ -186,7 +186,7 @@ def path_options(
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of `path_options` for its parameter `path`, which gets their value, and --help-all."""
+    """The command with the options of `path_options` as its one parameter `path`, and --help-all."""
     own = inspect.signature(command, eval_str=True, locals={"PathOptions": object}).parameters
     shared = inspect.signature(path_options, eval_str=True, locals={"PathOptions": object}).parameters
     parameters: list[inspect.Parameter] = []
