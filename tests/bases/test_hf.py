@@ -6,6 +6,7 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import hashlib
 import json
 import math
 import os
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command import refuses, run
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from scenes import box_before_wall
@@ -30,8 +32,10 @@ from spackle.bases import hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import DepthModel, HfBase
 from spackle.bases.hf_models import FARTHEST_M, Window, meaning_of, to_depth_map
+from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.protocol import NEAREST_M
 from spackle.color import srgb_to_linear
+from spackle.downloads import DEPTH_ANYTHING, WEIGHTS, HubFiles, check_recorded
 from spackle.errors import InputError
 from spackle.image import DEFAULT_FOCAL_MM, Photo
 
@@ -616,10 +620,19 @@ class Hub:
     def __init__(self, models: dict[str, Path], cache: Path) -> None:
         self.models, self.cache, self.asked, self.connected = models, cache, list[list[str]](), True
 
-    def __call__(self, model: str, *, allow_patterns: list[str], local_files_only: bool = False) -> str:
+    def __call__(
+        self,
+        model: str,
+        *,
+        allow_patterns: list[str],
+        local_files_only: bool = False,
+        revision: str | None = None,
+        local_dir: Path | None = None,
+    ) -> str:
         from huggingface_hub import errors
 
-        cached = self.cache / model
+        self.revision = revision
+        cached = local_dir or self.cache / model
         if not local_files_only:
             self.asked.append(allow_patterns)
             if not self.connected:
@@ -676,3 +689,62 @@ def test_what_the_hub_cannot_give_is_one_line(hub: Hub) -> None:
     hub.connected = False
     with pytest.raises(InputError, match=r"^hf:owner/name: not on this machine yet, and the hub cannot be reached"):
         HfBase.load("owner/name")
+
+
+# `spackle weights get depth`.
+
+
+@pytest.fixture
+def published(hub: Hub, folders: dict[str, Path], shipped: Path, monkeypatch: pytest.MonkeyPatch) -> HubFiles:
+    """A hub with a small model in place of Depth-Anything-V2-Small."""
+    digest = hashlib.sha256((folders["relative"] / "model.safetensors").read_bytes()).hexdigest()
+    files = dataclasses.replace(DEPTH_ANYTHING, sha256=digest)
+    monkeypatch.setitem(WEIGHTS, "depth", dataclasses.replace(WEIGHTS["depth"], hub=files))
+    hub.models[files.model] = folders["relative"]
+    return files
+
+
+def test_depth_anything_is_fetched_at_its_revision_and_auto_takes_it_before_lite(
+    published: HubFiles, hub: Hub, folders: dict[str, Path], tmp_path: Path
+) -> None:
+    photo, file = photo_of(), tmp_path / "weights" / "depth-anything-v2-small" / "model.safetensors"
+    assert open_base(BaseSettings()).predict(photo)[1].base == "lite"
+    with pytest.raises(InputError, match="--base depth: not on this machine: `spackle weights get depth`"):
+        open_base(BaseSettings("depth"))
+    first = run("weights", "get", "depth")
+    assert first.code == 0, first.err
+    assert "99 MB" in first.err
+    assert "Apache License 2.0" in first.err
+    assert (hub.revision, [path.name for path in file.parent.parent.iterdir()]) == (
+        published.revision,
+        [file.parent.name],
+    )
+    assert (record := check_recorded(file)) is not None
+    assert (published.revision in record.url, record.sha256) == (True, published.sha256)
+    hub.asked.clear()
+    assert "already and intact" in run("weights", "get", "depth").err
+    assert hub.asked == []
+    expected = load(folders["relative"]).predict(photo).gaussians
+    for name in ("auto", "depth"):
+        prediction, choice = open_base(BaseSettings(name, precision="fp32", device="cpu")).predict(photo)
+        assert choice.base == "depth"
+        assert torch.equal(prediction.gaussians.means, expected.means)
+    file.write_bytes(file.read_bytes()[::-1])
+    choice = open_base(BaseSettings(), lambda line: None).predict(photo)[1]
+    assert (choice.base, "SHA-256 is not that of what was downloaded" in choice.failures[0]) == ("lite", True)
+
+
+def test_another_file_or_no_package_leaves_nothing(
+    published: HubFiles, hub: Hub, folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuses(run("weights", "get", "depth", "--url", "https://mirror.example"), "HF_ENDPOINT")
+    hub.models[published.model] = folders["dpt"]
+    ends = [run("weights", "get", "depth")]
+    hub.connected = False
+    ends.append(run("weights", "get", "depth"))
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    ends.append(run("weights", "get", "depth"))
+    wanted = (published.sha256, "the hub cannot be reached", "pip install 'spackle-nvs[hf]'")
+    assert [(end.code, said in end.lines[-1]) for end, said in zip(ends, wanted, strict=True)] == [(2, True)] * 3
+    assert not (tmp_path / "weights").exists()
+    assert (published.revision, published.model) == (DEPTH_ANYTHING.revision, DEPTH_ANYTHING.model)

@@ -36,7 +36,7 @@ from spackle.image import Photo, load_photo
 from spackle.scene import ResidualChoice
 
 pytestmark = pytest.mark.usefixtures("shipped")
-NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here"
+NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no Depth Anything here"
 
 
 @pytest.fixture
@@ -52,7 +52,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     asked: list[dict[str, Any]] = []
 
     def load(name: str) -> Callable[..., StandIn]:
-        return lambda path, **options: (asked.append({"path": path, **options}), StandIn(name or f"hf:{path}"))[1]
+        return lambda path, **options: (
+            asked.append({"path": path, **options}),
+            StandIn(name or f"hf:{path}"),
+        )[1]
 
     monkeypatch.setattr(SharpBase, "load", load("sharp"))
     monkeypatch.setattr(HfBase, "load", load(""))
@@ -88,7 +91,7 @@ def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
 ) -> None:
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get sharp`" in choice.note
+    assert "--depth FILE, `spackle weights get depth` (99 MB, Apache-2.0)" in choice.note
     (tmp_path / "weights").mkdir()
     shutil.copy(made["sharp"], tmp_path / "weights")
     prediction, choice = pick(photo)
@@ -236,7 +239,7 @@ def test_damaged_weights_of_sharp_fail_once_for_all_photos(photo: Path, sharp: P
     said, log = "SHA-256 is not that of what was downloaded", list[str]()
     base = open_base(BaseSettings(), log.append)
     choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used"] * 2
+    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no Depth Anything here"] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):

@@ -23,6 +23,8 @@ from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.image import Photo
 
+NO_DEPTH, NO_MODEL = "no depth in the photo", "no Depth Anything here"
+
 
 @pytest.fixture(autouse=True)
 def _quick(shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +128,7 @@ def test_where_results_must_say_what_they_are_of_auto_is_refused_and_sharp_the_d
         run("bench", *root),
     ):
         refuses(result, "--base auto: results must say what they are of")
-    refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, lite, hf:NAME_OR_FOLDER need none")
+    refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, depth, lite, hf:NAME_OR_FOLDER need none")
     assert not (tmp_path / "out").exists()
 
 
@@ -178,7 +180,7 @@ def test_results_of_sharp_that_give_way_to_lite_are_named(
         patch.setattr(SharpBase, "load", bad)
         first, second = warned()
         assert str(tmp_path / "out" / "a") in first
-        assert second.endswith(f"by lite: no depth in the photo, SHARP cannot be used ({sharp})")
+        assert second.endswith(f"by lite: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
         assert warned() == []  # done already
     install(made, tmp_path)
     assert warned() == []

@@ -22,9 +22,7 @@ from spackle.app.complete import (
 )
 from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
-from spackle.bases.lite import LiteBase
-from spackle.bases.open import AUTO, BaseError, BaseSettings, OpenedBase
-from spackle.bases.sharp import SharpBase
+from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseError, BaseSettings, OpenedBase
 from spackle.digest import digest_of, fingerprint
 from spackle.downloads import installed
 from spackle.errors import InputError
@@ -117,7 +115,7 @@ def predict_one(
             pictures = picture_files(len(completer.given_views))
             folders.enter_context(results_folder(folder / "views", pictures))
         done = completer.complete(photo, reporter, seconds)
-        _warn_of_lite(done, folder, options.base, reporter)
+        _warn_of_rougher(done, folder, options.base, reporter)
         scene, views, renderer = done.scene, done.views, completer.renderer
         with reporter.stage("write", seconds):
             (folder / "report.json").unlink(missing_ok=True)  # a report means that the other files are complete
@@ -246,14 +244,14 @@ def make_report(
     return report
 
 
-def _warn_of_lite(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
-    """Warn before rough results replace SHARP's, because its weights are damaged or gone."""
-    before = _earlier(folder).get("base")
-    by_sharp = isinstance(before, dict) and before.get("name") == SharpBase.name
-    if by_sharp and base.named == AUTO and done.choice.base == LiteBase.name:
-        file = base.files.get("checkpoint")
+def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
+    """Warn before rougher results replace those of a network whose weights are damaged or gone."""
+    before, now = _earlier(folder).get("base"), done.choice.base
+    better = before.get("name") if isinstance(before, dict) else None
+    if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
+        file = base.files.get("checkpoint" if better == "sharp" else "depth weights")
         reporter.log(
-            f"{done.photo.path.name}: warning: {folder} was made by sharp and is made again by lite: "
+            f"{done.photo.path.name}: warning: {folder} was made by {better} and is made again by {now}: "
             f"{done.choice.why}{'' if file is None else f' ({file})'}"
         )
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
+import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -12,18 +16,22 @@ from rich.table import Table
 from safetensors.torch import save_file
 from torch import Tensor
 
+from spackle.bases.hf import NOT_INSTALLED, fetch_revision
 from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.downloads import (
     WEIGHTS,
     DownloadRecord,
+    HubFiles,
     KnownWeights,
     check_recorded,
     download,
+    hold,
     known_weights,
     read_record,
     weights_folder,
 )
+from spackle.downloads.transfer import digest, write_json
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.inpaint import lama_network
@@ -40,7 +48,11 @@ def get_weights(
     InputError for an unknown name, and for a file that cannot be downloaded, cannot be written or is damaged.
     """
     known = known_weights(name)
-    if output is None:
+    if known.hub is not None:
+        if url is not None:
+            raise InputError(f"--url {url}: {name} comes through huggingface_hub: name a mirror in HF_ENDPOINT")
+        path = (output or weights_folder()) / known.file
+    elif output is None:
         path = weights_folder() / known.file
     elif output.suffix.lower() == Path(known.file).suffix and not os.path.isdir(output):
         path = output
@@ -50,7 +62,10 @@ def get_weights(
     new = force or not os.path.isfile(path)
     if new:
         with results_folder(path.parent, [path.name]):
-            record = _download(known, known.url if url is None else url, path, reporter)
+            if known.hub is not None:
+                record = _fetch(known, known.hub, path, reporter)
+            else:
+                record = _download(known, known.url if url is None else url, path, reporter)
         hint = "" if output is None else f"; {known.named_by}"
         reporter.log(f"{_summary(known, record)} -> {path}{hint}")
     else:
@@ -61,6 +76,8 @@ def get_weights(
             reporter.log(f"{known.name}: {unchecked}: {path}")
         else:
             reporter.log(f"{_summary(known, record)}, there already and intact: {path}")
+    if known.hub is not None and find_spec("transformers") is None:
+        reporter.log(f"{known.name}: not to be used yet: {NOT_INSTALLED}")
     sha256 = None if record is None else record.sha256
     size = os.path.getsize(path)
     reporter.result({"name": known.name, "file": path, "bytes": size, "sha256": sha256, "downloaded": new})
@@ -122,6 +139,34 @@ def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> 
             if noticed:
                 reporter.log(f"{known.name}: what has come is kept; the same command goes on from there")
             raise
+
+
+def _fetch(known: KnownWeights, hub: HubFiles, path: Path, reporter: Reporter) -> DownloadRecord:
+    """Files of the hub, by way of a folder beside `path`'s that keeps what has come of a fetch that broke off."""
+    for line in known.notice:
+        reporter.log(line)
+    folder, part = path.parent, path.parent.with_name(f"{path.parent.name}.part")
+    try:
+        with hold(path.with_name(f"{path.name}.lock")):
+            with reporter.stage("download", {}):
+                fetch_revision(hub.model, hub.revision, [path.name, *hub.others], part)
+            with open(part / path.name, "rb") as file:
+                record = DownloadRecord(known.url, os.path.getsize(part / path.name), digest(file).hexdigest())
+            if record.sha256 != hub.sha256:
+                shutil.rmtree(part)
+                raise InputError(f"{known.url}: what came has not the SHA-256 {hub.sha256}: it is another file")
+            write_json(dataclasses.asdict(record), part / f"{path.name}.json")
+            for name in (*hub.others, f"{path.name}.json", path.name):  # the weights last: they tell that all is here
+                os.replace(part / name, folder / name)
+    except BlockingIOError as error:
+        raise InputError(f"{path}: another process is downloading this file: wait until it is done") from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write: {error.strerror or error}: make room or choose another folder"
+        ) from error
+    with contextlib.suppress(OSError):  # what huggingface_hub notes
+        shutil.rmtree(part)
+    return record
 
 
 def _summary(known: KnownWeights, record: DownloadRecord) -> str:

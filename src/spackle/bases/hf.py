@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,9 @@ class HfBase:
         self.precision = precision
 
     @classmethod
-    def load(cls, model: str, *, device: str | None = None, precision: Precision = "auto") -> HfBase:
+    def load(
+        cls, model: str, *, device: str | None = None, precision: Precision = "auto", name: str | None = None
+    ) -> HfBase:
         """Read a model's settings and weights.
 
         Args:
@@ -90,6 +92,7 @@ class HfBase:
                 network; the rest is copied into it.
             device: cpu or a CUDA device; where None, CUDA if it is there.
             precision: of the products of matrices; auto is bf16 where the hardware multiplies it natively.
+            name: of the base; hf:MODEL where None.
 
         Raises:
             InputError: a device, package, model or file that is not there, a model that is broken, that is not a depth
@@ -98,7 +101,7 @@ class HfBase:
         """
         target = pick_device(device)
         dtype = pick_dtype(precision, target)
-        name = f"hf:{model}"
+        name = name or f"hf:{model}"
         return cls(name, _load_model(model, name, target, dtype), "bf16" if dtype.itemsize == 2 else "fp32")
 
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
@@ -291,10 +294,7 @@ def _find(model: str, files: list[str]) -> Path:
         if not folder.is_dir():
             raise InputError(f"hf:{model}: no such folder: check the name")
     elif _HUB_NAME.fullmatch(model):
-        try:
-            from huggingface_hub import snapshot_download
-        except ImportError as error:
-            raise InputError(NOT_INSTALLED) from error
+        snapshot_download = _hub().snapshot_download
         cached = None
         with contextlib.suppress(OSError), quiet():  # what huggingface_hub says of what is not in the cache is one
             cached = Path(snapshot_download(model, allow_patterns=files, local_files_only=True))
@@ -324,19 +324,37 @@ def _lacks(folder: Path, files: list[str]) -> str:
     return ""
 
 
-def _from_hub(model: str, files: list[str]) -> Path:
-    """The model's folder in the cache, after what is not in it has been copied there."""
-    from huggingface_hub import errors, snapshot_download
+def fetch_revision(model: str, revision: str, files: Sequence[str], folder: Path) -> None:
+    """Bring files of one commit of a hub's model into a folder; goes on where an earlier call broke off.
 
+    InputError where huggingface_hub is not installed, or the hub does not give the files.
+    """
+    _from_hub(model, list(files), revision=revision, local_dir=folder)
+    if absent := [name for name in files if not (folder / name).is_file()]:
+        raise InputError(f"hf:{model}: revision {revision} has no {', '.join(absent)}: try again")
+
+
+def _hub() -> Any:
+    """The package huggingface_hub; InputError where it is not installed."""
+    try:
+        import huggingface_hub.errors
+    except ImportError as error:
+        raise InputError(NOT_INSTALLED) from error
+    return huggingface_hub
+
+
+def _from_hub(model: str, files: list[str], **options: Any) -> Path:
+    """The model's folder in the cache, or in `local_dir`, after what is not in it has been copied there."""
+    hub = _hub()
     try:
         with quiet():
-            return Path(snapshot_download(model, allow_patterns=files))
+            return Path(hub.snapshot_download(model, allow_patterns=files, **options))
     except Exception as error:  # of three libraries, one of them about the network
-        if isinstance(error, errors.LocalEntryNotFoundError):
+        if isinstance(error, hub.errors.LocalEntryNotFoundError):
             problem = "not on this machine yet, and the hub cannot be reached: connect, or give a folder"
-        elif isinstance(error, errors.GatedRepoError):
+        elif isinstance(error, hub.errors.GatedRepoError):
             problem = "its owner asks for consent: give it on the model's page, then log in with hf auth login"
-        elif isinstance(error, errors.RepositoryNotFoundError):
+        elif isinstance(error, hub.errors.RepositoryNotFoundError):
             problem = "the hub has no such model, or only for its owner: check the name, or log in with hf auth login"
         else:
             problem = f"cannot be fetched from the hub ({reason_in_a_line(error)}): try again, or give a folder"

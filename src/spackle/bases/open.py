@@ -1,8 +1,8 @@
 """All bases, their options, and the one path from a base's name, or `auto`, to a photo's Gaussians.
 
-`auto` tries the depth in the photo's file, then SHARP if its weights are installed, then lite. It falls back to the
-next candidate when one fails, and logs why. The focal length comes from the user, else from the depth map's
-calibration, else from the photo's file, else it is the default.
+`auto` tries the depth in the photo's file, then SHARP and Depth Anything if their weights are installed, then lite. It
+falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from the depth
+map's calibration, else from the photo's file, else it is the default.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from spackle.errors import InputError, check_name
 from spackle.image import Photo
 
 AUTO = "auto"
+AUTO_NETWORKS = ("sharp", "depth", "lite")  # in the order that `auto` tries them
 HF = "hf:"  # a folder, or owner/name of the hub, follows
 ANY_HF = "hf:NAME_OR_FOLDER"
 NOT_SHARP = "not SHARP, so not the paper's base"
 ROUGH = (
-    "rough geometry; for better: --depth FILE, `spackle weights get sharp` (research only), "
-    "or --base hf:depth-anything/Depth-Anything-V2-Small-hf"
+    "rough geometry; for better: --depth FILE, `spackle weights get depth` (99 MB, Apache-2.0), "
+    "or `spackle weights get sharp` (2.8 GB, research only)"
 )
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
@@ -56,6 +57,11 @@ class BaseKind:
 
 
 _OWN_DEPTH = {"--depth": "finds depth itself", "--calib": "finds depth itself"}
+_MODELS = {
+    **_OWN_DEPTH,
+    "--sharp": "is not SHARP, whose speed it is about",
+    "-c": "has no checkpoint but the model that --base names",
+}
 KINDS = {
     "rgbd": BaseKind(
         f"the dataset's own depth, map or points, lifted; {NOT_SHARP}",
@@ -63,17 +69,14 @@ KINDS = {
         network=False,
     ),
     "sharp": BaseKind("Apple's network, from the photo alone", _OWN_DEPTH, slow=True),
+    "depth": BaseKind(f"Depth-Anything-V2-Small, from the photo alone, lifted; {NOT_SHARP}", _MODELS),
     "lite": BaseKind(
         f"Spackle's own small depth networks, from the photo alone, lifted; {NOT_SHARP}",
         _OWN_DEPTH | {"--precision": "always computes in fp32", "--sharp": "is fast as it is"},
     ),
     ANY_HF: BaseKind(
         f"a depth model of transformers, from the photo alone, lifted; {NOT_SHARP}",
-        {
-            **_OWN_DEPTH,
-            "--sharp": "is not SHARP, whose speed it is about",
-            "-c": "has no checkpoint but the model that --base names",
-        },
+        _MODELS,
     ),
 }
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.network)
@@ -155,12 +158,14 @@ class BaseSettings:
             patterns = (*SETTINGS, *WEIGHTS)
             return {file.name: file for p in patterns for file in sorted(self.folder.glob(p)) if file.is_file()}
         found: dict[str, Path | None] = {}
-        if self.named in ("sharp", AUTO):
-            try:
+        try:
+            if self.named in ("sharp", AUTO):
                 found["checkpoint"] = self.checkpoint or installed("sharp")
-            except InputError:  # the machine has no folder for downloads
-                if self.named != AUTO:
-                    raise
+            if self.named in ("depth", AUTO):
+                found["depth weights"] = installed("depth")
+        except InputError:  # the machine has no folder for downloads
+            if self.named != AUTO:
+                raise
         if self.named in ("lite", AUTO):
             shipped = lite.SHIPPED if lite.SHIPPED.is_file() else None
             found["lite weights"] = (self.checkpoint if self.named == "lite" else None) or shipped
@@ -190,6 +195,10 @@ class BaseSettings:
             raise InputError(
                 "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
                 "(2.8 GB, for research only), -c FILE takes a local copy"
+            )
+        if self.named == "depth" and not self.files:
+            raise InputError(
+                "--base depth: not on this machine: `spackle weights get depth` downloads it (99 MB, Apache-2.0)"
             )
 
 
@@ -239,6 +248,7 @@ def open_base(settings: BaseSettings, log: Log = LOG.warning) -> OpenedBase:
         candidates = [
             _Candidate("rgbd", "the depth in the photo", lifted, "no depth in the photo", shared=False),
             _Candidate("sharp", "SHARP", network("sharp"), "no SHARP weights here"),
+            _Candidate("depth", "Depth Anything", network("depth"), "no Depth Anything here"),
             _Candidate("lite", "lite", network("lite")),
         ]
         return OpenedBase(candidates, log, prints)
@@ -253,17 +263,22 @@ def open_loaded(base: Base) -> OpenedBase:
 
 
 def _load(name: str, settings: BaseSettings, files: Mapping[str, Path], prints: Mapping[str, str]) -> Base | None:
-    """A network, None if SHARP is not installed; BaseError if its files have changed since the base was opened."""
-    if name == "sharp" and "checkpoint" not in files:
+    """A network, None if it is not installed; BaseError if its files have changed since the base was opened."""
+    downloaded = files.get({"sharp": "checkpoint", "depth": "depth weights"}.get(name, ""))
+    if name in ("sharp", "depth") and downloaded is None:
         return None
+    if downloaded is not None:
+        check_recorded(downloaded)  # against the record of its download, if there is one
     device = None if settings.device == "auto" else settings.device
     base: Base
     if name == "lite":
         base = lite.LiteBase.load(settings.checkpoint if settings.named == name else None, device=device)
     elif name.startswith(HF):
         base = HfBase.load(name.removeprefix(HF), device=device, precision=settings.precision)
+    elif name == "depth":
+        folder = str(files["depth weights"].parent)
+        base = HfBase.load(folder, device=device, precision=settings.precision, name=name)
     else:
-        check_recorded(files["checkpoint"])  # against the record of its download, if there is one
         base = SharpBase.load(
             files["checkpoint"],
             precision=settings.precision,

@@ -39,7 +39,7 @@ def dataset_build(
     sample: Annotated[int | None, typer.Option(help="So many photos, chosen at random; default: all.")] = None,
     seed: Annotated[int, typer.Option(help="Of the choice and of the paths.")] = 0,
     base: Annotated[
-        str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, lite or hf:NAME.")
+        str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME.")
     ] = "sharp",
     depth: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Depth maps named as the photos, for --base rgbd.")

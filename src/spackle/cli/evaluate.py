@@ -32,7 +32,7 @@ _DATASET = typer.Option(
 _ROOT = typer.Option(metavar="DIR", help="Where the dataset was unpacked.")
 Dataset = Annotated[str, _DATASET]
 Root = Annotated[Path, _ROOT]
-BaseName = Annotated[str, typer.Option(help="sharp, lite, hf:NAME, or rgbd with the dataset's own depth.")]
+BaseName = Annotated[str, typer.Option(help="sharp, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
     str | None,

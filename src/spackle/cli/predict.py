@@ -37,9 +37,10 @@ def predict(
         str,
         typer.Option(
             metavar="NAME",
-            help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; lite: rough depth by "
-            "networks that come along; hf:OWNER/NAME or hf:FOLDER: a depth model of transformers. "
-            "auto: the depth that is given or in the photo, else sharp if its weights are here, else lite.",
+            help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; depth: "
+            "Depth-Anything-V2-Small; lite: rough depth by networks that come along; hf:OWNER/NAME or hf:FOLDER: "
+            "another depth model of transformers. auto: the depth that is given or in the photo, else sharp, else "
+            "depth, if `spackle weights get` brought them, else lite.",
         ),
     ] = "auto",
     depth: Annotated[
@@ -89,7 +90,7 @@ def predict(
 ) -> None:
     """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each.
 
-    A photo alone is enough. With a depth map, or SHARP's weights (`spackle weights get sharp`), geometry is better.
+    A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
     from spackle.app.predict import PredictOptions, predict_all
     from spackle.bases.open import BaseSettings

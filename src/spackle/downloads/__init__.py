@@ -136,8 +136,24 @@ class KnownWeights:
     notice: tuple[str, ...]  # lines that a person sees before the download
     named_by: str  # the option that names a copy elsewhere
     md5: str | None = None  # where it was published with the file
+    hub: HubFiles | None = None  # where it comes from the hub, with files that belong to it
 
 
+@dataclasses.dataclass(frozen=True)
+class HubFiles:
+    """One revision of a model on huggingface.co, which huggingface_hub fetches."""
+
+    model: str  # owner/name
+    revision: str  # the commit
+    sha256: str  # of the file of weights, as the hub's page states it
+    others: tuple[str, ...] = ("config.json", "preprocessor_config.json")  # that lie beside it
+
+
+DEPTH_ANYTHING = HubFiles(
+    "depth-anything/Depth-Anything-V2-Small-hf",
+    "5426e4f0f36572d16453bbda7a8389317b1bef99",
+    "3152477ce0d8d6978d76b995120de97cb5b928701fd0f817769f59e249a16b70",
+)
 WEIGHTS = {
     "sharp": KnownWeights(
         name="sharp",
@@ -162,6 +178,18 @@ WEIGHTS = {
         ),
         named_by="--inpainter-weights names it to dataset build",
         md5="e3aa4aaa15225a33ec84f9f4bc47e500",
+    ),
+    "depth": KnownWeights(
+        name="depth",
+        url=f"https://huggingface.co/{DEPTH_ANYTHING.model}/resolve/{DEPTH_ANYTHING.revision}/model.safetensors",
+        file="depth-anything-v2-small/model.safetensors",
+        licence="Apache-2.0",
+        notice=(
+            "Depth-Anything-V2-Small (99 MB) is its authors' (Yang et al., 2024), under the Apache License 2.0:",
+            f"https://huggingface.co/{DEPTH_ANYTHING.model}",
+        ),
+        named_by="--base hf:FOLDER names its folder",
+        hub=DEPTH_ANYTHING,
     ),
 }
 
