@@ -1,4 +1,5 @@
-"""The five functions of gsplat that Spackle calls, in plain PyTorch: the same arguments, shapes and meaning."""
+"""The four functions of gsplat 1.5.3 that Spackle calls, in plain PyTorch, and as strict: what the real ones refuse,
+read as other memory, or die of, fails here."""
 
 from __future__ import annotations
 
@@ -7,16 +8,24 @@ from torch import Tensor
 
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
 
+__version__ = "1.5.3"
+
 
 def fully_fused_projection(
-    means: Tensor, covars: Tensor, quats: None, scales: None, viewmats: Tensor, Ks: Tensor, width: int, height: int,
-    *, eps2d: float, near_plane: float, opacities: Tensor,
+    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, eps2d: float = 0.3, near_plane: float = 0.01, far_plane: float = 1e10, *,
+    opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:  # fmt: skip
     """Radii [C, N, 2] int, means [C, N, 2], depths [C, N], conics [C, N, 3]; anything where the radii are 0."""
-    assert covars.shape == (len(means), 6)
-    assert opacities.shape == (len(means),)
     assert quats is scales is None
-    full = covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    assert covars is not None
+    assert opacities is not None
+    n, c = len(means), len(viewmats)
+    assert n > 0, "divides by the number of Gaussians: a signal ends the process"
+    check(means, (n, 3), covars=(covars, (n, 6)), viewmats=(viewmats, (c, 4, 4)), Ks=(Ks, (c, 3, 3)))
+    check(means, (n, 3), opacities=(opacities, (n,)))
+    xx, xy, xz, yy, yz, zz = covars.unbind(-1)
+    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     rotation, shift = viewmats[:, None, :3, :3], viewmats[:, None, :3, 3]
     x, y, z = ((rotation @ means[None, :, :, None])[..., 0] + shift).unbind(-1)
     fx, fy, cx, cy = (Ks[:, a, b, None] for a, b in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -26,74 +35,102 @@ def fully_fused_projection(
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * tx / z, zero, fy / z, -fy * ty / z], -1).reshape(*z.shape, 2, 3)
     factor = jacobian @ rotation
-    flat = factor @ full @ factor.transpose(-1, -2) + eps2d * torch.eye(2)
-    det = flat[..., 0, 0] * flat[..., 1, 1] - flat[..., 0, 1] ** 2
-    conics = torch.stack([flat[..., 1, 1], -flat[..., 0, 1], flat[..., 0, 0]], -1) / det[..., None]
+    flat = factor @ full @ factor.transpose(-1, -2)
+    a, b, d = flat[..., 0, 0] + eps2d, flat[..., 0, 1], flat[..., 1, 1] + eps2d
+    det = a * d - b * b
+    conics = torch.stack([d, -b, a], -1) / det[..., None]
     reach = (2 * (opacities / ALPHA_MIN).clamp_min(1).log()).sqrt().clamp_max(3.33)[None, :, None]
-    radii = (reach * torch.stack([flat[..., 0, 0], flat[..., 1, 1]], -1).sqrt()).ceil()
+    radii = (reach * torch.stack([a, d], -1).sqrt()).ceil()
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
-    inside = ((means2d + radii > 0) & (means2d - radii < torch.tensor([width, height]))).all(-1)
-    seen = inside & (z > near_plane) & (det > 0) & (opacities >= ALPHA_MIN)
+    low, high = means2d - radii, means2d + radii
+    inside = (high > 0).all(-1) & (low[..., 0] < width) & (low[..., 1] < height)
+    seen = inside & (z >= near_plane) & (z <= far_plane) & (det > 0) & (opacities >= ALPHA_MIN)
     rubbish = torch.where(seen[..., None], means2d, torch.nan)  # as the kernel, which does not write there
     return (radii * seen[..., None]).detach().nan_to_num(0).int(), rubbish, z, conics, None
 
 
 def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, columns: int, rows: int
-) -> tuple[None, Tensor, Tensor]:
-    """Keys [M] (camera and tile, then depth, here as pairs in one float64) and flat ids [M], sorted."""
+    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
+    packed: bool = False, n_images: int | None = None, image_ids: Tensor | None = None,
+    gaussian_ids: Tensor | None = None,
+) -> tuple[None, Tensor, Tensor]:  # fmt: skip
+    """Of packed Gaussians [nnz] keys [M] (image and tile; sorted by depth, too) and ids [M], sorted."""
+    assert packed
+    assert n_images is not None
+    assert image_ids is not None
+    assert gaussian_ids is not None
+    n = len(means2d)
+    check(means2d, (n, 2), depths=(depths, (n,)))
+    check(means2d, (n, 2), radii=(radii, (n, 2)), dtype=torch.int32)
+    check(means2d, (n, 2), image_ids=(image_ids, (n,)), gaussian_ids=(gaussian_ids, (n,)), dtype=torch.int64)
     found: list[tuple[int, float, int]] = []
-    count = means2d.shape[1]
-    for c, n in (radii > 0).all(-1).nonzero().tolist():
-        low = ((means2d[c, n] - radii[c, n]) / tile_size).floor().int().tolist()
-        high = ((means2d[c, n] + radii[c, n]) / tile_size).ceil().int().tolist()
-        for row in range(max(low[1], 0), min(high[1], rows)):
-            for column in range(max(low[0], 0), min(high[0], columns)):
-                found.append(((c * rows + row) * columns + column, float(depths[c, n]), c * count + n))
+    place = means2d.device
+    numbers = torch.cat([means2d, radii, depths[:, None], image_ids[:, None]], 1).cpu().tolist()
+    for k, (u, v, right, down, depth, image) in enumerate(numbers):
+        if right <= 0 or down <= 0:
+            continue
+        tiles = [edge / tile_size for edge in (v - down, v + down, u - right, u + right)]
+        for row in range(max(int(tiles[0] // 1), 0), min(-int(-tiles[1] // 1), tile_height)):
+            for column in range(max(int(tiles[2] // 1), 0), min(-int(-tiles[3] // 1), tile_width)):
+                found.append(((int(image) * tile_height + row) * tile_width + column, depth, k))
     found.sort()
-    return None, torch.tensor([f[0] for f in found]).long(), torch.tensor([f[2] for f in found]).int()
+    keys, ids = torch.tensor([f[0] for f in found]).long(), torch.tensor([f[2] for f in found]).int()
+    return None, keys.to(place), ids.to(place)
 
 
-def isect_offset_encode(keys: Tensor, images: int, columns: int, rows: int) -> Tensor:
-    """[images, rows, columns] where each tile's ids begin."""
-    counts = torch.bincount(keys, minlength=images * rows * columns)
-    return (counts.cumsum(0) - counts).reshape(images, rows, columns).int()
+def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+    """[n_images, rows, columns] where each tile's ids begin."""
+    check(isect_ids, isect_ids.shape, dtype=torch.int64)
+    counts = torch.bincount(isect_ids, minlength=n_images * tile_height * tile_width)
+    return (counts.cumsum(0) - counts).reshape(n_images, tile_height, tile_width).int()
 
 
 def rasterize_to_pixels(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
-    offsets: Tensor, ids: Tensor, *, masks: Tensor | None,
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, image_width: int, image_height: int,
+    tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, *, masks: Tensor | None = None, packed: bool = False,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """[C, H, W, D] and [C, H, W, 1]; where the mask is False it holds anything, as the kernel's does."""
-    images, rows, columns = offsets.shape
-    assert opacities.shape == means2d.shape[:2] == colors.shape[:2]
-    ends = torch.cat([offsets.flatten()[1:], torch.tensor([len(ids)])]).reshape(offsets.shape)
-    canvases = []
-    for c in range(images):
-        drawn = []
-        for row in range(rows):
-            tiles = []
-            for column in range(columns):
-                mine = ids[offsets[c, row, column] : ends[c, row, column]].long()
-                if masks is not None and not masks[c, row, column]:
-                    tiles.append(torch.full((tile_size, tile_size, colors.shape[-1] + 1), torch.nan))
-                    continue
-                y, x = torch.meshgrid(
-                    torch.arange(tile_size) + row * tile_size + 0.5,
-                    torch.arange(tile_size) + column * tile_size + 0.5,
-                    indexing="ij",
-                )
-                mean, conic = means2d.flatten(0, 1)[mine], conics.flatten(0, 1)[mine][:, :, None, None]
-                dx, dy = x - mean[:, 0, None, None], y - mean[:, 1, None, None]
-                power = 0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) + conic[:, 1] * dx * dy
-                alpha = (opacities.flatten()[mine][:, None, None] * torch.exp(-power)).clamp_max(ALPHA_MAX)
-                alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0)
-                after = torch.cumprod(1 - alpha, 0)
-                before = torch.cat([torch.ones_like(x)[None], after[:-1]])[: len(after)]
-                weight = torch.where(after > TRANSMITTANCE_STOP, alpha * before, 0)
-                color = torch.einsum("nhw,nd->hwd", weight, colors.flatten(0, 1)[mine])
-                tiles.append(torch.cat([color, weight.sum(0)[..., None]], -1))
-            drawn.append(torch.cat(tiles, 1))
-        canvases.append(torch.cat(drawn)[:height, :width])
-    whole = torch.stack(canvases)
+    """[I, H, W, D] and [I, H, W, 1]; where the mask is False it holds anything, as the kernel's does."""
+    assert packed
+    n, (images, rows, columns) = len(means2d), isect_offsets.shape
+    assert colors.shape[1] in (1, 2, 3, 4, 5, 8), "kernels are built for these numbers of channels"
+    check(means2d, (n, 2), conics=(conics, (n, 3)), colors=(colors, (n, colors.shape[1])), opacities=(opacities, (n,)))
+    check(means2d, (n, 2), isect_offsets=(isect_offsets, isect_offsets.shape), dtype=torch.int32)
+    check(means2d, (n, 2), flatten_ids=(flatten_ids, flatten_ids.shape), dtype=torch.int32)
+    if masks is not None:
+        check(means2d, (n, 2), masks=(masks, isect_offsets.shape), dtype=torch.bool)
+    assert rows * tile_size >= image_height
+    assert columns * tile_size >= image_width
+    starts = [*isect_offsets.flatten().cpu().tolist(), len(flatten_ids)]
+    wanted = [True] * (len(starts) - 1) if masks is None else masks.flatten().cpu().tolist()
+    y, x = (steps.to(means2d.device) for steps in torch.meshgrid(*[torch.arange(tile_size) + 0.5] * 2, indexing="ij"))
+    tiles = []
+    for tile in range(images * rows * columns):
+        if not wanted[tile]:
+            tiles.append(means2d.new_full((tile_size, tile_size, colors.shape[-1] + 1), torch.nan))
+            continue
+        mine = flatten_ids[starts[tile] : starts[tile + 1]].long()
+        mean, conic = means2d[mine], conics[mine][:, :, None, None]
+        dx = x + tile % columns * tile_size - mean[:, 0, None, None]
+        dy = y + tile // columns % rows * tile_size - mean[:, 1, None, None]
+        power = 0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) + conic[:, 1] * dx * dy
+        alpha = (opacities[mine][:, None, None] * torch.exp(-power)).clamp_max(ALPHA_MAX)
+        alpha = torch.where((alpha >= ALPHA_MIN) & (power >= 0), alpha, 0)
+        after = torch.cumprod(1 - alpha, 0)
+        before = torch.cat([torch.ones_like(x)[None], after[:-1]])[: len(after)]
+        weight = torch.where(after > TRANSMITTANCE_STOP, alpha * before, 0)
+        color = (weight[..., None] * colors[mine][:, None, None, :]).sum(0)
+        tiles.append(torch.cat([color, weight.sum(0)[..., None]], -1))
+    grid = torch.stack(tiles).reshape(images, rows, columns, tile_size, tile_size, -1).transpose(2, 3)
+    whole = grid.reshape(images, rows * tile_size, columns * tile_size, -1)[:, :image_height, :image_width]
     return whole[..., :-1], whole[..., -1:]
+
+
+def check(
+    first: Tensor, shape: tuple[int, ...], dtype: torch.dtype = torch.float32, **others: tuple[Tensor, tuple[int, ...]]
+) -> None:
+    """The kernels read one device's memory as numbers of one type."""
+    for name, (tensor, expected) in {"first": (first, shape), **others}.items():
+        wanted = torch.float32 if name == "first" and first.is_floating_point() else dtype
+        assert tensor.dtype == wanted, f"{name}: expected {wanted}, found {tensor.dtype}"
+        assert tuple(tensor.shape) == tuple(expected), f"{name}: expected {expected}, found {tuple(tensor.shape)}"
+        assert tensor.device == first.device, f"{name} lies on {tensor.device}, not on {first.device}"

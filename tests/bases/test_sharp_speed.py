@@ -128,7 +128,7 @@ class NoStream:
 def _stand_in_for_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     replacements: dict[str, Callable[..., Any]] = {
         "CUDAGraph": RecordingGraph,
-        "graph": lambda graph: graph,
+        "graph": lambda graph, stream: graph,
         "Stream": NoStream,
         "current_stream": NoStream,
         "stream": contextlib.nullcontext,
@@ -151,6 +151,16 @@ def test_one_graph_says_of_every_photo_what_the_network_says() -> None:
         assert seen == [(WINDOWS, WINDOWS)] * 2
         assert all(same(output, network(*one, 35)) for output, one in zip(found, pictures, strict=True))
     assert not same(*found)  # the first is not what the second has become
+
+
+@pytest.mark.usefixtures("_stand_in_for_cuda")
+def test_a_graph_captured_in_inference_mode_serves_other_modes_too() -> None:
+    network = micro_network()
+    graphed = GraphedForward(network)
+    with torch.inference_mode():
+        graphed(waves(MICRO.side), 0.8, 35)
+    with torch.no_grad():
+        assert same(graphed(waves(MICRO.side).flip(-1), 1.3, 35), network(waves(MICRO.side).flip(-1), 1.3, 35))
 
 
 # --- a GPU is waited for once

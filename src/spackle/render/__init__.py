@@ -1,16 +1,20 @@
 """Renderers: Gaussians and a camera in, an image, its depth and its opacity out."""
 
 import logging
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
+from spackle.camera import Camera
 from spackle.errors import InputError
+from spackle.gaussians import Gaussians
 from spackle.render.cpu import CpuRenderer
 from spackle.render.cuda import GsplatRenderer
 from spackle.render.pipeline import touched_tiles
-from spackle.render.protocol import TILE, Renderer
+from spackle.render.protocol import TILE, Renderer, Rendering
 
-__all__ = ["TILE", "CpuRenderer", "GsplatRenderer", "Renderer", "get_renderer", "touched_tiles"]
+__all__ = ["TILE", "CpuRenderer", "GsplatRenderer", "Renderer", "get_renderer", "render_batch", "touched_tiles"]
 
 LOG = logging.getLogger("spackle")
 
@@ -31,3 +35,18 @@ def get_renderer(device: str = "auto") -> Renderer:
         except InputError as error:
             LOG.warning("rendering on the processor: %s", error)
     return CpuRenderer()
+
+
+def render_batch(
+    renderer: Renderer,
+    scenes: Sequence[Sequence[Gaussians]],
+    cameras: Sequence[Camera],
+    *,
+    tiles: Sequence[Tensor | None],
+    onto: Sequence[Rendering | None],
+) -> list[Rendering]:
+    """`Renderer.render` of several views of one size: at once on a GPU, which is waited for once, else one by one."""
+    if isinstance(renderer, GsplatRenderer):
+        return renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
+    views = zip(scenes, cameras, tiles, onto, strict=True)
+    return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from types import ModuleType
 from typing import NamedTuple
 
@@ -13,12 +14,16 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
-from spackle.errors import InputError
-from spackle.gaussians import Gaussians
+from spackle.device import MemoryShort, memory_is_short
+from spackle.errors import InputError, reason_in_a_line
+from spackle.gaussians import Gaussians, quat_to_matrix
+from spackle.render.project import FINITE
 from spackle.render.projection_cache import Snapshot
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, paste, tile_grid
 
-UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))  # gsplat's order of a symmetric matrix' six values
+VERSIONS = ("1.5.3", "1.6")  # of gsplat, from and before: others do not build, or have another largest alpha
+INSTALL = "pip install 'spackle-nvs[cuda]'"
+MOST_ENTRIES = 2**31 - 1  # of tile lists, which gsplat's rasteriser counts in int32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,21 +38,28 @@ class Material:
     @staticmethod
     def of(part: Gaussians, device: torch.device) -> Material:
         """Bring a set there; what is not finite becomes a transparent point: to take it out would wait for the GPU."""
-        there = [tensor.to(device, torch.float32) for tensor in part.tensors]
+        there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
         finite = torch.stack(
             [t.detach().isfinite() if t.ndim == 1 else t.detach().isfinite().all(-1) for t in there]
         ).all(0)
         usable = Gaussians(*(torch.where(finite if t.ndim == 1 else finite[:, None], t, 0) for t in there))
-        return Material(usable.means, usable.covariances()[:, UPPER[0], UPPER[1]], usable.opacities, usable.colors)
+        return Material(usable.means, upper_covariances(usable), usable.opacities, usable.colors)
+
+
+def upper_covariances(part: Gaussians) -> Tensor:
+    """[N, 6], Σ's xx, xy, xz, yy, yz, zz, by products of numbers: autocast and TF32 round products of matrices."""
+    x, y, z = (quat_to_matrix(part.quats) * part.scales[:, None, :]).unbind(1)
+    pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
+    return torch.stack([(a * b).sum(-1) for a, b in pairs], dim=-1)
 
 
 class Projection(NamedTuple):
     """A set as a camera sees it."""
 
-    radii: Tensor  # [1, N, 2] int; 0 where nothing is seen
-    means2d: Tensor  # [1, N, 2] pixels; anything where nothing is seen, as the rest
-    depths: Tensor  # [1, N]
-    conics: Tensor  # [1, N, 3]
+    radii: Tensor  # [N, 2] int; 0 where nothing is seen
+    means2d: Tensor  # [N, 2] pixels; anything where nothing is seen, as the rest
+    depths: Tensor  # [N]
+    conics: Tensor  # [N, 3]
 
 
 @dataclasses.dataclass
@@ -68,20 +80,18 @@ class SetStore:
         self.device = device
         self._entries = WeakTensorKeyDictionary()
 
-    def material(self, part: Gaussians) -> Material:
-        """The set on the GPU."""
-        entry = self._entry(part)
-        return Material.of(part, self.device) if entry is None else entry.material
-
-    def projection(self, part: Gaussians, key: Hashable, make: Callable[[Material], Projection]) -> Projection:
-        """What `make` makes of the set's material; not again for the key of the last call."""
+    def seen(
+        self, part: Gaussians, key: Hashable, project: Callable[[Material], Projection]
+    ) -> tuple[Material, Projection]:
+        """The set on the GPU, and what `project` makes of it; not made again for the key of the last call."""
         entry = self._entry(part)
         if entry is None:
-            return make(self.material(part))
+            material = Material.of(part, self.device)
+            return material, project(material)
         if entry.projection is None or entry.key != key:
             with torch.inference_mode(False):
-                entry.key, entry.projection = key, make(entry.material)
-        return entry.projection
+                entry.key, entry.projection = key, project(entry.material)
+        return entry.material, entry.projection
 
     def _entry(self, part: Gaussians) -> _Entry | None:
         """What is remembered of a set, made where it is new or has changed; None for one that must not be."""
@@ -122,54 +132,145 @@ class GsplatRenderer:
         tiles: Tensor | None = None,
         onto: Rendering | None = None,
     ) -> Rendering:
-        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32."""
-        sets = [gaussians] if isinstance(gaussians, Gaussians) else [*gaussians] or [Gaussians.empty()]
-        grid = tile_grid(camera.height, camera.width)
-        if tiles is not None and tuple(tiles.shape) != grid:
-            raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}")
-        wanted = None if tiles is None else tiles.to(self.device, torch.bool)
-        drawn = self._draw(sets, camera, eps2d, wanted)
-        if wanted is not None:
-            under = None if onto is None else Rendering(*(image.to(drawn.rgb) for image in onto.tensors))
-            drawn = paste(drawn, wanted, under)
-        return Rendering(*(image.to(sets[0].means.device) for image in drawn.tensors))
+        """Draw Gaussians as a camera sees them; see `Renderer.render`. The result is float32.
 
-    def _draw(self, sets: Sequence[Gaussians], camera: Camera, eps2d: float, wanted: Tensor | None) -> Rendering:
+        Raises:
+            MemoryShort: the GPU's memory is too small.
+        """
+        sets = [gaussians] if isinstance(gaussians, Gaussians) else gaussians
+        return self.render_batch([sets], [camera], eps2d=eps2d, tiles=[tiles], onto=[onto])[0]
+
+    def render_batch(
+        self,
+        scenes: Sequence[Sequence[Gaussians]],
+        cameras: Sequence[Camera],
+        *,
+        eps2d: float = 0.0,
+        tiles: Sequence[Tensor | None] | None = None,
+        onto: Sequence[Rendering | None] | None = None,
+    ) -> list[Rendering]:
+        """`render` of several views of one size, whose results it gives bit for bit; waits for the GPU once.
+
+        Raises:
+            ValueError: tiles that are not those of the view, or views of several sizes.
+            MemoryShort: the GPU's memory is too small.
+        """
+        width, height = cameras[0].width, cameras[0].height
+        if any((camera.width, camera.height) != (width, height) for camera in cameras):
+            raise ValueError("views that are drawn together must be of one size")
+        grid = tile_grid(height, width)
+        chosen = tiles or [None] * len(cameras)
+        for grid_of in chosen:
+            if grid_of is not None and tuple(grid_of.shape) != grid:
+                raise ValueError(f"tiles has shape {tuple(grid_of.shape)}, expected {grid}")
+        wanted = [None if t is None else t.to(self.device, torch.bool, non_blocking=True) for t in chosen]
+        count = sum(len(part) for parts in scenes for part in parts)
+        with _enough_memory(f"{count:,} Gaussians at {width}×{height}"):
+            drawn = self._draw(scenes, cameras, eps2d, wanted)
+            results = []
+            for view, parts, here, under in zip(drawn, scenes, wanted, onto or [None] * len(cameras), strict=True):
+                if here is not None:
+                    kept = [] if under is None else [t.to(view.rgb, non_blocking=True) for t in under.tensors]
+                    view = paste(view, here, Rendering(*kept) if kept else None)
+                results.append(_at(view, parts[0].means.device if len(parts) else torch.device("cpu")))
+        return results
+
+    def _draw(
+        self,
+        scenes: Sequence[Sequence[Gaussians]],
+        cameras: Sequence[Camera],
+        eps2d: float,
+        wanted: Sequence[Tensor | None],
+    ) -> list[Rendering]:
         """Images drawn where `wanted` [rows, columns] says; elsewhere they hold anything."""
-        width, height = camera.width, camera.height
+        width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
-        parts = [self._store.material(part) for part in sets]
-        seen = self._seen(sets, camera, eps2d)
-        radii = seen.radii
-        if wanted is not None:
-            radii = radii * _touching(seen.means2d.detach(), radii, wanted)[..., None]
-        _, keys, ids = self._gsplat.isect_tiles(seen.means2d.detach(), radii, seen.depths.detach(), TILE, columns, rows)
-        offsets = self._gsplat.isect_offset_encode(keys, 1, columns, rows)
-        opacities = torch.cat([part.opacities for part in parts])[None]
-        colors = torch.cat([part.colors for part in parts])[None]
-        drawn, alpha = self._gsplat.rasterize_to_pixels(
-            seen.means2d, seen.conics, torch.cat([colors, seen.depths[..., None]], dim=-1), opacities, width, height,
-            TILE, offsets.reshape(1, rows, columns), ids, masks=None if wanted is None else wanted[None],
+        materials: list[Material] = []
+        seen: list[Projection] = []
+        boxes: list[Tensor] = []
+        images: list[Tensor] = []
+        for k, (parts, numbers) in enumerate(zip(scenes, self._numbers(cameras), strict=True)):
+            for part in parts:
+                if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
+                    continue
+                material, projection = self._seen(part, cameras[k], *numbers, eps2d)
+                here, radii = wanted[k], projection.radii
+                if here is not None:
+                    radii = radii * _touching(projection.means2d.detach(), radii, here)[:, None]
+                materials.append(material)
+                seen.append(projection)
+                boxes.append(radii)
+                images.append(torch.full((len(part),), k, device=self.device))
+        if not seen:
+            black = torch.zeros(height, width, device=self.device)
+            return [
+                Rendering(black[..., None].expand(-1, -1, 3).clone(), black.clone(), black.clone()) for _ in cameras
+            ]
+        means2d, depths, conics = (torch.cat(field) for field in list(zip(*seen, strict=True))[1:])
+        of = torch.cat(images)
+        _, keys, ids = self._gsplat.isect_tiles(
+            means2d.detach(), torch.cat(boxes), depths.detach(), TILE, columns, rows,
+            packed=True, n_images=len(cameras), image_ids=of, gaussian_ids=of,
         )  # fmt: skip
-        drawn, alpha = drawn[0], alpha[0, ..., 0]
-        return Rendering(linear_to_srgb(drawn[..., :3]), drawn[..., 3] / torch.where(alpha > 0, alpha, 1), alpha)
+        if len(ids) > MOST_ENTRIES:
+            raise MemoryError(f"out of memory: {len(ids):,} entries in the lists of tiles")
+        masks = None
+        if any(here is not None for here in wanted):
+            every = torch.ones(rows, columns, dtype=torch.bool, device=self.device)
+            masks = torch.stack([every if here is None else here for here in wanted])
+        colors = torch.cat([torch.cat([material.colors for material in materials]), depths[:, None]], dim=-1)
+        drawn, alphas = self._gsplat.rasterize_to_pixels(
+            means2d, conics, colors, torch.cat([material.opacities for material in materials]), width, height, TILE,
+            self._gsplat.isect_offset_encode(keys, len(cameras), columns, rows), ids, masks=masks, packed=True,
+        )  # fmt: skip
+        return [
+            Rendering(linear_to_srgb(image[..., :3]), image[..., 3] / torch.where(alpha > 0, alpha, 1), alpha)
+            for image, alpha in zip(drawn, alphas[..., 0], strict=True)
+        ]
 
-    def _seen(self, sets: Sequence[Gaussians], camera: Camera, eps2d: float) -> Projection:
-        """All sets as a camera sees them; what it sees of a set is remembered."""
-        view = camera.world_to_camera.to(self.device, torch.float32)[None]
-        lens = camera.K.to(self.device, torch.float32)[None]
+    def _numbers(self, cameras: Sequence[Camera]) -> list[tuple[Hashable, Tensor, Tensor]]:
+        """Of each camera its numbers as a key, extrinsics [1, 4, 4] and intrinsics [1, 3, 3]: one upload for all."""
+        keys = [(*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras]
+        there = torch.tensor(keys, dtype=torch.float32).to(self.device, non_blocking=True)
+        views, lenses = there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3)
+        return list(zip(keys, views, lenses, strict=True))
 
-        def project(part: Material) -> Projection:
-            radii, means2d, depths, conics, _ = self._gsplat.fully_fused_projection(
-                part.means, part.covariances, None, None, view, lens, camera.width, camera.height,
-                eps2d=eps2d, near_plane=NEAR_PLANE, opacities=part.opacities,
+    def _seen(
+        self, part: Gaussians, camera: Camera, numbers: Hashable, view: Tensor, lens: Tensor, eps2d: float
+    ) -> tuple[Material, Projection]:
+        """A set as a camera sees it, which is remembered."""
+
+        def project(material: Material) -> Projection:
+            found = self._gsplat.fully_fused_projection(
+                material.means, material.covariances, None, None, view, lens, camera.width, camera.height,
+                eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=FINITE, opacities=material.opacities,
             )  # fmt: skip
-            return Projection(radii, means2d, depths, conics)
+            return Projection(*(field[0] for field in found[:4]))
 
-        numbers = (*camera.K.flatten().tolist(), *camera.world_to_camera.flatten().tolist())
-        key = (eps2d, camera.width, camera.height, *numbers)
-        parts = [self._store.projection(part, key, project) for part in sets]
-        return parts[0] if len(parts) == 1 else Projection(*(torch.cat(field, 1) for field in zip(*parts, strict=True)))
+        return self._store.seen(part, (eps2d, camera.width, camera.height, numbers), project)
+
+
+def _at(view: Rendering, place: torch.device) -> Rendering:
+    """The images at a place; in one copy, for each waits for the GPU."""
+    if view.rgb.device == place:
+        return view
+    flat = torch.cat([image.flatten() for image in view.tensors]).to(place)
+    parts = torch.split(flat, [image.numel() for image in view.tensors])
+    return Rendering(*(part.view(image.shape) for part, image in zip(parts, view.tensors, strict=True)))
+
+
+@contextlib.contextmanager
+def _enough_memory(what: str) -> Iterator[None]:
+    """Turn a shortage of memory into one `MemoryShort` line."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not memory_is_short(error):
+            raise
+        raise MemoryShort(
+            f"--device cuda: the GPU's memory is too small to draw {what}: close other programs, make the picture "
+            "smaller, or use --device cpu"
+        ) from error
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
@@ -178,12 +279,15 @@ def load_gsplat(device: torch.device) -> ModuleType:
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
     try:
         import gsplat
+
+        check_version(gsplat.__version__)
         from gsplat.cuda import _backend
-    except ImportError as error:
-        install = "pip install 'spackle-nvs[cuda]'"
-        raise InputError(f"--device cuda: needs gsplat ({error}): {install}, or use --device cpu") from error
-    except Exception as error:  # its kernels are built when it is first imported: compilers fail in many ways
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    except InputError:
+        raise
+    except Exception as error:  # its kernels are built when this is first imported: compilers fail in many ways
+        if isinstance(error, ModuleNotFoundError) and error.name == "gsplat":
+            raise InputError(f"--device cuda: needs gsplat: {INSTALL}, or use --device cpu") from error
+        reason = reason_in_a_line(error)
         raise InputError(f"--device cuda: gsplat's kernels cannot be built here: {reason}; use --device cpu") from error
     if _backend._C is None:
         raise InputError(
@@ -194,20 +298,31 @@ def load_gsplat(device: torch.device) -> ModuleType:
     return package
 
 
+def check_version(found: str) -> None:
+    """InputError for a gsplat that would not do."""
+    numbers = [int(part) for part in found.split("+")[0].split(".") if part.isdigit()]
+    low, high = ([int(part) for part in version.split(".")] for version in VERSIONS)
+    if not low <= numbers < high:
+        raise InputError(
+            f"--device cuda: gsplat {found} does not build here or draws otherwise: {INSTALL} takes one from "
+            f"{VERSIONS[0]} on and before {VERSIONS[1]}; or use --device cpu"
+        )
+
+
 def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
-    """[1, N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
+    """[N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
     rows, columns = wanted.shape
     before = torch.nn.functional.pad(wanted.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).flatten()  # [(rows+1)(columns+1)]
-    size = means2d.new_tensor([columns, rows])
     radii = radii.to(means2d)
 
-    def tile(place: Tensor) -> Tensor:  # of what is out of sight gsplat leaves the place as the memory was
-        return place.nan_to_num(0, 0, 0).clamp_min(0).minimum(size).long()
+    def tile(place: Tensor) -> tuple[Tensor, Tensor]:  # of what is out of sight gsplat leaves the place as it was
+        x, y = place.nan_to_num(0, 0, 0).unbind(-1)
+        return x.clamp(0, columns).long(), y.clamp(0, rows).long()
 
-    low, high = tile(((means2d - radii) / TILE).floor()), tile(((means2d + radii) / TILE).ceil())
+    left, top = tile(((means2d - radii) / TILE).floor())
+    right, bottom = tile(((means2d + radii) / TILE).ceil())
 
     def at(x: Tensor, y: Tensor) -> Tensor:
         return before[y * (columns + 1) + x]
 
-    (left, top), (right, bottom) = low.unbind(-1), high.unbind(-1)
     return ((at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)) > 0).int()

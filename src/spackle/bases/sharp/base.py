@@ -202,7 +202,10 @@ class GraphedForward:
         start = self.output.start  # the next replay writes over it
         return SharpOutput(InitialGaussians(*(t.clone() for t in vars(start).values())), self.output.deltas.clone())
 
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def _capture(self, image: Tensor, batch: int) -> None:
+        """Record a forward over buffers that later calls may write to, in inference mode or not."""
         self.image, self.factor = image.clone(), image.new_ones(())
         side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         side.wait_stream(torch.cuda.current_stream())
@@ -211,7 +214,7 @@ class GraphedForward:
                 self.network(self.image, self.factor, batch)
         torch.cuda.current_stream().wait_stream(side)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        with torch.cuda.graph(graph, stream=side):  # by itself it takes that of the first device it was used on
             self.output: SharpOutput = self.network(self.image, self.factor, batch)
         self.graph = graph
 
