@@ -85,7 +85,8 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
     moved = func in (ATEN._to_copy.default, ATEN.copy_.default)
     if far and not moved and any(not isinstance(t, FarTensor) and t.ndim for t in tensors):
         index = func in (ATEN.index.Tensor, ATEN.index_put_.default)  # may be given places by the processor
-        assert index and isinstance(args[0], FarTensor), f"{func}: tensors of two devices"
+        assert index, f"{func}: tensors of two devices"
+        assert isinstance(args[0], FarTensor), f"{func}: a tensor of the processor, at places that lie far away"
     device = kwargs.get("device")
     if device is not None:
         far = torch.device(device) == FAR

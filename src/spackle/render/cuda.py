@@ -202,10 +202,8 @@ class GsplatRenderer:
                 boxes.append(radii)
                 images.append(torch.full((len(part),), k, device=self.device))
         if not seen:
-            black = torch.zeros(height, width, device=self.device)
-            return [
-                Rendering(black[..., None].expand(-1, -1, 3).clone(), black.clone(), black.clone()) for _ in cameras
-            ]
+            black = torch.zeros(len(cameras), height, width, 5, device=self.device)
+            return [Rendering(image[..., :3], image[..., 3], image[..., 4]) for image in black]
         means2d, depths, conics = (torch.cat(field) for field in list(zip(*seen, strict=True))[1:])
         of = torch.cat(images)
         _, keys, ids = self._gsplat.isect_tiles(
