@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import importlib.util
 import inspect
 import sys
 from pathlib import Path
@@ -335,3 +337,18 @@ def test_a_gsplat_that_cannot_be_used_is_told_in_a_line_and_auto_falls_back(
         with monkeypatch.context() as patch:
             patch.setattr(sys, "meta_path", [BrokenBuild(error), *sys.meta_path])
             refused(f"cannot be built here: {str(error).split()[0]}")
+
+
+def test_each_step_of_the_gpus_first_minutes_says_why_it_is_skipped_without_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spec = importlib.util.spec_from_file_location("gpu", Path(__file__).parents[2] / "benchmarks" / "gpu.py")
+    assert spec is not None
+    assert spec.loader is not None
+    steps = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(steps)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setenv("PATH", "")
+    for step in steps.STEPS:
+        with pytest.raises(steps.Skip, match="GPU|gsplat|path"):
+            list(step(argparse.Namespace(checkpoint=None)))

@@ -1,0 +1,318 @@
+"""The first ten minutes on a machine with an NVIDIA GPU: what works there, is exact and is fast, as one Markdown file.
+
+python benchmarks/gpu.py [-o gpu.md] [-c SHARP.pt] [--only STEP,...]
+
+Each step runs in a process of its own, for a fault in a kernel ends the process, and says what it must show. A step that
+cannot run here is skipped with its reason: without a GPU all are, which is the dry run. The file is written anew
+after each step and is meant for docs/performance.md. `spackle weights make sharp.pt` makes weights for -c.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import itertools
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import torch
+
+from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.base import to_metric
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
+from spackle.device import Precision
+from spackle.errors import InputError
+from spackle.evaluation.suite_sections import SIDE, find_view, holed_scene, photo_scene
+from spackle.evaluation.timing import TOTAL, Task, measure
+from spackle.formats import write_whole
+from spackle.gaussians import Gaussians
+from spackle.image import Photo
+from spackle.machine import commit, hardware, versions
+from spackle.render import CpuRenderer, GsplatRenderer
+from spackle.render.cuda import Material, load_gsplat
+from spackle.render.pipeline import project, wanted_tiles
+from spackle.render.project import KernelCamera
+from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
+from spackle.residual.network import ResidualNet
+from spackle.training.losses import total_loss
+from spackle.training.residual_method import complete_samples
+from spackle.training.sample import Sample
+
+REPOSITORY = Path(__file__).parents[1]
+SKIPPED, LIMIT_S, RUNS = 77, 1200, 20
+CUDA = torch.device("cuda")
+CLOSE = 2e-4  # of sRGB: nearer is the same
+TESTS = "tests/render/test_cuda.py"
+CROP, BATCH = 96, 8  # cells along a training crop; of a step
+
+
+class Skip(Exception):  # nothing went wrong
+    """Why a step cannot run here."""
+
+
+def renderer() -> GsplatRenderer:
+    """The GPU's, or a `Skip` that says what is missing."""
+    try:
+        return GsplatRenderer()
+    except InputError as error:
+        raise Skip(str(error)) from error
+
+
+def run(*command: str) -> Iterator[str]:
+    """The lines that a program prints; the step fails where it does."""
+    if shutil.which(command[0]) is None:
+        raise Skip(f"there is no {command[0]} on the path")
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}:\n{(done.stdout + done.stderr)[-2000:]}")
+    yield from done.stdout.splitlines()
+
+
+def sharp(
+    options: argparse.Namespace, precision: Precision = "fp32", *, compiled: bool = False
+) -> tuple[SharpBase, Photo]:
+    """SHARP on the GPU, and a photo of noise."""
+    if not torch.cuda.is_available():
+        raise Skip("PyTorch sees no NVIDIA GPU on this machine")
+    if options.checkpoint is None:
+        raise Skip("no weights: give -c FILE")
+    photo = Photo(torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(0)), 1843.2, "", Path("photo.png"))
+    base = SharpBase.load(options.checkpoint, precision=precision, compiled=compiled, device=CUDA)
+    return base, photo
+
+
+def views() -> tuple[Gaussians, list[Camera]]:
+    """A scene of SHARP's size, and the photo's camera and one from aside."""
+    scene, camera = photo_scene()
+    return scene, [camera, extremes(camera, 0.3, DepthRange.of(scene))[1]]
+
+
+def rows(tasks: dict[str, Task], runs: int = RUNS) -> Iterator[str]:
+    """A table of median milliseconds of tasks that take turns."""
+    yield from ("", "| what | median |", "|---|---|")
+    for (name, stage), times in measure(runs, tasks, CUDA).items():
+        if stage == TOTAL:
+            low, median, high = torch.from_numpy(times).quantile(torch.tensor([0.25, 0.5, 0.75]).double()).tolist()
+            yield f"| {name} | {median:,.2f} ms ({low:,.2f} – {high:,.2f}) |"
+
+
+def machine(options: argparse.Namespace) -> Iterator[str]:
+    """names driver, GPU, torch and the compiler"""
+    yield f"torch {torch.__version__}, CUDA {torch.version.cuda}, sees a GPU: {torch.cuda.is_available()}"
+    yield from run("nvidia-smi", "--query-gpu=name,driver_version,memory.total,compute_cap", "--format=csv")
+    yield from list(run("nvcc", "--version"))[-2:]
+
+
+def build(options: argparse.Namespace) -> Iterator[str]:
+    """gsplat's kernels build and load; the second time takes seconds"""
+    if importlib.util.find_spec("gsplat") is None:
+        raise Skip("gsplat is not installed: pip install 'spackle-nvs[cuda]'")
+    start = time.perf_counter()
+    try:
+        package = load_gsplat(CUDA)
+    except InputError as error:
+        raise Skip(str(error)) from error
+    yield f"gsplat {package.__version__}: {time.perf_counter() - start:.1f} s"
+
+
+def empty(options: argparse.Namespace) -> Iterator[str]:
+    """an empty scene is black, and an empty set beside another changes nothing"""
+    gpu = renderer()
+    scene, camera = photo_scene(256)
+    black, alone, both = (gpu.render(s, camera) for s in ([], [scene], [scene, Gaussians.empty()]))
+    same = all(torch.equal(a, b) for a, b in zip(alone.tensors, both.tensors, strict=True))
+    yield f"black: {not any(bool(t.any()) for t in black.tensors)}; the same bits: {same}"
+
+
+def parity(options: argparse.Namespace) -> Iterator[str]:
+    """all pass and none of gsplat's is skipped: values, gradients, tiles, batches, memory"""
+    renderer()
+    yield list(run(sys.executable, "-m", "pytest", TESTS, "-q", "-rs"))[-1]
+
+
+def against_cpu(options: argparse.Namespace) -> Iterator[str]:
+    """at eps2d 0 nearly all pixels within 2e-4 of the processor's, and next to no Gaussian drawn by one alone"""
+    gpu, (scene, cameras) = renderer(), views()
+    for camera in cameras:
+        one, other = gpu.render(scene, camera), CpuRenderer().render(scene, camera)
+        apart = (one.rgb - other.rgb).abs().amax(-1)
+        material, view = Material.of(scene, CUDA), camera.to(CUDA)
+        radii = gpu._gsplat.fully_fused_projection(
+            material.means, material.covariances, None, None, view.world_to_camera[None], view.K[None],
+            camera.width, camera.height, eps2d=0.0, near_plane=NEAR_PLANE, opacities=material.opacities,
+        )[0][0]  # fmt: skip
+        here = (radii > 0).all(-1).cpu()
+        lens = KernelCamera.of(camera, 0.0)
+        there = torch.from_numpy(project([scene], lens, wanted_tiles(lens, None))[0].boxes[: len(scene), 1] > 0)
+        yield (
+            f"{len(scene):,} Gaussians: {float((apart < CLOSE).float().mean()):.4%} of pixels within {CLOSE:g}, worst "
+            f"{float(apart.max()):.1e}; drawn by the GPU alone {int((here & ~there).sum()):,}, by the processor alone "
+            f"{int((there & ~here).sum()):,}"
+        )
+
+
+def sanitizer(options: argparse.Namespace) -> Iterator[str]:
+    """no invalid access in forward and backward, through tiles and batches"""
+    renderer()
+    words = "gradients or tiles or together"
+    command = ["compute-sanitizer", "--tool", "memcheck", "--error-exitcode", "1"]
+    yield list(run(*command, sys.executable, "-m", "pytest", TESTS, "-q", "-k", words))[-1]
+
+
+def counted_waits(call: Callable[[], object]) -> list[str]:
+    """The places in which a call makes the host wait for the GPU, after one call that warms up."""
+    call()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            call()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    found = [each for each in caught if "synchroniz" in str(each.message)]
+    return [f"{Path(each.filename).name}:{each.lineno}" for each in found]
+
+
+def waits(options: argparse.Namespace) -> Iterator[str]:
+    """the host waits once between photo and scene: for the scene"""
+    base, photo = sharp(options)
+    places = counted_waits(lambda: base.predict(photo))
+    yield f"{len(places)} waits: {', '.join(places)}"
+
+
+def precisions(options: argparse.Namespace) -> Iterator[str]:
+    """bf16 is several times as fast as fp32; a captured graph says the same as the network, and sooner"""
+    tasks: dict[str, Task] = {}
+    found: dict[str, torch.Tensor] = {}
+    ways: list[tuple[str, Precision, bool]] = [
+        ("fp32", "fp32", False), ("bf16", "bf16", False), ("bf16, captured", "bf16", True)
+    ]  # fmt: skip
+    for name, precision, compiled in ways:
+        base, photo = sharp(options, precision, compiled=compiled)
+        found[name] = to_metric(base.look(photo), photo).means.cpu()
+        if base.compile_problem:
+            yield f"{name}: not compiled: {base.compile_problem}"
+            continue
+        tasks[name] = lambda _, base=base, photo=photo: base.predict(photo)  # type: ignore[misc]
+    for name, means in found.items():
+        apart = (means - found["fp32"]).norm(dim=-1) / found["fp32"].norm(dim=-1)
+        yield f"{name}: centres {float(apart.median()):.1e} (relative median) from fp32's"
+    yield from rows(tasks, 5)
+
+
+def speed(options: argparse.Namespace) -> Iterator[str]:
+    """a view of 1.2 M Gaussians at 1536² takes 3 ms at most"""
+    gpu, (scene, cameras) = renderer(), views()
+    there, eyes = scene.to(CUDA), itertools.cycle(cameras)
+    few = Gaussians(*(t[:30_000].contiguous() for t in there.tensors))
+    tiles = torch.zeros(SIDE // TILE, SIDE // TILE, dtype=torch.bool, device=CUDA)
+    tiles[:24, :24] = True
+
+    def again(_: object) -> None:  # what completion does: the scene's projection is remembered
+        view: Rendering = gpu.render(there, cameras[0])
+        gpu.render([there, few], cameras[0], tiles=tiles, onto=view)
+
+    yield from rows(
+        {
+            "view: scene on the GPU, another camera each turn": lambda _: gpu.render(there, next(eyes)),
+            "view, and some of its tiles once more with 30,000 Gaussians": again,
+            "8 views in one batch": lambda _: gpu.render_batch([[there]] * 8, cameras * 4),
+            "view: the scene comes from the processor, the picture goes back": lambda _: gpu.render(
+                Gaussians(*(t.clone() for t in scene.tensors)), cameras[0]
+            ),
+        }
+    )
+    yield f"\n{torch.cuda.max_memory_allocated() / 2**30:.1f} GiB of the GPU's memory at most"
+
+
+def training(options: argparse.Namespace) -> Iterator[str]:
+    """a step, loss and gradients, takes a twentieth of the processor's, and waits once"""
+    gpu = renderer()
+    scene, camera = holed_scene(768)
+    view = find_view(scene, camera, gpu)[1]
+    whole = Sample.of(scene, CpuRenderer().render(scene, view), view, camera, torch.rand(view.height, view.width, 3))
+    cells = whole.cues.mask[:-CROP, :-CROP].nonzero()
+    picked = cells[torch.linspace(0, len(cells) - 1, BATCH).long()].tolist()
+    crops = [whole.crop(max(row - CROP // 2, 0), max(column - CROP // 2, 0), CROP, CROP) for row, column in picked]
+
+    def task(device: torch.device, drawer: GsplatRenderer | CpuRenderer) -> Callable[[], object]:
+        network = ResidualNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+        def step() -> None:
+            done = complete_samples(network, crops, drawer)
+            tensors = {name: tensor.to(device, non_blocking=True) for name, tensor in vars(done).items()}
+            total_loss(**tensors)[0].backward()  # type: ignore[no-untyped-call]
+
+        return step
+
+    here = task(CUDA, gpu)
+    places = counted_waits(here)
+    yield f"{len(places)} waits: {', '.join(places)}"
+    there = task(torch.device("cpu"), CpuRenderer())
+    yield from rows({f"GPU: {BATCH} crops of {2 * CROP}²": lambda _: here(), "processor": lambda _: there()}, 5)
+
+
+def suite(options: argparse.Namespace) -> Iterator[str]:
+    """completion adds 3 ms at most to a view, 60 frames are drawn within a second"""
+    renderer()
+    with tempfile.TemporaryDirectory() as folder:
+        weights = [] if options.checkpoint is None else ["-c", str(options.checkpoint)]
+        asked = ["--device", "cuda", "--only", "limits,completion,photo,video" + (",sharp" if weights else "")]
+        list(run(sys.executable, "-m", "spackle", "bench", "--suite", *asked, *weights, "-o", folder))
+        yield from (Path(folder) / "suite.md").read_text(encoding="utf-8").splitlines()[2:]
+
+
+STEPS = (machine, build, empty, parity, against_cpu, sanitizer, waits, precisions, training, speed, suite)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the steps; 0 unless one failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("gpu.md"))
+    parser.add_argument("-c", "--checkpoint", type=Path)
+    parser.add_argument("--only", default=",".join(step.__name__ for step in STEPS))
+    parser.add_argument("--step", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    steps = {step.__name__: step for step in STEPS}
+    if options.step:
+        try:
+            for line in steps[options.step](options):
+                print(line, flush=True)
+        except Skip as reason:
+            print(f"skipped: {reason}")
+            return SKIPPED
+        return 0
+    chosen = options.only.split(",")
+    if unknown := set(chosen) - set(steps):
+        parser.error(f"--only {', '.join(sorted(unknown))}: the steps are {', '.join(steps)}")
+    facts = {**hardware(CUDA if torch.cuda.is_available() else torch.device("cpu")), **versions()}
+    lines = ["## A GPU", "", f"{', '.join(f'{key} {value}' for key, value in facts.items())}; commit {commit()}."]
+    failed = 0
+    for name in chosen:
+        start, command = time.perf_counter(), [sys.executable, __file__, *arguments, "--step", name]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
+            code, said, log = done.returncode, done.stdout.strip(), done.stderr
+        except subprocess.TimeoutExpired:
+            code, said, log = 1, "", f"not done after {LIMIT_S} s"
+        seconds = time.perf_counter() - start
+        state = {0: "done", SKIPPED: "skipped"}.get(code, f"FAILED (exit status {code})")
+        print(f"{name}: {state}, {seconds:.0f} s", file=sys.stderr)
+        failed += code not in (0, SKIPPED)
+        lines += ["", f"**{name}** must show: {steps[name].__doc__}. {state}, {seconds:.0f} s.", "", said]
+        if code not in (0, SKIPPED):
+            lines += ["", "```", log[-2000:].strip(), "```"]
+        write_whole(options.output, ("\n".join(lines).strip() + "\n").encode())
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
