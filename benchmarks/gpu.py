@@ -2,8 +2,8 @@
 
 python benchmarks/gpu.py [-o gpu.md] [-c SHARP.pt] [--only STEP,...]
 
-Each step runs in a process of its own, for a fault in a kernel ends the process, and says what it must show. A step that
-cannot run here is skipped with its reason: without a GPU all are, which is the dry run. The file is written anew
+Each step runs in a process of its own, for a fault in a kernel ends the process, and says what it must show. A step
+that cannot run here is skipped with its reason: without a GPU all are, which is the dry run. The file is written anew
 after each step and is meant for docs/performance.md. `spackle weights make sharp.pt` makes weights for -c.
 """
 

@@ -350,5 +350,5 @@ def test_each_step_of_the_gpus_first_minutes_says_why_it_is_skipped_without_one(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setenv("PATH", "")
     for step in steps.STEPS:
-        with pytest.raises(steps.Skip, match="GPU|gsplat|path"):
+        with pytest.raises(steps.Skip, match=r"GPU|gsplat|path"):
             list(step(argparse.Namespace(checkpoint=None)))
