@@ -6,7 +6,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --quiet --constraint const
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
-.PHONY: demo test test-slow lint types check bench viewer clean clean-cache
+.PHONY: demo test test-wheel test-slow wheel lint types check bench viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -24,6 +24,14 @@ demo: $(VENV)/.demo
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# In an environment that is empty but for the wheel: pip fetches what it asks for.
+test-wheel: $(VENV)/.installed
+	SPACKLE_EMPTY=1 $(BIN)/python -m pytest tests/test_quick_start.py
+
+wheel: $(VENV)/.demo
+	rm -rf dist
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow tests research/lite/tests
@@ -50,4 +58,4 @@ clean-cache:
 	find src -name '*.nb[ci]' -delete
 
 clean:
-	rm -rf $(VENV) .numba_cache demo-output build
+	rm -rf $(VENV) .numba_cache demo-output build dist

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import subprocess
 import sys
 from pathlib import Path
@@ -81,6 +82,39 @@ def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "wide.png", 3072, 12)
     made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(3072, 12)), kind="swipe", network=None)
     assert (made.camera.width, made.camera.height) == (1536, 6)  # the working size of a large photo
+
+
+def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Path) -> None:
+    counts = f"{len(scene.base):,} base + {len(scene.aux):,} aux Gaussians, {WIDTH}×{HEIGHT}"
+    assert repr(scene) == f"Scene({counts}, cpu)"
+    assert repr(scene.base) == f"Gaussians({len(scene.base):,}, cpu)"
+    assert repr(scene.camera).startswith(f"Camera({WIDTH}×{HEIGHT}, focal length ")
+    for name in ("scene.ply", "scene.spz", "scene.html"):
+        scene.export(tmp_path / name)
+    loaded = spackle.Scene.load(tmp_path / "scene.ply")
+    assert repr(loaded) == repr(scene)
+    assert (loaded.disparity, torch.equal(loaded.base.means, scene.base.means)) == (scene.disparity, True)
+    assert scene.disparity is not None
+    wide = spackle.Scene.load(tmp_path / "scene.ply", fov=90)
+    assert wide.camera.focal[0] == pytest.approx(WIDTH / 2)
+    frame = scene.show(300)._repr_html_()
+    page = html.unescape(frame.partition('srcdoc="')[2].rpartition('"')[0])
+    assert page == (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert len(repr(scene.show())) < 80
+    with pytest.raises(spackle.InputError, match=r"scene\.obj"):
+        scene.export(tmp_path / "scene.obj")
+
+
+def test_predict_takes_a_lens_and_tells_how_far_it_is(
+    pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo, depth = pair
+    made = spackle.predict(photo, depth, fov=90, disparity=0.1, network=None, progress=True)
+    assert made.camera.focal[0] == pytest.approx(WIDTH / 2)
+    assert "complete" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="load_photo"):
+        spackle.predict(spackle.load_photo(photo), depth, fov=90)
+    assert {"predict", "Scene", "__version__"} <= set(dir(spackle))
 
 
 def test_complete_visits_what_it_is_given(scene: spackle.Scene, tmp_path: Path) -> None:

@@ -32,11 +32,11 @@ ALLOWED: dict[str, set[str]] = {
     "bases": {"values", "downloads", "shared"},
     "inpaint": {"values", "downloads"},
     "residual": {"values", "render", "inpaint"},
-    "scene": BELOW_SCENE,
+    "viewer": {"values", "formats"},
+    "scene": {*BELOW_SCENE, "viewer"},
     "dataset": BELOW_DATASET,
     "training": {*BELOW_DATASET, "dataset"},
     "evaluation": {*BELOW_DATASET, "dataset", "training"},
-    "viewer": {"values", "formats", "scene"},
     "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer"},
     "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app"},
 }

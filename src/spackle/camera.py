@@ -26,6 +26,10 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera size {self.width}×{self.height} is empty")
 
+    def __repr__(self) -> str:
+        eye = ", ".join(f"{x:.3g}" for x in self.position.tolist())
+        return f"Camera({self.width}×{self.height}, focal length {self.focal[0]:.4g} px, at ({eye}))"
+
     @staticmethod
     def from_focal(focal_px: float, width: int, height: int) -> Camera:
         """The photo's own camera: at the world's origin, principal point in the middle."""

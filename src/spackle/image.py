@@ -47,6 +47,10 @@ class Photo:
     path: Path
     frame: PhotoFrame | None = None  # that the file has around `rgb`, in the file's pixels
 
+    def __repr__(self) -> str:
+        lens = f"focal length {self.focal_px:.4g} px ({self.focal_source})"
+        return f"Photo({self.path.name!r}, {self.width}×{self.height}, {lens})"
+
     @property
     def height(self) -> int:
         return int(self.rgb.shape[0])

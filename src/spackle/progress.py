@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
@@ -33,6 +34,21 @@ def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
         yield
     finally:
         seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@contextlib.contextmanager
+def progress_line(name: str, shown: bool = True) -> Iterator[Step]:
+    """Yields a function of (done, of how many) that draws a bar on one line, in terminals and notebooks alike."""
+    start = time.monotonic()
+
+    def draw(done: int, total: int) -> None:
+        if shown:
+            bar = "█" * (20 * done // total) if total else ""
+            print(f"\r{name:<10}{bar:<20} {done}/{total} {time.monotonic() - start:.0f} s", end="", file=sys.stderr)
+
+    yield draw
+    if shown:
+        print(file=sys.stderr)
 
 
 class Reporter:

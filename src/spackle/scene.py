@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import html
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,18 +22,22 @@ from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajec
 from spackle.device import Precision
 from spackle.downloads import installed
 from spackle.errors import InputError
-from spackle.formats import save_ply, save_video
+from spackle.formats import save_ply, save_video, write_whole
+from spackle.formats.scene_files import SceneFile, Writer, at_origin, writer_of
 from spackle.formats.video import check_video
 from spackle.gaussians import Gaussians
-from spackle.image import Photo, load_photo
+from spackle.image import Photo, focal_length, load_photo
 from spackle.inpaint import InpainterOptions, get_inpainter
+from spackle.progress import progress_line
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import SHIPPED, load_residual, shipped_network
 from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
+from spackle.viewer import PageScene, page_scene, single_html
 
 PATH_FRAMES = 60
+DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
 LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
 Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # of the texture in holes
@@ -76,6 +81,38 @@ class Scene:
     aux: Gaussians  # what completion added
     camera: Camera  # the photo's
     by_view: tuple[Gaussians, ...] | None = None  # in view mode: the aux Gaussians of each completed view
+    disparity: float | None = None  # how far it was completed, where that is known
+
+    def __repr__(self) -> str:
+        size = f"{self.camera.width}×{self.camera.height}"
+        return f"Scene({len(self.base):,} base + {len(self.aux):,} aux Gaussians, {size}, {self.base.means.device})"
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None) -> Scene:
+        """Read a PLY of ours, of INRIA's or of SHARP's; InputError for another file.
+
+        Args:
+            path: the file.
+            focal_px, fov: the lens; by default what is stored, else 30 mm.
+        """
+        return Scene.of_file(SceneFile.load(Path(path)), focal_px, fov)
+
+    @staticmethod
+    def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:
+        """What a file holds, in the frame of its camera; see `load`."""
+        gaussians, camera = file.gaussians, file.camera
+        if camera is None or focal_px is not None or fov is not None:
+            width, height = (camera.width, camera.height) if camera else DEFAULT_SIZE
+            focal, _ = focal_length(file.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=fov)
+            given = Camera.from_focal(focal, width, height)
+            pose = given.world_to_camera if camera is None else camera.world_to_camera
+            camera = dataclasses.replace(given, world_to_camera=pose)
+        if not at_origin(camera):
+            gaussians = gaussians.transform(camera.world_to_camera)
+            camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
+        count = len(gaussians) if file.base_count is None else file.base_count
+        base, aux = gaussians.select(slice(0, count)), gaussians.select(slice(count, None))
+        return Scene(base, aux, camera, disparity=file.disparity)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -116,9 +153,29 @@ class Scene:
 
         Args:
             path: the file.
-            disparity: how far the scene was completed, where that is known: so far `spackle view` goes.
+            disparity: how far the scene was completed, by default as `Scene.disparity` has it: so far `spackle view`
+                goes.
         """
-        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base), disparity=disparity)
+        reach = self.disparity if disparity is None else disparity
+        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base), disparity=reach)
+
+    def page(self, name: str) -> PageScene:
+        """The scene for the page of `spackle view`, under a name."""
+        return page_scene(name, self.base, self.aux, self.camera, self.disparity)
+
+    def export(self, path: str | os.PathLike[str]) -> None:
+        """Write a file for other viewers: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html, a page of its own.
+
+        InputError for another name, and for a scene too large for a format.
+        """
+        target = Path(path)
+        page: Writer = lambda file, place: write_whole(place, single_html(self.page(place.stem)))  # noqa: E731
+        file = SceneFile(target, self.gaussians, self.camera, len(self.base), self.disparity)
+        writer_of(target, {".html": page})(file, target)
+
+    def show(self, height: int = 480) -> InlinePage:
+        """The page with the scene in it, `height` pixels high: the last value of a notebook's cell is shown."""
+        return InlinePage(single_html(self.page("scene")).decode(), height)
 
     def save_video(
         self,
@@ -135,6 +192,21 @@ class Scene:
         save_video((view.rgb for view in self.frames(cameras)), path, fps, loop)
 
 
+@dataclasses.dataclass(frozen=True)
+class InlinePage:
+    """A page inside of a notebook."""
+
+    html: str
+    height: int  # pixels
+
+    def __repr__(self) -> str:
+        return f"InlinePage({len(self.html) / 1e6:.1f} MB, shown by a notebook)"
+
+    def _repr_html_(self) -> str:
+        style = f"width: 100%; height: {self.height}px; border: 0"
+        return f'<iframe style="{style}" allowfullscreen srcdoc="{html.escape(self.html)}"></iframe>'
+
+
 def predict(
     photo: str | os.PathLike[str] | Photo,
     depth: str | os.PathLike[str] | DepthMap | None = None,
@@ -146,6 +218,10 @@ def predict(
     fill: Fill = "auto",
     renderer: Renderer | None = None,
     keep_frame: bool = False,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
+    progress: bool = False,
 ) -> Scene:
     """A photo to a scene without holes along a camera path.
 
@@ -162,24 +238,35 @@ def predict(
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
         keep_frame: otherwise a uniform frame around a file's picture is cut off, and the logger is told.
+        focal_px, focal_mm, fov: the lens of a photo's file, see `load_photo`; by default the file's own.
+        progress: show how far it is, on one line of the standard error.
 
     Raises:
         InputError: a photo or a depth map that cannot be used, or a base's name in place of a base.
-        ValueError: depth and base both given.
+        ValueError: depth and base both given, or a lens for a photo that is loaded.
     """
     if depth is not None and base is not None:
         raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
     if isinstance(base, str):
         raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
-    loaded = photo if isinstance(photo, Photo) else load_photo(photo, keep_frame=keep_frame)
+    if isinstance(photo, Photo):
+        if (focal_px, focal_mm, fov) != (None, None, None):
+            raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
+        loaded = photo
+    else:
+        loaded = load_photo(photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame)
     if loaded.frame is not None:
         LOG.info("%s: %s", loaded.path.name, loaded.frame.note)
     source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
-    prediction, choice = (open_base(BaseSettings(depth=source)) if base is None else open_loaded(base)).predict(loaded)
+    opened = open_base(BaseSettings(depth=source)) if base is None else open_loaded(base)
+    with progress_line("base", progress) as step:
+        prediction, choice = opened.load(loaded).predict(step)
     if choice.note:
         LOG.info("%s: %s", loaded.path.name, choice.note)
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
-    return complete(prediction, cameras, network=network, fill=fill, renderer=renderer)
+    with progress_line("complete", progress) as step:
+        made = complete(prediction, cameras, network=network, fill=fill, renderer=renderer, progress=step)
+    return dataclasses.replace(made, disparity=disparity)
 
 
 def resolved(fill: Fill) -> Fill:

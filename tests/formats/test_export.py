@@ -28,14 +28,14 @@ from plain_scenes import (
 from rich.console import Console
 from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
-from spackle.app.export import WRITERS, export_scene
+from spackle.app.export import PAGE, export_scene
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_ply
 from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
 from spackle.formats.gltf import encode_glb
-from spackle.formats.scene_files import SceneFile, encode_splat
+from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, encode_splat
 from spackle.formats.sog import codebook, encode_sog
 from spackle.formats.spz import LIMIT, encode_spz, spz_grid
 from spackle.gaussians import Gaussians, quat_to_matrix
@@ -270,7 +270,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
-    outputs = [tmp_path / f"out{suffix}" for suffix in WRITERS] + [tmp_path / "A.SPLAT"]
+    outputs = [tmp_path / f"out{suffix}" for suffix in (*SCENE_WRITERS, *PAGE)] + [tmp_path / "A.SPLAT"]
     export_scene(scene, outputs, told()[0])
     base, copy = load_ply(scene), tmp_path / "out.ply"
     for a, b in zip(load_ply(copy).tensors, base.tensors, strict=True):
@@ -283,7 +283,7 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     assert gltf["nodes"][0]["extras"] == {"spackle_base": 1000}
     assert (tmp_path / "A.SPLAT").stat().st_size == 32 * len(base)
     assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *(output.name for output in outputs)}
-    WRITERS[".ply"](SceneFile(scene, base, moved(), None), copy)  # a camera elsewhere is no comment
+    SCENE_WRITERS[".ply"](SceneFile(scene, base, moved(), None), copy)  # a camera elsewhere is no comment
     assert load_ply_camera(copy) is None
 
 

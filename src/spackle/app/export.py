@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from rich.filesize import decimal
 
-from spackle.app.render import DEFAULT_SIZE
-from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.formats import check_writable, write_whole
 from spackle.formats.ply import read_header
-from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, at_origin
+from spackle.formats.scene_files import SceneFile, Writer, writer_of
 from spackle.formats.spz import LARGEST, spz_grid
-from spackle.image import focal_length
 from spackle.output_folder import results_folder
 from spackle.progress import Reporter
-from spackle.viewer import PageScene, page_scene, single_html
+from spackle.scene import Scene
+from spackle.viewer import PageScene, single_html
 
-WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
-    **SCENE_WRITERS,
-    ".html": lambda scene, path: write_whole(path, single_html(page_of(scene))),
-}
+PAGE: dict[str, Writer] = {".html": lambda scene, path: write_whole(path, single_html(page_of(scene)))}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -35,16 +28,14 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
-    writers = [writer_of(output) for output in outputs]
+    writers = [writer_of(output, PAGE) for output in outputs]
     with contextlib.ExitStack() as folders:
         for output in outputs:
             folders.enter_context(results_folder(output.parent, [output.name]))
         _export(scene, outputs, writers, reporter)
 
 
-def _export(
-    scene: Path, outputs: Sequence[Path], writers: Sequence[Callable[[SceneFile, Path], None]], reporter: Reporter
-) -> None:
+def _export(scene: Path, outputs: Sequence[Path], writers: Sequence[Writer], reporter: Reporter) -> None:
     targets = [check_writable(output) for output in outputs]
     twice = [output for output, target in zip(outputs, targets, strict=True) if targets.count(target) > 1]
     if twice:
@@ -68,14 +59,6 @@ def _export(
         _say(reporter, loaded, output, size, time.perf_counter() - start)
 
 
-def writer_of(output: Path) -> Callable[[SceneFile, Path], None]:
-    """What writes a file of this name; InputError for a name that ends in none of the formats."""
-    for suffix, writer in WRITERS.items():
-        if output.name.lower().endswith(suffix):
-            return writer
-    raise InputError(f"{output}: which format? Give a name that ends in {', '.join(WRITERS)}")
-
-
 def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, seconds: float) -> None:
     """One line about a file, and one about what its format could not hold."""
     size = os.path.getsize(output)
@@ -93,32 +76,16 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
 
 def page_of(scene: SceneFile, focal_px: float | None = None, fov: float | None = None) -> PageScene:
     """A loaded scene for the page, with a usual lens along z if none is stored; InputError if it cannot be seen."""
-    path, gaussians, camera = scene.path, scene.gaussians, _lens(scene, focal_px, fov)
-    if not at_origin(camera):
-        gaussians = gaussians.transform(camera.world_to_camera)  # the page's eye starts at the origin
-        camera = dataclasses.replace(camera, world_to_camera=torch.eye(4))
-    count = len(gaussians) if scene.base_count is None else scene.base_count
-    base, aux = gaussians.select(slice(0, count)), gaussians.select(slice(count, None))
+    name = name_of(scene.path)
     try:
-        return page_scene(name_of(path), base, aux, camera, scene.disparity)
+        return Scene.of_file(scene, focal_px, fov).page(name)
     except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{name_of(path)}: ')}") from error
+        raise InputError(f"{scene.path}: {str(error).removeprefix(f'{name}: ')}") from error
     except ValueError as error:
-        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
+        raise InputError(f"{scene.path}: cannot be looked at: {error}: give the lens with --fov") from error
 
 
 def name_of(path: Path) -> str:
     """What people call a scene: the folder's name where every scene has the same one."""
     path = path.absolute()
     return path.parent.name if path.name in ("scene.ply", "base.ply") and path.parent.name else path.stem
-
-
-def _lens(scene: SceneFile, focal_px: float | None, fov: float | None) -> Camera:
-    """The stored camera; a lens that a person gives beats it, and without either it is as `spackle render` has it."""
-    stored = scene.camera
-    if stored is not None and focal_px is None and fov is None:
-        return stored
-    width, height = (stored.width, stored.height) if stored else DEFAULT_SIZE
-    focal, _ = focal_length(scene.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=fov)
-    camera = Camera.from_focal(focal, width, height)
-    return camera if stored is None else dataclasses.replace(camera, world_to_camera=stored.world_to_camera)

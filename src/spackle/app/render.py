@@ -24,8 +24,8 @@ from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
+from spackle.scene import DEFAULT_SIZE
 
-DEFAULT_SIZE = (1280, 720)
 TOLERATED = 0.01  # holes of a frame that nobody need be told of
 
 

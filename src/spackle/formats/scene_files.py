@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from spackle.camera import Camera
+from spackle.errors import InputError
 from spackle.formats.atomic import write_whole
 from spackle.formats.columns import Columns
 from spackle.formats.compressed_ply import encode_compressed_ply
@@ -73,8 +74,9 @@ def encode_splat(gaussians: Gaussians) -> bytes:
     return rows.tobytes()
 
 
+Writer = Callable[[SceneFile, Path], None]
 # Each writes a whole file or none. A new format is one file and one line here; the first end that fits a name counts.
-SCENE_WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
+SCENE_WRITERS: dict[str, Writer] = {
     ".compressed.ply": lambda scene, path: write_whole(
         path, encode_compressed_ply(scene.gaussians, scene.untilted_camera, scene.base_count)
     ),
@@ -90,3 +92,12 @@ SCENE_WRITERS: dict[str, Callable[[SceneFile, Path], None]] = {
     ".sog": lambda scene, path: write_whole(path, encode_sog(scene.gaussians)),
     ".glb": lambda scene, path: write_whole(path, encode_glb(scene.gaussians, scene.camera, scene.base_count)),
 }
+
+
+def writer_of(path: Path, more: Mapping[str, Writer] | None = None) -> Writer:
+    """What writes a file of this name, of SCENE_WRITERS and `more`; InputError for a name of no format."""
+    writers = {**SCENE_WRITERS, **(more or {})}
+    for suffix, writer in writers.items():
+        if path.name.lower().endswith(suffix):
+            return writer
+    raise InputError(f"{path}: which format? Give a name that ends in {', '.join(writers)}")

@@ -21,6 +21,10 @@ class Rendering:
     depth: Tensor  # [H, W] expected z, normalised by alpha; 0 where alpha is 0
     alpha: Tensor  # [H, W] accumulated opacity in 0..1
 
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Rendering({width}×{height}, {self.alpha.device})"
+
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
         """The three images in field order."""

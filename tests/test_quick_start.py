@@ -1,0 +1,105 @@
+"""The quick start, word for word, by the wheel alone: outside of the checkout, in an environment that is otherwise empty."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+import urllib.request
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photos import picture
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
+SHORTER = {"train": ["optim.steps=10", "data.views=4", "data.validation_views=1", "data.cells=16"]}
+SHORTER |= {"predict": ["--frames", "4"], "render": ["--frames", "4"]}
+ALONE = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "NUMBA"))}
+
+
+def commands() -> list[list[str]]:
+    blocks = re.findall(r"^```bash\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    return [
+        shlex.split(line, comments=True)[1:] for line in "".join(blocks).splitlines() if line.startswith("spackle ")
+    ]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment's programs. SPACKLE_EMPTY=1 lets pip fetch what the wheel asks for; else it is borrowed."""
+    folder = tmp_path_factory.mktemp("wheel")
+    shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".*", "node_modules", "tests", "docs"))
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    empty = os.environ.get("SPACKLE_EMPTY") == "1"
+    build = [*pip, "wheel", "--no-deps", *([] if empty else ["--no-build-isolation"]), "-w", folder, folder / "source"]
+    if not empty:
+        pytest.importorskip("setuptools", "77", reason="builds the wheel")
+    subprocess.run(build, check=True, timeout=300, env=ALONE)
+    (wheel,) = folder.glob("*.whl")
+    venv.create(folder / "venv")
+    python = folder / "venv" / "bin" / "python"
+    wanted = (
+        ["--constraint", ROOT / "constraints.txt", f"{wheel}[train]"] if empty else ["--no-deps", "--no-index", wheel]
+    )
+    subprocess.run([*pip, "--python", python, "install", *wanted], check=True, timeout=1800, env=ALONE)
+    if not empty:
+        (own,) = (folder / "venv" / "lib").glob("python*/site-packages")
+        (own / "borrowed.pth").write_text(sysconfig.get_path("purelib"))
+    return python.parent
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("place")
+    (folder / "photos").mkdir()
+    image = Image.fromarray(picture()).resize((160, 120))
+    image.save(folder / "photo.jpg")
+    for name in ("a", "b", "c"):
+        noise = np.random.default_rng(ord(name)).normal(0, 8, (120, 160, 3))
+        Image.fromarray((np.asarray(image) + noise).clip(0, 255).astype(np.uint8)).save(
+            folder / "photos" / f"{name}.png"
+        )
+    return folder
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_each_command_of_the_quick_start_works(environment: Path, place: Path, words: list[str]) -> None:
+    command = [environment / "spackle", *words, *SHORTER.get(words[0], [])]
+    if words[0] == "view":
+        return view([*command, "--no-open"], place)
+    done = subprocess.run(command, cwd=place, env=ALONE, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    for file in re.findall(r"-o (\S+)", " ".join(words)):
+        assert (place / file).exists()
+
+
+def view(command: list[object], place: Path) -> None:
+    server = subprocess.Popen(list(map(str, command)), cwd=place, env=ALONE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr is not None
+        deadline, found = time.monotonic() + 120, None
+        while found is None and time.monotonic() < deadline:
+            found = re.search(r"http://\S+", server.stderr.readline())
+        assert found
+        with urllib.request.urlopen(found[0], timeout=60) as answer:
+            assert b"<canvas" in answer.read()
+    finally:
+        server.terminate()
+        server.communicate(timeout=60)
+
+
+def test_the_python_of_the_quick_start_works_by_the_wheel(environment: Path, place: Path) -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    code += "\nprint(spackle.__file__)"
+    out = subprocess.check_output([environment / "python", "-c", code], cwd=place, env=ALONE, text=True, timeout=600)
+    assert Path(out.strip()).is_relative_to(environment.parent)
+    assert (place / "video.mp4").is_file()
