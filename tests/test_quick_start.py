@@ -1,4 +1,4 @@
-"""The quick start, word for word, by the wheel alone: outside of the checkout, in an environment that is otherwise empty."""
+"""The quick start, word for word, by the wheel alone: in an empty environment, outside of the checkout."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_each_command_of_the_quick_start_works(environment: Path, place: Path, words: list[str]) -> None:
     command = [environment / "spackle", *words, *SHORTER.get(words[0], [])]
     if words[0] == "view":
-        return view([*command, "--no-open"], place)
+        view([*command, "--no-open"], place)
+        return
     done = subprocess.run(command, cwd=place, env=ALONE, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
     for file in re.findall(r"-o (\S+)", " ".join(words)):
