@@ -18,6 +18,12 @@ def reason_in_a_line(error: object) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
+def one_line(text: str) -> str:
+    """What may go to a terminal or a log: names and comments of strangers can hold escape codes and line breaks."""
+    line = " ".join(text.splitlines())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
 def check_name(option: str, name: str, known: Iterable[str]) -> None:
     """Raise InputError for an unknown name, and name the nearest known one."""
     names = list(known)

@@ -23,6 +23,8 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
+from spackle.errors import one_line
+
 Step = Callable[[int, int], None]  # (done, of how many)
 
 
@@ -69,7 +71,7 @@ class Reporter:
 
     def log(self, line: str) -> None:
         """One line for everybody."""
-        self.console.print(escape(" ".join(line.splitlines())), soft_wrap=True)  # names may hold line breaks
+        self.console.print(escape(one_line(line)), soft_wrap=True)
 
     def detail(self, line: str) -> None:
         """One line for those who asked for more."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +32,20 @@ from spackle.bases.open import BaseSettings, open_base
 from spackle.downloads import known_weights
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
+from spackle.output_folder import results_folder
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import shipped_network
 from spackle.residual.texture import EXEMPLAR
 from spackle.scene import ResidualChoice
+
+
+def hashes(folder: Path) -> dict[str, object]:
+    """What a report says of its files, once that is found true."""
+    files = report_of(folder)["files"]
+    for name, record in files.items():
+        data = (folder / name).read_bytes()
+        assert record == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    return dict(files)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -282,16 +294,51 @@ def test_a_folder_goes_on_where_a_killed_run_stopped(tmp_path: Path) -> None:
             assert redone() == {"a", "b", "c"}
 
 
-def test_no_old_report_vouches_for_new_files(
-    tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+def test_a_report_vouches_for_its_files_alone(tmp_path: Path) -> None:
+    photos, out, depth = tmp_path / "photos", tmp_path / "out", write_depth(tmp_path / "d.npy")
+    for name in "abc":
+        write_photo(photos / f"{name}.png")
+    predicted(photos, depth, out)
+    assert set(report_of(out / "a")["files"]) == FILES - {"report.json"}
+    whole = {name: hashes(out / name) for name in "abc"}
+    shutil.copytree(out, tmp_path / "copy")  # all files are newer than their reports, which then read them
+    assert sum("done already" in line for line in predicted(photos, depth, tmp_path / "copy").lines) == 3
+    os.truncate(out / "a" / "scene.ply", 1000)
+    data = bytearray((out / "b" / "scene.ply").read_bytes())
+    data[-1] ^= 1
+    (out / "b" / "scene.ply").write_bytes(data)
+    result = predicted(photos, depth, out)
+    assert [line for line in result.lines if "done already" in line] == [
+        "c.png: done already (--overwrite does it again)"
+    ]
+    assert {name: hashes(out / name) for name in "abc"} == whole
+
+
+@pytest.mark.parametrize("failing", ["save_views_video", "write_report"])
+def test_an_interrupted_run_leaves_the_old_set_whole(
+    tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
     def interrupted(*args: object) -> None:
         raise KeyboardInterrupt
 
     predicted(*pair, tmp_path)
-    monkeypatch.setattr("spackle.app.predict.save_views_video", interrupted)
+    before = hashes(tmp_path / "photo")
+    monkeypatch.setattr(f"spackle.app.predict.{failing}", interrupted)
     assert run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path, "--disparity", "0.5", *SHORT).code == 130
-    assert names_in(tmp_path / "photo") == FILES - {"report.json"}
+    assert hashes(tmp_path / "photo") == before
+    assert names_in(tmp_path / "photo") == FILES
+
+
+def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    out = tmp_path / "out"
+    with results_folder(out / "photo", alone=True):
+        refuses(run("predict", "-i", pair[0], "--depth", pair[1], "-o", out, *SHORT), out / "photo", "another run")
+        predicted(write_photo(tmp_path / "other.png"), pair[1], out)  # beside it is room
+    with results_folder(out, alone=True):
+        refuses(run("predict", "-i", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT), out, "another run")
+    assert names_in(out) == {"other"}
+    (out / ".lock").touch()  # of a killed run
+    predicted(pair[0].parent, pair[1], out)
 
 
 def expect_refusal(tmp_path: Path, *arguments: object, named: object) -> None:

@@ -11,10 +11,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from command import FILES, SHORT, decode, names_in, refuses, report_of, run
+from command import FILES, SHORT, decode, names_in, predicted, refuses, report_of, run
 from photos import (
     metres,
-    read_ply,
     write_depth,
     write_photo,
 )
@@ -73,21 +72,51 @@ def test_a_killed_run_leaves_whole_files_and_the_next_one_finishes(tmp_path: Pat
     process = subprocess.Popen([*COMMAND, *map(str, arguments), "--frames", "1500"], stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 240
-        while not list(folder.glob(".video.*.mp4")):
+        while not list(folder.glob(".new/.video.*.mp4")):
             assert process.poll() is None, "ended before it could be killed"
             assert time.monotonic() < deadline
             time.sleep(0.005)
     finally:
         process.kill()
         assert process.wait() == -signal.SIGKILL
-    assert names_in(folder) > {"base.ply", "scene.ply"}
-    assert not {"video.mp4", "report.json"} & names_in(folder)  # not finished, so not there
-    base, merged = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
-    assert merged.body[: len(base.body)] == base.body
+    assert names_in(folder) == {".lock", ".new"}  # nothing has taken its place before all is whole
     (folder / ".other.0123456789ab.ply").touch()  # somebody else's
     assert run(*arguments, *SHORT).code == 0
     assert names_in(folder) == {*FILES, ".other.0123456789ab.ply"}
     assert len(decode(folder / "video.mp4")) == 3
+
+
+def test_sigterm_leaves_no_folder_and_a_full_standard_output_is_one_line(
+    tmp_path: Path, pair: tuple[Path, Path]
+) -> None:
+    arguments = ["predict", *map(str, pair[:1]), "--depth", str(pair[1]), "--json", "-o", str(tmp_path / "out")]
+    process = subprocess.Popen([*COMMAND, *arguments, "--frames", "1500"], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 240
+    while not (tmp_path / "out" / "photo" / ".new").exists():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.terminate()
+    assert process.wait(timeout=120) == 128 + signal.SIGTERM
+    assert not (tmp_path / "out").exists()
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*COMMAND, *arguments, *SHORT], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1] == "error: cannot write to the standard output: No space left on device"
+
+
+def test_no_control_character_of_a_name_reaches_the_terminal(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    evil = tmp_path / "a\x1b]0;owned\x07\x9b2J\n\n\u202e\udcff.png"
+    for words in (("predict", evil), ("predict", evil, "--json"), ("export", evil)):
+        result = run(*words, "-o", tmp_path / "out.ply")
+        assert result.code == 2
+        assert result.err.count("\n") == 1
+        assert (result.out + result.err).replace("\n", "").isprintable()
+        assert r"a\x1b]0;owned\x07\x9b2J  \u202e\udcff.png" in result.err
+    evil.symlink_to(pair[0])
+    result = predicted(evil, pair[1], tmp_path / "out")
+    assert r"a\x1b]0;owned" in result.err
+    assert result.err.replace("\n", "").isprintable()
 
 
 def test_every_command_has_a_help() -> None:

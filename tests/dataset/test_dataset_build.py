@@ -300,7 +300,7 @@ def test_another_configuration_and_a_folder_in_which_a_build_is_at_work_are_refu
     refused(done, 'inpainter.name: "geometry" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
     assert content(copy) == before
     with hold(copy / ".lock"):
-        refused(build(place, copy), "another build is at work")
+        refused(build(place, copy), "another run is at work")
 
 
 def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -> None:

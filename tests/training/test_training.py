@@ -163,7 +163,7 @@ def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, whole: tupl
     with hold(out / ".lock"):
         done = train(place, out, "optim.steps=7")
     assert done.code == 2
-    assert "another training is at work" in done.err
+    assert "another run is at work" in done.err
     done = train(place, out, "optim.lr=2e-3")
     assert done.code == 2
     assert "another recipe (optim.lr differs)" in done.err

@@ -23,7 +23,7 @@ from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.opencv import OpenCV
-from spackle.output_folder import results_folder, write_report
+from spackle.output_folder import file_records, results_folder, whole_set, write_report
 from spackle.progress import Reporter, Step, timed
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
@@ -82,18 +82,17 @@ def predict_clip(
     InputError for a clip, a frame, a depth map or a folder that cannot be used.
     """
     seconds: dict[str, float] = {}
-    with results_folder(folder, FILES):
+    with results_folder(folder, FILES, alone=True), whole_set(folder, FILES[-1]) as new:
         with reporter.stage("read", seconds) as step:
             clip = read_clip(path, completer.path.frames, step)
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
             reporter.log(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
         run = _Run(clip, focal, completer, reporter)
-        (folder / "report.json").unlink(missing_ok=True)  # a report means that the video is complete
         with reporter.stage("frames", seconds) as step:
-            run.write(folder / "video.mp4", step)
-        report = run.report(seconds)
-        write_report(report, folder / "report.json")
+            run.write(new / FILES[0], step)
+        report = run.report(seconds) | {"files": file_records(new, [new / FILES[0]])}
+        write_report(report, new / FILES[-1])
     holes, figures = report["hole_area_ratio"], report["flicker"]
     calm = ""
     if figures["carried"] is not None:

@@ -38,7 +38,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
     InputError where scikit-image is missing, or `output` cannot be written to.
     """
     pair = load_motorcycle()
-    with results_folder(output, FILES):
+    with results_folder(output, FILES, alone=True):
         start = time.perf_counter()
         renderer = get_renderer()
         seconds: dict[str, float] = {}

@@ -29,9 +29,11 @@ from spackle.errors import InputError
 from spackle.formats import save_ply
 from spackle.formats.clip import is_clip
 from spackle.image import PHOTO_SUFFIXES, load_photo
-from spackle.output_folder import results_folder, write_report
+from spackle.output_folder import as_recorded, file_records, results_folder, whole_set, write_report
 from spackle.progress import Reporter
 from spackle.scene import Mode, ResidualChoice
+
+REPORT = "report.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +54,7 @@ class PredictOptions:
     @property
     def files(self) -> tuple[str, ...]:
         """What a photo's folder gets, besides views/: the video is the last."""
-        files = ("base.ply", "scene.ply", "report.json")
+        files = ("base.ply", "scene.ply", REPORT)
         return (*files, f"video{self.path.video.suffix}") if self.render else files
 
     @property
@@ -75,14 +77,13 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
             predict_clip(photos, output / found[0][1], completer, options.lens, reporter)
         return 0
     shared = shared_digest(options, completer.base)
-    wanted = [*options.files, *(f"views/{name}" for name in picture_files(len(completer.given_views or [])))]
     failed = 0
-    with results_folder(output):
+    with results_folder(output, alone=os.path.isdir(photos)):
         for path, name in found:
             try:
                 request = request_of(path, options.base.depth, shared)
-                whole = all((output / name / file).is_file() for file in wanted)
-                done = whole and _earlier(output / name).get("request") == request
+                earlier = _earlier(output / name)
+                done = earlier.get("request") == request and as_recorded(output / name, REPORT, earlier.get("files"))
                 if done and path != photos and not options.overwrite:
                     reporter.log(f"{path.name}: done already (--overwrite does it again)")
                     reporter.result({"folder": output / name, "done_already": True})
@@ -104,36 +105,38 @@ def predict_one(
 ) -> None:
     """One photo to `folder`: base.ply, scene.ply, a video, report.json, and views/ with --cameras.
 
-    Nothing is written before all is computed. InputError for a photo, a depth map or a folder that cannot be used.
+    The files take their places once all are whole. InputError for a photo, a depth map or a folder that cannot be used.
     """
     seconds: dict[str, float] = {}
     with reporter.stage("load", seconds):
         photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
     with contextlib.ExitStack() as folders:
-        folders.enter_context(results_folder(folder, options.files))
-        if completer.given_views:
-            pictures = picture_files(len(completer.given_views))
+        pictures = picture_files(len(completer.given_views or []))
+        folders.enter_context(results_folder(folder, options.files, alone=True))
+        if pictures:
             folders.enter_context(results_folder(folder / "views", pictures))
         done = completer.complete(photo, reporter, seconds)
         _warn_of_rougher(done, folder, options.base, reporter)
         scene, views, renderer = done.scene, done.views, completer.renderer
+        new = folders.enter_context(whole_set(folder, REPORT))
         with reporter.stage("write", seconds):
-            (folder / "report.json").unlink(missing_ok=True)  # a report means that the other files are complete
             reach = None if options.path.cameras or options.path.path else options.path.disparity
             for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
-                save_ply(part, folder / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)
+                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)
         video = None
         if options.render:
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video", seconds) as step:
-                save_views_video(folder / options.files[-1], views, scene, renderer, step)
-        if completer.given_views:
+                save_views_video(new / options.files[-1], views, scene, renderer, step)
+        if pictures:
+            (new / "views").mkdir()
             with reporter.stage("views", seconds) as step:
-                save_pictures(folder / "views", views, scene, renderer, step)
+                save_pictures(new / "views", views, scene, renderer, step)
         with reporter.stage("measure", seconds):
             holes = measure_holes(views, scene, renderer)
         report = make_report(done, completer, holes, video, request, seconds)
-        write_report(report, folder / "report.json")
+        report["files"] = file_records(new, sorted(file for file in new.rglob("*") if file.is_file()))
+        write_report(report, new / REPORT)
     before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))
     aux, weights, total = report["aux"], completer.residual.weights, report["seconds"]["total"]
     reporter.log(
@@ -259,7 +262,7 @@ def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, rep
 def _earlier(folder: Path) -> dict[str, Any]:
     """An earlier run's report; empty without a whole one."""
     try:
-        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return report if isinstance(report, dict) else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -13,7 +14,8 @@ from typer.exceptions import TyperException
 
 from spackle.cli import dataset, evaluate, predict, render, train, weights
 from spackle.cli.options import INTERRUPTED
-from spackle.errors import InputError
+from spackle.errors import InputError, one_line
+from spackle.signals import exit_on_sigterm
 
 EXAMPLES = (
     ("spackle predict photo.jpg -o out", "a scene, a video, a report"),
@@ -101,22 +103,30 @@ def main() -> None:
     # Read when torch is loaded. Its idle threads would otherwise spin: where other programs want the cores too,
     # that makes completion three to five times slower.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    exit_on_sigterm()
     try:
         code = app(standalone_mode=False)
+        sys.stdout.flush()
     except InputError as error:
         _fail(str(error))
     except TyperException as error:  # an unknown option, a number that is none
+        if type(error).__name__ == "NoArgsIsHelpError":  # the help, where nothing was asked for
+            print(error.format_message(), file=sys.stderr)
+            sys.exit(2)
         _fail(error.format_message())
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        with contextlib.suppress(OSError, ValueError):  # Python would try again as it ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _fail(f"cannot write to the standard output: {error.strerror or error}")
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)
 
 
 def _fail(message: str) -> NoReturn:
-    if "\n\n" in message:  # the help, where nothing was asked for
-        print(message, file=sys.stderr)
-        sys.exit(2)
-    line = " ".join(message.splitlines())
+    line = one_line(message)
     print(f"error: {line}", file=sys.stderr)
     if "--json" in sys.argv:
         print(json.dumps({"error": line}))

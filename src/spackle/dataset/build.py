@@ -14,7 +14,7 @@ from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.ray import at_work_on_ray, cluster
 from spackle.dataset.shards import NAME, Manifest, differences, load_manifest, shard_name, write_shard
 from spackle.errors import InputError
-from spackle.output_folder import alone_in, make_folder, remove_half_written, results_folder
+from spackle.output_folder import make_folder, remove_half_written, results_folder
 from spackle.progress import Reporter, timed
 from spackle.signals import asked_to_stop
 
@@ -34,7 +34,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     with cluster(options) as ray:
         photos = _photos(source, options, reporter)
         config = configuration(options, photos, completion)
-        with results_folder(output, (NAME,)), alone_in(output, "build"):
+        with results_folder(output, (NAME,), alone=True):
             manifest = _begin(output, config)
             return _Build(photos, output, options, reporter, manifest).run(ray)
 

@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import load_manifest, problems
-from spackle.errors import InputError
+from spackle.errors import InputError, one_line
 from spackle.formats import save_png, save_video
 from spackle.formats.png import thumbnail
 from spackle.output_folder import results_folder
@@ -32,7 +32,10 @@ def show_info(location: str, console: Console) -> None:
     manifest = load_manifest(location)
     samples = manifest.samples
     state = "complete" if manifest.complete else "not finished"
-    lines = [f"{location}: {state}", f"{len(samples)} photos, {manifest.views} views, {len(manifest.shards)} shards"]
+    lines = [
+        one_line(f"{location}: {state}"),
+        f"{len(samples)} photos, {manifest.views} views, {len(manifest.shards)} shards",
+    ]
     lines.append(f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo")
     if passed := sum(len(shard.passed_over) for shard in manifest.shards):
         lines.append(f"{passed} photos gave no sample: manifest.json says why")
@@ -67,7 +70,7 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
     files = DatasetFiles(location)
     if not len(files):
         raise InputError(f"{location}: holds no photos")
-    with results_folder(output, (SHEET, VIDEO)):
+    with results_folder(output, (SHEET, VIDEO), alone=True):
         chosen = [files.group(index) for index in _spread(len(files), photos)]
         save_png(_stack([_block(group, views) for group in chosen], 0), output / SHEET)
         # The path without the photo's own view, which comes before it.

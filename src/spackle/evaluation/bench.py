@@ -27,7 +27,7 @@ from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluatio
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.timing import MS, TOTAL, Lap, Task, complete_in_laps, measure
 from spackle.machine import hardware, load_average, versions
-from spackle.output_folder import alone_in, results_folder
+from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.residual import Completer, ResidualNet
 from spackle.signals import asked_to_stop
@@ -58,7 +58,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     config |= {"hardware": hardware(device), "versions": versions()}
     images: list[Record] = []
     warm = False  # whether this process has predicted something
-    with results_folder(output, (RESULTS, MARKDOWN, LATEX)), alone_in(output, "benchmark"):
+    with results_folder(output, (RESULTS, MARKDOWN, LATEX), alone=True):
         begin(output, config)
         with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
             for index, case in enumerate(tools.cases):

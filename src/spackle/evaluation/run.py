@@ -29,7 +29,7 @@ from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.tables import NOT_RUN, make_tables
 from spackle.formats import atomic_path, save_png
 from spackle.machine import hardware, versions
-from spackle.output_folder import alone_in, results_folder
+from spackle.output_folder import as_recorded, file_records, results_folder
 from spackle.progress import Reporter
 from spackle.residual import hole_mask
 from spackle.signals import asked_to_stop
@@ -49,7 +49,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
     evaluation = open_evaluation(options)
     _log_missing(evaluation, reporter)
     files = (results.RESULTS, results.TIMES, results.WORST, results.BEST, *TABLES, *([report.REPORT] if html else []))
-    with results_folder(output, files), alone_in(output, "evaluation"):
+    with results_folder(output, files, alone=True):
         begin(output, evaluation.config)
         records = _do_images(evaluation, output, reporter)
         if records is None:
@@ -99,8 +99,9 @@ def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list
 
 def _load(output: Path, index: int, case: Case, inputs: str) -> tuple[ImageResult, float] | None:
     """What an earlier run found of an image, and in how many seconds; None where it is to be done."""
-    part = load_part(image_file(output, index, case.name, ".json"), inputs)
-    if part is None or not image_file(output, index, case.name, ".png").is_file():
+    file = image_file(output, index, case.name, ".json")
+    part = load_part(file, inputs)
+    if part is None or not as_recorded(file.parent, file.name, part.get("files")):
         return None
     try:
         return ImageResult.of(part["record"]), float(part["seconds"])
@@ -117,11 +118,13 @@ def _do_image(
     for remark in record.remarks:
         reporter.log(f"{case.name}: {remark}")
     seconds = round(time.perf_counter() - start, 3)
+    files = {name: image_file(output, index, case.name, f".{name}.webp") for name in pictures}
     for name, picture in pictures.items():
-        report.save_picture(picture, image_file(output, index, case.name, f".{name}.webp"))
-    save_png(strip(pictures), image_file(output, index, case.name, ".png"))
-    found = {"record": dataclasses.asdict(record), "seconds": seconds}
-    save_part(image_file(output, index, case.name, ".json"), inputs, found)
+        report.save_picture(picture, files[name])
+    joined, part = (image_file(output, index, case.name, suffix) for suffix in (".png", ".json"))
+    save_png(strip(pictures), joined)
+    records = file_records(part.parent, [*files.values(), joined])
+    save_part(part, inputs, {"record": dataclasses.asdict(record), "seconds": seconds, "files": records})
     reporter.detail(f"  {case.name}: {seconds:.1f} s")
     return record, seconds
 
@@ -248,7 +251,7 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     runs = [source.run for source in sources]
     make_tables(runs)  # what does not go together is refused before anything is written
     files = (*TABLES, *([report.REPORT] if html else []))
-    with results_folder(output, files):
+    with results_folder(output, files, alone=True):
         _write_tables(runs, output)
         if html:
             write_text(report.make_report(sources, report.find_bench(folders)), output / report.REPORT)

@@ -25,7 +25,7 @@ from spackle.evaluation.suite_sections import SIDE, Section, holed_scene
 from spackle.evaluation.table import EMPTY, Line, Table, to_markdown
 from spackle.image import Photo
 from spackle.machine import commit, hardware, load_average, versions, without_nan
-from spackle.output_folder import alone_in, results_folder
+from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual.network import load_residual
@@ -94,7 +94,7 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
     config |= {"runs": options.runs, "side": options.side, "residual": weights}
     found: dict[str, Record] = {}
     not_run: dict[str, str] = {}
-    with results_folder(output, (RESULTS, MARKDOWN)), alone_in(output, "benchmark"):
+    with results_folder(output, (RESULTS, MARKDOWN), alone=True):
         begin(output, config, PARTS)
         with asked_to_stop(alone=True) as stop:
             for name in TITLES:

@@ -16,7 +16,7 @@ from torch import Tensor
 from spackle.device import pick_device
 from spackle.errors import InputError, reason_in_a_line
 from spackle.machine import hardware, versions, without_nan
-from spackle.output_folder import alone_in, results_folder, write_report
+from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 from spackle.training.checkpoint import (
@@ -101,8 +101,7 @@ def train(
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {ranks.count} processes")
         device = torch.device(kind, ranks.local) if kind == "cuda" else torch.device(kind)
         if ranks.first:  # which alone writes
-            stack.enter_context(results_folder(output, (NEWEST, PREVIOUS, BEST, LAST, RUN)))
-            stack.enter_context(alone_in(output, "training"))
+            stack.enter_context(results_folder(output, (NEWEST, PREVIOUS, BEST, LAST, RUN), alone=True))
         else:
             reporter = Reporter(console=Console(quiet=True))
         context = RunContext(recipe, output, reporter, ranks, device)
