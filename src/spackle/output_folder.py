@@ -117,7 +117,7 @@ def as_recorded(folder: Path, report: str, records: object) -> bool:
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:
-    """Delete what killed runs left of `files`; of any file if None, where nobody else is at work (see `results_folder`)."""
+    """Delete what killed runs left of `files`; of any file if None, where the caller is `alone`."""
     for folder in folders:
         for file in folder.iterdir():
             match = LEFTOVER.fullmatch(file.name)
