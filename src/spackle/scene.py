@@ -16,7 +16,7 @@ import torch
 
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import BaseSettings, open_base, open_loaded
-from spackle.bases.protocol import Base, BasePrediction
+from spackle.bases.protocol import USUAL_DISPARITY, Base, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajectory
 from spackle.device import Precision
@@ -119,15 +119,20 @@ class Scene:
         """Everything, the base first."""
         return Gaussians.cat([self.base, self.aux])
 
+    def _far(self, disparity: float | None) -> float:
+        """How far a path goes: as somebody says, else as the scene was completed, else as usual."""
+        own = USUAL_DISPARITY if self.disparity is None else self.disparity
+        return own if disparity is None else disparity
+
     def of_view(self, index: int) -> list[Gaussians]:
         """The sets that a completed view is drawn with."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
     def path(
-        self, kind: TrajectoryKind = "rotate-forward", disparity: float = 0.3, frames: int = PATH_FRAMES
+        self, kind: TrajectoryKind = "rotate-forward", disparity: float | None = None, frames: int = PATH_FRAMES
     ) -> list[Camera]:
         """Cameras of a video around the photo's eye, both sides of the picture even."""
-        return scene_path(self.base, self.camera, kind, disparity, frames)
+        return scene_path(self.base, self.camera, kind, self._far(disparity), frames)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
         """Cameras through keyframes, see `spackle.formats.load_path`; without a number as many as they take at `fps`.
@@ -181,14 +186,14 @@ class Scene:
         self,
         path: str | os.PathLike[str],
         kind: TrajectoryKind = "rotate-forward",
-        disparity: float = 0.3,
+        disparity: float | None = None,
         frames: int = PATH_FRAMES,
         fps: float = 30,
         loop: int | None = None,
     ) -> None:
         """Write a video of a camera path: .mp4, .webm, .gif or .webp; `loop` as in `spackle.formats.VideoWriter`."""
         plays = check_video(path, fps, loop).loop if loop is None else loop
-        cameras = scene_path(self.base, self.camera, kind, disparity, frames, looped=plays != 1)
+        cameras = scene_path(self.base, self.camera, kind, self._far(disparity), frames, looped=plays != 1)
         save_video((view.rgb for view in self.frames(cameras)), path, fps, loop)
 
 
@@ -213,7 +218,7 @@ def predict(
     *,
     base: Base | None = None,
     kind: TrajectoryKind = "rotate-forward",
-    disparity: float = 0.3,
+    disparity: float | None = None,
     network: ResidualNet | Shipped | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
@@ -233,7 +238,8 @@ def predict(
             downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
             what could not be used. A network is then loaded for this photo alone: for many, load a base once.
         kind: the path that the scene is completed for.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as the base has it: 0.15 for
+            lite, else 0.3.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
@@ -263,10 +269,11 @@ def predict(
         prediction, choice = opened.load(loaded).predict(step)
     if choice.note:
         LOG.info("%s: %s", loaded.path.name, choice.note)
-    cameras = scene_path(prediction.gaussians, prediction.camera, kind, disparity)
+    far = prediction.disparity if disparity is None else disparity
+    cameras = scene_path(prediction.gaussians, prediction.camera, kind, far)
     with progress_line("complete", progress) as step:
         made = complete(prediction, cameras, network=network, fill=fill, renderer=renderer, progress=step)
-    return dataclasses.replace(made, disparity=disparity)
+    return dataclasses.replace(made, disparity=far)
 
 
 def resolved(fill: Fill) -> Fill:

@@ -132,7 +132,7 @@ def test_carried_holes_are_calmer_and_no_worse_by_the_true_motion() -> None:
 
 @pytest.mark.parametrize("fill", [True, False])
 def test_another_shot_starts_anew_and_holes_stay_where_nothing_is_to_be_filled(fill: bool) -> None:
-    completer = ClipCompleter("rotate", 0.3, 20, CPU, OpenCV("this").flow, fill=fill)
+    completer = ClipCompleter("rotate", None, 20, CPU, OpenCV("this").flow, fill=fill)
     _, rgb, prediction = frame_of(0.0)
     noise = torch.rand(72, 96, 3, generator=torch.Generator().manual_seed(0))
     depth = torch.full((72, 96), 3.0)
@@ -141,5 +141,7 @@ def test_another_shot_starts_anew_and_holes_stay_where_nothing_is_to_be_filled(f
     assert [one.cut for one in drawn] == [False, True]
     assert torch.equal(drawn[1].view.rgb, drawn[1].alone.rgb)
     assert drawn[0].gaussians[0] is prediction.gaussians
+    said = ClipCompleter("rotate", prediction.disparity, 20, CPU, OpenCV("this").flow, fill=False)
+    assert torch.equal(said.add(rgb, prediction).camera.world_to_camera, drawn[0].camera.world_to_camera)
     assert bool(len(drawn[0].gaussians[1])) == fill
     assert fill or bool(hole_mask(drawn[0].view.alpha).any())

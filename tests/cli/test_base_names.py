@@ -15,12 +15,14 @@ from photos import write_depth, write_photo
 from safetensors.torch import load_file, save_file
 from stand_in import StandIn, predict, write_model
 
+import spackle
 from spackle.bases.hf import HfBase
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
 from spackle.errors import InputError
+from spackle.formats import load_ply_disparity
 from spackle.image import Photo
 
 NO_DEPTH, NO_MODEL = "no depth in the photo", "no Depth Anything here"
@@ -162,6 +164,32 @@ def test_a_folder_is_done_again_when_better_weights_come(
     assert [base(), base()] == ["sharp", "done already"]
     weights.unlink()
     assert [base(), base()] == ["lite", "done already"]
+
+
+def test_the_base_says_how_far_the_camera_goes_unless_a_person_does(tmp_path: Path) -> None:
+    photo = write_photo(tmp_path / "photo.png")
+    depth = ("--depth", write_depth(tmp_path / "d.npy"))
+    for options, far, who in (
+        ((), 0.15, "default of lite"),
+        (("--disparity", 0.25), 0.25, "--disparity"),
+        (depth, 0.3, "default of rgbd"),
+    ):
+        result = predict(tmp_path, "-i", photo, *options)
+        report = report_of(tmp_path / "out" / "photo")
+        assert (report["disparity"], report["disparity_source"]) == (far, who)
+        assert f"disparity {far:g} ({who})" in result.err
+        assert load_ply_disparity(tmp_path / "out" / "photo" / "scene.ply") == far
+        assert [row["view"] for row in report["hole_area_ratio"]] == [f"-{far:g}", f"+{far:g}"]
+    scene = spackle.predict(photo, network=None, fill="none")
+    assert (scene.disparity, scene.path()[20].position.tolist()) == (
+        0.15,
+        scene.path(disparity=0.15)[20].position.tolist(),
+    )
+    files = [tmp_path / f"{name}.mp4" for name in ("as it is", "said")]
+    assert predict(tmp_path, "-i", photo).code == 0
+    for file, options in zip(files, ((), ("--disparity", 0.15)), strict=True):
+        assert run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options).code == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_results_of_sharp_that_give_way_to_lite_are_named(

@@ -21,8 +21,11 @@ from portraits import apple_jpeg, codes
 from scenes import box_before_wall
 
 import spackle
+from spackle.app.view import Teller, ViewOptions, complete_for_page
+from spackle.bases.open import ROUGH, BaseSettings
 from spackle.formats import save_ply
-from spackle.image import film_to_pixels
+from spackle.image import film_to_pixels, load_photo
+from spackle.progress import Reporter
 
 # The command line in a process of its own; a photo takes for ever.
 DEAF = """
@@ -152,6 +155,13 @@ def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_w
     result = visit(lambda url: told.append(hear(url, "/jobs/1")), photo, "--base", "rgbd")
     assert told[-1][-1]["error"].startswith(f"{photo}: --base rgbd needs depth")
     assert (result.code, any(line.startswith("error: ") for line in result.lines)) == (130, True)
+
+
+def test_the_page_says_that_lite_is_rough_and_goes_no_farther_than_it_looks_right(tmp_path: Path) -> None:
+    photo = load_photo(write_pair(tmp_path)[0])
+    completer = ViewOptions(settings := BaseSettings("lite")).completer(settings)
+    description: Any = complete_for_page(photo, "p", completer, Teller(Reporter(), lambda event: None)).description
+    assert (description["note"], description["orbit"]["free"]) == (ROUGH, 0.15)
 
 
 @pytest.mark.parametrize(

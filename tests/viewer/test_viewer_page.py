@@ -331,7 +331,7 @@ def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path)
 
     def complete_photo(path: Path, name: str, tell: Callable[[dict[str, object]], None]) -> PageScene:
         tell({"stage": "complete", "done": 1, "total": 2})
-        return page_of_box(name)
+        return dataclasses.replace(made := page_of_box(name), description={**made.description, "note": "a; b"})
 
     with ViewerServer(page_files(), complete_photo) as server:
         server.show(page_of_box("First"))
@@ -341,6 +341,8 @@ def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path)
         found.page.locator("#file").set_input_files(photo)
         found.page.get_by_role("heading", name="my photo.png").wait_for()
         found.page.evaluate("spackle.settled()")
+        found.page.get_by_text("Gaussians · a").wait_for()
+        assert found.page.get_by_role("alert").text_content() == "a; b"
         assert found.said == []
         assert all(url.startswith((server.url, f"blob:{server.url}")) for url in found.asked)
         found.page.context.close()

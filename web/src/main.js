@@ -59,6 +59,7 @@ async function show({ description, layers }) {
   await viewer.stage.settled();
   element("frame").classList.remove("waiting");
   element("notice").hidden = true;
+  if (description.note) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
 

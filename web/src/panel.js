@@ -71,10 +71,12 @@ export function panel(viewer, say) {
   }
 
   function facts() {
-    const count = viewer.description.layers.reduce((sum, layer) => sum + layer.count, 0);
+    const { layers: all, note } = viewer.description;
+    const count = all.reduce((sum, layer) => sum + layer.count, 0);
+    const caution = note ? ` · ${note.split(";")[0]}` : "";
     const speed = viewer.playing && viewer.fps ? ` · ${viewer.fps.toFixed(viewer.fps < 10 ? 1 : 0)} fps` : "";
-    const text = `${count.toLocaleString("en")} Gaussians${speed}`;
-    if (element("facts").textContent !== text) element("facts").textContent = text;
+    const text = `${count.toLocaleString("en")} Gaussians${caution}${speed}`;
+    if (element("facts").textContent !== text) Object.assign(element("facts"), { textContent: text, title: note ?? "" });
   }
 }
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import spackle
-from spackle.app.complete import PhotoCompleter
+from spackle.app.complete import PhotoCompleter, disparity_source
 from spackle.app.video import PathOptions, VideoOptions
 from spackle.bases.open import BaseSettings, Choice
 from spackle.bases.protocol import BasePrediction
@@ -176,6 +176,7 @@ class _Run:
         """Counts, holes, flicker and times, ready for JSON."""
         assert self._first is not None
         (photo, prediction, choice), clip, notes = self._first, self._clip, self._notes
+        path = self._setting.path
         stages = {name: round(value, 3) for name, value in self._completer.seconds.items()}
         before, after = ([note["holes"][side] for note in notes] for side in (0, 1))
         found = {name: [note[name] for note in notes if name in note] for name in FIGURES}
@@ -198,8 +199,9 @@ class _Run:
             "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
             "residual": {"weights": self._setting.residual.weights},
             "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # the mean over the frames
-            "views": self._setting.path.trajectory,
-            "disparity": self._setting.path.disparity,
+            "views": path.trajectory,
+            "disparity": prediction.disparity if path.disparity is None else path.disparity,
+            "disparity_source": disparity_source(path, choice),
             "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
             # In units of 1/255; None where no frame has the figure.
             "flicker": {name: round(255 * _mean(values), 3) if values else None for name, values in found.items()},
@@ -254,7 +256,7 @@ class ClipCompleter:
     """Takes the frames in their order and completes the view of each; one frame is kept in memory."""
 
     trajectory: TrajectoryKind
-    disparity: float
+    disparity: float | None  # as the base has it where None
     frames: int  # of the clip, and so of the path
     renderer: Renderer
     flow: Flow
@@ -275,7 +277,8 @@ class ClipCompleter:
         with timed("depth", self.seconds):
             base, guard, now, past = self._aligned(rgb, prediction)
         even = prediction.camera.even()
-        camera = view_at(self.trajectory, even, self.disparity, now.depths, self._count, self.frames)
+        disparity = prediction.disparity if self.disparity is None else self.disparity
+        camera = view_at(self.trajectory, even, disparity, now.depths, self._count, self.frames)
         with timed("complete", self.seconds):
             before, aux = self.renderer.render(base, camera), Gaussians.empty()
             alone = before

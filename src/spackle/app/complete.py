@@ -56,6 +56,7 @@ class CompletedPhoto:
     prediction: BasePrediction
     choice: Choice
     views: PlannedViews
+    disparity: float | None  # how far the path goes; None for given views and keyframes
     scene: Scene
     saved_view: str | None  # in view mode: the view that `scene.aux` belongs to
 
@@ -82,22 +83,28 @@ class PhotoCompleter:
         with reporter.stage("base", seconds) as step:
             prediction, choice = base.predict(step)
         photo = resize_photo(photo)
-        self._say_base(photo, prediction, choice, reporter)
+        disparity = None
+        if self.given_views is None and self.keyframes is None:
+            disparity = prediction.disparity if self.path.disparity is None else self.path.disparity
+        self._say_base(photo, prediction, choice, disparity, reporter)
         views = self._plan(photo.path, prediction)
         with reporter.stage("complete", seconds) as step:
             scene, saved_view = self._fill(prediction, views, step)
             if not scene.aux.finite:
                 raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
-        return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
+        return CompletedPhoto(photo, prediction, choice, views, disparity, scene, saved_view)
 
-    def _say_base(self, photo: Photo, prediction: BasePrediction, choice: Choice, reporter: Reporter) -> None:
-        """Say which base predicted, the focal length, and how much depth was filled."""
+    def _say_base(
+        self, photo: Photo, prediction: BasePrediction, choice: Choice, disparity: float | None, reporter: Reporter
+    ) -> None:
+        """Say which base predicted, the focal length, how far the camera goes, and how much depth was filled."""
         name = photo.path.name
         if choice.note:
             reporter.log(f"{name}: {choice.note}")
         reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
+            + ("" if disparity is None else f", disparity {disparity:g} ({disparity_source(self.path, choice)})")
         )
         if missing := float(prediction.notes.get("depth_filled", 0)):
             reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
@@ -113,17 +120,17 @@ class PhotoCompleter:
             maker = FrameMaker.of(video, gaussians, self.given_views, photo)
             return PlannedViews.of(self.given_views, {}, maker, stills=True)
         try:
-            path = self.path.fly(gaussians, prediction.camera, self.keyframes)
-            others = self._checked(gaussians, prediction.camera.even())
+            path = self.path.fly(gaussians, prediction.camera, self.keyframes, prediction.disparity)
+            others = self._checked(gaussians, prediction.camera.even(), prediction.disparity)
         except PathError as error:
             raise InputError(f"{self.path.path}: {error}") from error
         except ValueError as error:
             raise InputError(f"{photo}: no camera path: {error}: check the depth map and the focal length") from error
         return PlannedViews.of(path, others, FrameMaker.of(video, gaussians, path, photo), stills=False)
 
-    def _checked(self, gaussians: Gaussians, camera: Camera) -> dict[str, Camera]:
+    def _checked(self, gaussians: Gaussians, camera: Camera, disparity: float) -> dict[str, Camera]:
         """The views whose holes are reported, by their names."""
-        depths, far = DepthRange.of(gaussians), self.path.disparity
+        depths, far = DepthRange.of(gaussians), disparity if self.path.disparity is None else self.path.disparity
         if self.keyframes is None:
             return dict(zip((f"{-far:g}", f"+{far:g}"), extremes(camera, far, depths), strict=True))
         keys = self.keyframes.key_cameras(camera, depths)
@@ -150,6 +157,11 @@ class PhotoCompleter:
         far = {name: float((views.cameras[k].position.double() - eye).norm()) for name, k in views.checked.items()}
         name = max(far, key=lambda name: far[name])
         return dataclasses.replace(scene, aux=scene.by_view[views.checked[name]]), name
+
+
+def disparity_source(path: PathOptions, choice: Choice) -> str:
+    """Who says how far the camera goes."""
+    return f"default of {choice.base}" if path.disparity is None else "--disparity"
 
 
 def save_views_video(path: Path, views: PlannedViews, scene: Scene, renderer: Renderer, step: Step) -> None:

@@ -15,6 +15,7 @@ from spackle.app.clip import check_clip_options, predict_clip
 from spackle.app.complete import (
     CompletedPhoto,
     PhotoCompleter,
+    disparity_source,
     measure_holes,
     picture_files,
     save_pictures,
@@ -120,9 +121,8 @@ def predict_one(
         scene, views, renderer = done.scene, done.views, completer.renderer
         new = folders.enter_context(whole_set(folder, REPORT))
         with reporter.stage("write", seconds):
-            reach = None if options.path.cameras or options.path.path else options.path.disparity
             for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
-                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=reach)
+                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=done.disparity)
         video = None
         if options.render:
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
@@ -230,7 +230,8 @@ def make_report(
         "merged": base + aux,
         "mode": completer.mode,
         "views": given.name if given else path.trajectory,
-        "disparity": None if given else path.disparity,
+        "disparity": done.disparity,
+        "disparity_source": None if given else disparity_source(path, choice),
         "video": video,
         "hole_area_ratio": holes,
         "request": request if choice.lasting else None,  # None: the next run does it again

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from spackle.app.video import FrameMaker, PathOptions, cover, video_problem
+from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
@@ -116,7 +117,8 @@ def _fly(
     stored = load_ply_camera(scene)
     try:
         camera = _photo_camera(stored, path.video.size, focal_px)
-        cameras = path.fly(gaussians, camera, keyframes)
+        completed = load_ply_disparity(scene)
+        cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if completed is None else completed)
     except InputError:
         raise
     except PathError as error:

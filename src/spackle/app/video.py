@@ -12,6 +12,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
+from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import MAX_DISPARITY, DepthRange, KeyframePath, PathError, TrajectoryKind
 from spackle.color import DepthColors
@@ -97,7 +98,7 @@ class PathOptions:
     """Which way the camera goes, and the video along it."""
 
     trajectory: TrajectoryKind = "rotate-forward"
-    disparity: float = 0.3
+    disparity: float | None = None  # as the base has it where None
     cameras: Path | None = None  # exactly these views in place of a trajectory
     path: Path | None = None  # keyframes in place of a trajectory
     frames: int | None = None  # 60, or as many as the keyframes take
@@ -105,7 +106,7 @@ class PathOptions:
 
     def check(self) -> None:
         """InputError for a path that cannot be flown, views that are given twice, or a video that cannot be."""
-        if not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
+        if self.disparity is not None and not (math.isfinite(self.disparity) and 0 <= self.disparity <= MAX_DISPARITY):
             raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
             raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {self.frames}")
@@ -120,14 +121,18 @@ class PathOptions:
         views = None if self.cameras is None else load_cameras(self.cameras)
         return views, None if self.path is None else load_path(self.path)
 
-    def fly(self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None) -> list[Camera]:
+    def fly(
+        self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float = USUAL_DISPARITY
+    ) -> list[Camera]:
         """The cameras of a video: through keyframes or along the trajectory, at the photo's size made even.
 
-        PathError where the keyframes lead nowhere, ValueError for a path that this scene does not allow.
+        `disparity` is for options without one. PathError where the keyframes lead nowhere, ValueError for a
+        path that this scene does not allow.
         """
         if keyframes is None:
             looped, count = self.video.plays != 1, self.frames or PATH_FRAMES
-            return scene_path(gaussians, camera, self.trajectory, self.disparity, count, looped)
+            far = disparity if self.disparity is None else self.disparity
+            return scene_path(gaussians, camera, self.trajectory, far, count, looped)
         count = self.frames or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")

@@ -16,7 +16,8 @@ from pathlib import Path
 from spackle.app.complete import PhotoCompleter
 from spackle.app.export import page_of
 from spackle.app.video import PathOptions
-from spackle.bases.open import AUTO, BaseSettings
+from spackle.bases.lite import LiteBase
+from spackle.bases.open import AUTO, ROUGH, BaseSettings
 from spackle.errors import InputError
 from spackle.formats.scene_files import SceneFile
 from spackle.image import Photo, check_file, load_photo
@@ -40,7 +41,7 @@ class ViewOptions:
     """The choices of `spackle view`."""
 
     base: BaseSettings
-    disparity: float = 0.3  # how far photos are completed
+    disparity: float | None = None  # how far photos are completed; as the base has it where None
     focal_px: float | None = None  # of the scene or the photo
     fov: float | None = None
     host: str = HOST
@@ -112,9 +113,10 @@ def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller
     """A loaded photo to what the page shows; the terminal gets errors too."""
     seconds: dict[str, float] = {}
     try:
-        scene = completer.complete(photo, teller, seconds).scene
+        done = completer.complete(photo, teller, seconds)
+        scene, note = done.scene, ROUGH if done.choice.base == LiteBase.name else ""
         with teller.stage("page", seconds):
-            return page_scene(name, scene.base, scene.aux, scene.camera, completer.path.disparity)
+            return page_scene(name, scene.base, scene.aux, scene.camera, done.disparity, note)
     except InputError as error:
         Reporter.log(teller, f"error: {error}")  # the page is told as the job ends
         raise

@@ -13,6 +13,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 
 Progress = Callable[[int, int], None]  # (steps done, of how many)
+USUAL_DISPARITY = 0.3  # how far a camera goes where neither a person nor the base says; the paper's S1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +24,7 @@ class BasePrediction:
     camera: Camera  # the photo's, at its working size
     notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
     lens_source: str = ""  # who gave the camera's lens, where it is not the photo's file or a person
+    disparity: float = USUAL_DISPARITY  # how far a camera goes where nobody says: as far as this geometry looks right
 
 
 class Base(Protocol):

@@ -16,7 +16,6 @@ if TYPE_CHECKING:  # torch takes seconds to load
     from spackle.app.video import PathOptions
     from spackle.camera_path import TrajectoryKind
 
-DEFAULT_DISPARITY = 0.3
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 SPELLINGS = ["swipe", "shake", "rotate", "rotate-forward"]  # of trajectories
 
@@ -109,7 +108,10 @@ def path_options(
     trajectory: Annotated[str | None, trajectory_option("Camera path of the video.", "rotate-forward")] = None,
     disparity: Annotated[
         float | None,
-        typer.Option(help="How far the camera moves: 0 to 2; 0.3 is large.", show_default=str(DEFAULT_DISPARITY)),
+        typer.Option(
+            help="How far the camera moves: 0 to 2; 0.3 is large.",
+            show_default="as the scene has it, else 0.15 with lite, 0.3 with others",
+        ),
     ] = None,
     path: Annotated[
         Path | None,
@@ -182,7 +184,7 @@ def path_options(
     kind: TrajectoryKind = trajectory or "rotate-forward"  # type: ignore[assignment]  # one of them, by its parser
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, show, stereo, ipd, convergence)
-    return PathOptions(kind, DEFAULT_DISPARITY if disparity is None else disparity, cameras, path, frames, video)
+    return PathOptions(kind, disparity, cameras, path, frames, video)
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -76,7 +76,12 @@ def view(
     ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
     checkpoint: CheckpointOption = None,
-    disparity: Annotated[float, typer.Option(help="How far photos are completed: 0 to 2; 0.3 is large.")] = 0.3,
+    disparity: Annotated[
+        float | None,
+        typer.Option(
+            help="How far photos are completed: 0 to 2; 0.3 is large.", show_default="0.15 with lite, else 0.3"
+        ),
+    ] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
     keep_frame: KeepFrameOption = False,

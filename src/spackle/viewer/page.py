@@ -42,7 +42,9 @@ class PageScene:
     files: dict[str, bytes]  # the layers, by the names that the description gives them
 
 
-def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None) -> PageScene:
+def page_scene(
+    name: str, base: Gaussians, aux: Gaussians, camera: Camera, disparity: float | None = None, note: str = ""
+) -> PageScene:
     """A scene for the page.
 
     The description's `paths` hold, for each trajectory, eye positions [SAMPLES, 3] in metres: the eye stands at
@@ -54,6 +56,7 @@ def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera, dispa
         aux: what completion added; may be empty.
         camera: the photo's, at the world's origin.
         disparity: how far it was completed: up to there the eye follows the hand, and little farther.
+        note: what a person should know of it; the part before the semicolon stays in sight.
 
     Raises:
         InputError: where no Gaussian stands in front of the camera.
@@ -69,6 +72,7 @@ def page_scene(name: str, base: Gaussians, aux: Gaussians, camera: Camera, dispa
         layers.append({"name": layer, "file": file, "count": len(gaussians), "scaleLow": low, "scaleStep": step})
     description: dict[str, object] = {
         "name": name,
+        "note": note,
         "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height},
         "focus": depths.focus,
         "zNear": depths.near,
