@@ -92,20 +92,20 @@ class Camera:
 
     def to_camera(self, points: Tensor) -> Tensor:
         """World points [..., 3] in this camera's coordinates, [..., 3]."""
-        matrix = self.world_to_camera.to(points)
+        matrix = beside(self.world_to_camera, points)
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points [..., 3] to pixel coordinates [..., 2] and depth z [...]."""
         local = self.to_camera(points)
         z = local[..., 2]
-        K = self.K.to(points)
+        K = beside(self.K, points)
         uv = local[..., :2] / z[..., None] * torch.stack([K[0, 0], K[1, 1]]) + K[:2, 2]
         return uv, z
 
     def unproject(self, uv: Tensor, depth: Tensor) -> Tensor:
         """Pixels [..., 2] at depth z [...] to world points [..., 3]."""
-        K, matrix = self.K.to(uv), self.world_to_camera.to(uv)
+        K, matrix = beside(self.K, uv), beside(self.world_to_camera, uv)
         xy = (uv - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]]) * depth[..., None]
         local = torch.cat([xy, depth[..., None]], dim=-1)
         return (local - matrix[:3, 3]) @ matrix[:3, :3]
@@ -115,3 +115,8 @@ class Camera:
         ys = (torch.arange(self.height // stride) + 0.5) * stride
         xs = (torch.arange(self.width // stride) + 0.5) * stride
         return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)
+
+
+def beside(numbers: Tensor, other: Tensor) -> Tensor:
+    """A small tensor in the type and on the device of another; a GPU is not waited for on the way to it."""
+    return numbers.to(other, non_blocking=other.device.type != "cpu")

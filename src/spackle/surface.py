@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from spackle._numba import kernel
-from spackle.camera import Camera
+from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians, quat_from_matrix
 
@@ -43,18 +44,17 @@ def surface_gaussians(
         colors: [N, 3] linear RGB.
         opacities: [N].
     """
-    fx, fy = camera.focal
+    (fx, fy), K = camera.focal, beside(camera.K, uv)
     z = 1.0 / inverse_depth
-    ray = torch.cat([(uv - camera.K[:2, 2].to(uv)) / uv.new_tensor([fx, fy]), torch.ones_like(uv[:, :1])], dim=-1)
+    ray = torch.cat([(uv - K[:2, 2]) / K.diagonal()[:2], torch.ones_like(uv[:, :1])], dim=-1)
     # P = z·ray, so dP/du = z·d(ray)/du + dz/du·ray with dz/du = −z²·d(1/z)/du.
     dz = -(z**2)[:, None] * slope
-    across = dz[:, :1] * ray + z[:, None] * uv.new_tensor([1 / fx, 0, 0])
-    down = dz[:, 1:] * ray + z[:, None] * uv.new_tensor([0, 1 / fy, 0])
+    across = dz[:, :1] * ray + pad(z[:, None] * (1 / fx), (0, 2))
+    down = dz[:, 1:] * ray + pad(z[:, None] * (1 / fy), (1, 1))
     rotation, lengths = _principal_axes(across, down)
-    spread = torch.as_tensor(spread, dtype=uv.dtype, device=uv.device).reshape(-1, 1)
-    scales = lengths * spread
+    scales = lengths * (spread.to(uv).reshape(-1, 1) if isinstance(spread, Tensor) else spread)
     scales = torch.cat([scales, THICKNESS * scales.amin(dim=-1, keepdim=True)], dim=-1)
-    local_to_world = camera.world_to_camera.to(uv)[:3, :3].T
+    local_to_world = beside(camera.world_to_camera, uv)[:3, :3].T
     means = camera.unproject(uv, z)
     return Gaussians(means, quat_from_matrix(local_to_world @ rotation), scales, opacities, colors)
 

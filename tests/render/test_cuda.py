@@ -14,7 +14,7 @@ from typing import Any
 import gsplat_stand_in
 import pytest
 import torch
-from far_device import FarDevice, FarTensor, far_device
+from far_device import FarDevice, FarTensor, Watched, far_device
 from scenes import box_before_wall, same_bits, shifted
 from torch import Tensor
 
@@ -52,22 +52,6 @@ def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Gspl
             pytest.skip(str(error))
     monkeypatch.setattr(cuda, "load_gsplat", lambda device: gsplat_stand_in)
     return GsplatRenderer("cpu")
-
-
-class Watched:
-    """The stand-in, whose own looks at numbers do not count; the one wait that gsplat has does."""
-
-    def __init__(self, far: FarDevice) -> None:
-        self.far = far
-
-    def __getattr__(self, name: str) -> Any:
-        def call(*arguments: Any, **options: Any) -> Any:
-            if name == "isect_tiles":
-                self.far.waits.append(name)
-            with self.far.uncounted():
-                return getattr(gsplat_stand_in, name)(*arguments, **options)
-
-        return call
 
 
 def agree(one: Rendering, other: Rendering) -> None:

@@ -14,7 +14,16 @@ from spackle.render.cuda import GsplatRenderer
 from spackle.render.pipeline import touched_tiles
 from spackle.render.protocol import TILE, Renderer, Rendering
 
-__all__ = ["TILE", "CpuRenderer", "GsplatRenderer", "Renderer", "get_renderer", "render_batch", "touched_tiles"]
+__all__ = [
+    "TILE",
+    "CpuRenderer",
+    "GsplatRenderer",
+    "Renderer",
+    "get_renderer",
+    "place_of",
+    "render_batch",
+    "touched_tiles",
+]
 
 LOG = logging.getLogger("spackle")
 
@@ -50,3 +59,9 @@ def render_batch(
         return renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
     views = zip(scenes, cameras, tiles, onto, strict=True)
     return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]
+
+
+def place_of(renderer: Renderer) -> torch.device:
+    """Where a renderer computes: what lies there need not travel."""
+    place: torch.device = getattr(renderer, "device", torch.device("cpu"))
+    return place

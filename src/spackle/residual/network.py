@@ -145,13 +145,18 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
-    # Elsewhere the rim is the cell itself.
-    known = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar)
-    own, near, mirrored, patches = (color_logit(colors[cues.mask]) for colors in known)
-    distance = (rim.distance[cues.mask] / TYPICAL_DISTANCE).log1p()[..., None]
-    far = seeds.rgb.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-    mismatch = rim.mismatch[cues.mask][..., None] / TYPICAL_MISMATCH
-    far[cues.mask] = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
+    # Elsewhere the rim is the cell itself: a processor does not look there, but to look for holes would wait for a GPU.
+    masked = cues.mask.device.type == "cpu"
+    grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
+    *colors, distance, mismatch = (grid[cues.mask] for grid in grids) if masked else grids
+    own, near, mirrored, patches = map(color_logit, colors)
+    distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
+    there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
+    if masked:
+        far = there.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
+        far[cues.mask] = there
+    else:
+        far = torch.where(cues.mask[..., None], there, 0)
     channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
@@ -197,7 +202,7 @@ def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
     """Deltas [B, 14, ...] from the outputs of the heads [B, 17, ...], the last three of which copy known colours."""
     deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
     known = (FAR_RIM, MIRRORED, EXEMPLAR)
-    taken = sum(copies[:, [k]] * features[:, colors] for k, colors in enumerate(known))
+    taken = sum(copies[:, k : k + 1] * features[:, colors] for k, colors in enumerate(known))
     return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
 
 

@@ -40,11 +40,12 @@ class Seeds:
     unit: float = 1.0  # the view's median inverse depth, in which depths and their deltas are measured
 
     def select(self, cells: Tensor) -> Seeds:
-        """The chosen cells, flat: a boolean grid [h, w] gives fields [n, ...]."""
-        index = cells.flatten().nonzero()[:, 0]  # once for all fields
-
+        """The chosen cells, flat [n, ...]: of a boolean grid [h, w], or their numbers in its rows laid end to end."""
+        # Once for all fields, and without waiting for a GPU where they are numbers already.
+        index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
+        lead = self.inverse_depth.ndim - 1
         fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
-        uv, inverse_depth, slope, rgb = (field.flatten(0, cells.ndim - 1)[index.to(field.device)] for field in fields)
+        uv, inverse_depth, slope, rgb = (field.flatten(0, lead)[index.to(field.device)] for field in fields)
         return Seeds(uv, inverse_depth, slope, rgb, self.unit)
 
 

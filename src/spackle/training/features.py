@@ -209,7 +209,7 @@ def _layer(inside: int, width: int, blocks: int, stride: int) -> nn.Sequential:
 
 def _channels(numbers: tuple[float, ...], images: Tensor) -> Tensor:
     """[3, 1, 1] on the images' device."""
-    return images.new_tensor(numbers)[:, None, None]
+    return torch.tensor(numbers, dtype=images.dtype).to(images.device, non_blocking=True)[:, None, None]
 
 
 def _half(x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from spackle.formats import atomic_path
 from spackle.output_folder import make_folder
-from spackle.render import Renderer
+from spackle.render import Renderer, place_of, render_batch
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import Cues
 from spackle.residual.network import ResidualNet, load_residual, network_input
@@ -42,17 +42,24 @@ def complete_samples(
 ) -> ViewBatch:
     """Run the network on samples of one size, and render them with what it adds.
 
-    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
+    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`. What
+    needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
     """
+    place = place_of(renderer)
+    cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
+    tiles = [sample.tiles for sample in samples]
+    samples = [sample.to(place) for sample in samples]
     features = torch.cat([network_input(sample.cues, sample.seeds, sample.rim) for sample in samples])
-    place, features = features.device, features.to(next(network.parameters()).device)
+    features = features.to(next(network.parameters()).device)
     with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
         deltas = network(features.contiguous(memory_format=torch.channels_last))
-    views = []
-    for sample, field in zip(samples, deltas.float().to(place), strict=True):
-        cells = training_cells(sample.cues)
-        aux = compose(sample.seeds.select(cells), field.permute(1, 2, 0)[cells], sample.camera)
-        views.append(renderer.render([sample.base, aux], sample.camera, tiles=sample.tiles, onto=sample.rendering))
+    scenes = []
+    for sample, field, chosen in zip(samples, deltas.float().to(place), cells, strict=True):
+        index = chosen.to(place, non_blocking=True)
+        aux = compose(sample.seeds.select(index), field.flatten(1).T[index], sample.camera)
+        scenes.append([sample.base, aux])
+    cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
+    views = render_batch(renderer, scenes, cameras, tiles=tiles, onto=onto)
     return ViewBatch(
         rgb=torch.stack([view.rgb for view in views]),
         alpha=torch.stack([view.alpha for view in views]),

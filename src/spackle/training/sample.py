@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,6 +66,16 @@ class Sample:
         """[ceil(H/16), ceil(W/16)] bool: the renderer's tiles that aux Gaussians can touch."""
         near = max_pool2d(self.hole.float()[None, None], 2 * REACH_PX + 1, stride=1, padding=REACH_PX)
         return max_pool2d(near, TILE, ceil_mode=True)[0, 0] > 0
+
+    def to(self, device: torch.device) -> Sample:
+        """The same on another device, but for the camera, whose numbers are read by the host."""
+
+        def moved(grid: Any) -> Any:
+            if isinstance(grid, Tensor):
+                return grid.to(device, non_blocking=device.type != "cpu")
+            return dataclasses.replace(grid, **{name: moved(t) for name, t in vars(grid).items() if name != "unit"})
+
+        return dataclasses.replace(self, **{name: moved(t) for name, t in vars(self).items() if name != "camera"})
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
         """The part of a view whose upper left cell is (row, column), height × width cells."""

@@ -118,7 +118,7 @@ class Trainer:
         """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0."""
         method, ranks, optim = self.method, self.ranks, self.recipe.optim
         items = samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
-        mine: dict[str, float] = {}
+        found: dict[str, Tensor] = {}
         parts = [items[start : start + method.at_once] for start in range(0, len(items), method.at_once)]
         self.optimizer.zero_grad(set_to_none=True)
         for part in parts:
@@ -129,8 +129,9 @@ class Trainer:
                 loss, terms = method.loss(self.wrapped, step, part)
                 (share * loss).backward()  # type: ignore[no-untyped-call]
             for name, value in {"loss": loss.detach(), **terms}.items():
-                mine[name] = mine.get(name, 0.0) + share * float(value)
-        mine["gradient"] = float(clip_grad_norm_(self.network.parameters(), optim.clip))
+                found[name] = found.get(name, 0.0) + share * value.double()
+        found["gradient"] = clip_grad_norm_(self.network.parameters(), optim.clip).double()
+        mine = dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))  # a GPU is waited for once
         mine["stop"] = float(self.callbacks.stop())
         sums = ranks.sum(list(mine.values()), self.device)
         numbers = {name: total / ranks.count for name, total in zip(mine, sums, strict=True)}
