@@ -42,8 +42,8 @@ def complete_samples(
 ) -> ViewBatch:
     """Run the network on samples of one size, and render them with what it adds.
 
-    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`. What
-    needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
+    The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
+    What needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
     """
     place = place_of(renderer)
     cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
