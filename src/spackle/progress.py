@@ -38,6 +38,11 @@ def timed(stage: str, seconds: dict[str, float]) -> Iterator[None]:
         seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
+def counted(count: int, thing: str) -> str:
+    """`1 shard`, `2 shards`."""
+    return f"{count:,} {thing}{'' if count == 1 else 's'}"
+
+
 @contextlib.contextmanager
 def progress_line(name: str, shown: bool = True) -> Iterator[Step]:
     """Yields a function of (done, of how many) that draws a bar on one line, in terminals and notebooks alike."""

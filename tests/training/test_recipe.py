@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from spackle.downloads import known_weights
 from spackle.errors import InputError
 from spackle.training.losses import PAPER_WEIGHTS
 from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe, plain
@@ -25,7 +26,7 @@ def written(folder: Path, text: str = PLAIN) -> Path:
 
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
 def test_every_packaged_recipe_can_be_read_and_all_but_the_small_machines_have_the_papers_weights(name: str) -> None:
-    recipe = load_recipe(Recipe, name)
+    recipe = load_recipe(Recipe, name, ["loss.features_path=weights"])
     papers = {**PAPER_WEIGHTS, "color_blur": 0, "gram": 1}
     assert (vars(recipe.loss).items() >= papers.items()) == (name != "cpu")
     assert recipe.data.photos is not None or recipe.data.pseudo is not None
@@ -35,6 +36,16 @@ def test_every_packaged_recipe_can_be_read_and_all_but_the_small_machines_have_t
         assert (optim.lr, optim.min_lr, optim.warmup) == (1.6e-4, 1.6e-5, 10_000)
         assert (run.patience, run.min_delta) == (10, 1e-4)
         assert (recipe.loss.features, recipe.loss.feature_size, recipe.data.views) == ("resnet50", 512, 20_000)
+
+
+def test_resnet50_comes_from_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
+    for override in ((), ("loss.features=squeezenet",)):
+        with pytest.raises(InputError, match="spackle weights get features"):
+            load_recipe(Recipe, "paper", override)
+    fetched = tmp_path / known_weights("features").file
+    fetched.touch()
+    assert load_recipe(Recipe, "paper").loss.features_file == fetched
 
 
 def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path: Path) -> None:
@@ -82,7 +93,10 @@ def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path:
         ("{loss: {features_path: a, feature_size: null}, data: {cells: 16}}", "", "crops of 16 cells are too small"),
     ],
 )
-def test_what_cannot_be_is_named_with_its_file_or_option(tmp_path: Path, text: str, override: str, named: str) -> None:
+def test_what_cannot_be_is_named_with_its_file_or_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, override: str, named: str
+) -> None:
+    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError) as error:
         load_recipe(Recipe, written(tmp_path, text), [override] if override else [])
     assert named in str(error.value)

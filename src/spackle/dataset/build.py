@@ -15,7 +15,7 @@ from spackle.dataset.ray import at_work_on_ray, cluster
 from spackle.dataset.shards import NAME, Manifest, differences, load_manifest, shard_name, write_shard
 from spackle.errors import InputError
 from spackle.output_folder import make_folder, remove_half_written, results_folder
-from spackle.progress import Reporter, timed
+from spackle.progress import Reporter, counted, timed
 from spackle.signals import asked_to_stop
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
@@ -156,7 +156,7 @@ class _Build:
             stages = ", ".join(f"{stage} {self.seconds[stage] / made:.2f}" for stage in STAGES)
             self.reporter.log(f"{3600 * made / wall:,.0f} photos an hour; seconds a photo: {stages}")
         total = decimal(sum(shard.size for shard in shards))
-        self.reporter.log(f"{samples} photos in {len(shards)} shards, {total} -> {self.output}")
+        self.reporter.log(f"{counted(samples, 'photo')} in {counted(len(shards), 'shard')}, {total} -> {self.output}")
         return "complete"
 
     def _portable(self, name: str, problem: str) -> str:

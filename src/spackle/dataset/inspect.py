@@ -20,7 +20,7 @@ from spackle.errors import InputError, one_line
 from spackle.formats import save_png, save_video
 from spackle.formats.png import thumbnail
 from spackle.output_folder import results_folder
-from spackle.progress import Reporter
+from spackle.progress import Reporter, counted
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"
 THUMBNAIL = 192  # pixels along its longer side
@@ -34,7 +34,7 @@ def show_info(location: str, console: Console) -> None:
     state = "complete" if manifest.complete else "not finished"
     lines = [
         one_line(f"{location}: {state}"),
-        f"{len(samples)} photos, {manifest.views} views, {len(manifest.shards)} shards",
+        f"{counted(len(samples), 'photo')}, {manifest.views} views, {counted(len(manifest.shards), 'shard')}",
     ]
     lines.append(f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo")
     if passed := sum(len(shard.passed_over) for shard in manifest.shards):

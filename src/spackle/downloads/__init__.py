@@ -179,6 +179,17 @@ WEIGHTS = {
         named_by="--inpainter-weights names it to dataset build",
         md5="e3aa4aaa15225a33ec84f9f4bc47e500",
     ),
+    "features": KnownWeights(
+        name="features",
+        url="https://download.pytorch.org/models/resnet50-0676ba61.pth",
+        file="resnet50-0676ba61.pth",
+        licence="BSD-3-Clause",
+        notice=(
+            "ResNet-50's weights (98 MB, learned from ImageNet) are torchvision's, under the BSD 3-Clause License:",
+            "https://github.com/pytorch/vision/blob/main/LICENSE",
+        ),
+        named_by="loss.features_path names it to train",
+    ),
     "depth": KnownWeights(
         name="depth",
         url=f"https://huggingface.co/{DEPTH_ANYTHING.model}/resolve/{DEPTH_ANYTHING.revision}/model.safetensors",

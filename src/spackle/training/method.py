@@ -189,7 +189,7 @@ class Plan:
 def load_objective(context: RunContext[Recipe]) -> Objective:
     """The recipe's loss; InputError where its feature network cannot be read."""
     loss = context.recipe.loss
-    features = load_features(loss.features if loss.perceptual else "none", loss.features_path, context.device)
+    features = load_features(loss.features if loss.perceptual else "none", loss.features_file, context.device)
     return Objective(loss, features, get_renderer(), context.precision, context.device)
 
 

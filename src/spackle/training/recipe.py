@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar, Union
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
+from spackle.downloads import installed
 from spackle.errors import InputError, reason_in_a_line
 from spackle.image import check_file
 from spackle.residual.hole_features import CELL
@@ -104,6 +105,11 @@ class LossRecipe:
     color_blur: Annotated[float, Range(0, 64)] = 0.0  # pixels; above 0 the colour term sees low frequencies alone
     gram: Share = 1.0  # how much the perceptual term's Gram statistics count
 
+    @property
+    def features_file(self) -> Path | None:
+        """The feature network's weights: `features_path`, else ResNet-50 as `spackle weights get features` fetched it."""
+        return self.features_path or (installed("features") if self.features == "resnet50" else None)
+
 
 @dataclasses.dataclass(frozen=True)
 class OptimRecipe:
@@ -169,9 +175,11 @@ class Recipe:
             raise InputError(f"{file}: loss.dilation {self.loss.dilation} is even; a square around a pixel is odd")
         if self.loss.features == "none":
             return
-        if self.loss.features_path is None:
+        if self.loss.features_file is None:
+            fetched = "" if self.loss.features == "resnet50" else "loss.features=resnet50 takes what "
             raise InputError(
                 f"{file}: loss.features_path is missing: it names the weights of {self.loss.features}; "
+                f"{fetched}`spackle weights get features` brings{' them' if not fetched else ''}, "
                 "loss.features=none does without"
             )
         if (self.loss.feature_size or CELL * self.data.cells) < LEAST_SIDE:

@@ -47,9 +47,10 @@ def scene_folders(root: Path, dataset: str) -> list[Path]:
     layout = LAYOUTS[dataset]
     found = sorted(_walk(root, layout, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
     if not found:
-        # Another dataset that has scenes there, after a short look.
-        other = next((name for name, layout in LAYOUTS.items() if any(_walk(root, layout, GUESS_FOLDERS))), None)
-        hint = f"; this looks like {other}" if other else ""
+        # The dataset that has most scenes there, after a short look.
+        counts = {name: sum(1 for _ in _walk(root, other, GUESS_FOLDERS)) for name, other in LAYOUTS.items()}
+        likely = max(counts, key=lambda name: counts[name])
+        hint = f"; this looks like {likely}" if counts[likely] else ""
         raise InputError(f"{root}: no scene of {dataset} at or below it: expected {layout.expected}{hint}")
     return found
 
