@@ -107,7 +107,7 @@ class LossRecipe:
 
     @property
     def features_file(self) -> Path | None:
-        """The feature network's weights: `features_path`, else ResNet-50 as `spackle weights get features` fetched it."""
+        """The feature network's weights: `features_path`, else what `spackle weights get features` fetched."""
         return self.features_path or (installed("features") if self.features == "resnet50" else None)
 
 
