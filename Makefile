@@ -6,7 +6,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --quiet --constraint const
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
-.PHONY: demo test test-wheel test-slow wheel lint types check bench viewer clean clean-cache
+.PHONY: demo test test-wheel test-slow wheel docs lint types check bench viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -48,6 +48,12 @@ check: lint types test
 bench: $(VENV)/.installed
 	rm -rf bench-suite
 	$(BIN)/spackle bench --suite --only renderer,video -o bench-suite
+
+# The documentation as a site: build/site/index.html.
+docs: pyproject.toml
+	test -x build/docs/bin/mkdocs || { $(PYTHON) -m venv build/docs && \
+		build/docs/bin/pip install --quiet 'mkdocs-material>=9.6' 'mkdocstrings[python]>=1' 'typer>=0.29' 'rich>=13' ruff; }
+	NO_MKDOCS_2_WARNING=1 PYTHONPATH=src build/docs/bin/mkdocs build --quiet --strict
 
 # The viewer's page: needs node, which nothing else does; what it builds is committed.
 viewer:

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from spackle.cli import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(page for d in ("docs", "research", "src") for page in (ROOT / d).rglob("*.md"))])
@@ -41,3 +46,20 @@ def test_links_lead_somewhere(page: Path) -> None:
         if section and path.suffix == ".md":
             titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
             assert section in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, link
+
+
+def commands() -> list[str]:
+    """Every command of ours in the docs, whatever it needs."""
+    blocks = [
+        b for page in PAGES for b in re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    ]
+    lines = re.sub(r"\\\n\s*", "", "\n".join(blocks)).splitlines()
+    return sorted({line.partition(" #")[0].strip() for line in lines if line.startswith("spackle ")})
+
+
+@pytest.mark.parametrize("line", commands())
+def test_the_command_line_takes_what_the_docs_type(line: str) -> None:
+    words, command = shlex.split(line)[1:], get_command(app)
+    while isinstance(command, TyperGroup):
+        command = command.commands[words.pop(0)]
+    command.make_context(line, words)

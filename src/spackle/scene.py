@@ -93,7 +93,8 @@ class Scene:
 
         Args:
             path: the file.
-            focal_px, fov: the lens; by default what is stored, else 30 mm.
+            focal_px: focal length in pixels; by default what is stored, else that of 30 mm.
+            fov: horizontal field of view in degrees, in its place.
         """
         return Scene.of_file(SceneFile.load(Path(path)), focal_px, fov)
 
@@ -244,7 +245,9 @@ def predict(
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
         keep_frame: otherwise a uniform frame around a file's picture is cut off, and the logger is told.
-        focal_px, focal_mm, fov: the lens of a photo's file, see `load_photo`; by default the file's own.
+        focal_px: focal length of a photo's file in pixels; by default the file's own, see `load_photo`.
+        focal_mm: its 35 mm film equivalent, in its place.
+        fov: horizontal field of view in degrees, in its place.
         progress: show how far it is, on one line of the standard error.
 
     Raises:

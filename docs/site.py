@@ -1,0 +1,78 @@
+"""What the site has besides docs/: pages from elsewhere in the repository, and the reference made of the code."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+import spackle
+
+ROOT = Path(__file__).parents[1]
+ELSEWHERE = {
+    "architecture.md": "ARCHITECTURE.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "weights.md": "src/spackle/weights/README.md",
+}
+COMMANDS = ("predict", "view", "render", "export", "demo", "weights get", "weights list", "weights make", "train")
+COMMANDS += ("dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables", "bench")
+LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that docs/ does not hold."""
+    pages = {page: (ROOT / source).read_text(encoding="utf-8") for page, source in ELSEWHERE.items()}
+    pages |= {"commands.md": _commands(), "python.md": _python()}
+    for page, text in pages.items():
+        files.append(File.generated(config, page, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Let links lead to pages of the site; what is not on it stays as words."""
+    here = page.file.src_uri
+    source = ROOT / ELSEWHERE.get(here, f"docs/{here}")
+    moved = {(ROOT / place).resolve(): name for name, place in ELSEWHERE.items()}
+
+    def lead(found: re.Match[str]) -> str:
+        picture, words, target = found.groups()
+        file, hash_, section = target.partition("#")
+        if "://" in target or not file:
+            return found[0]
+        place = (source.parent / file).resolve()
+        name = moved.get(place) or (
+            place.relative_to(ROOT / "docs").as_posix() if place.is_relative_to(ROOT / "docs") else ""
+        )
+        if not name or place.is_dir():
+            return words
+        return f"{picture}[{words}]({os.path.relpath(name, Path(here).parent)}{hash_}{section})"
+
+    return LINK.sub(lead, markdown)
+
+
+def _commands() -> str:
+    """The help of every command, with all options."""
+    parts = [
+        "# Commands\n\nAll options of every command, as `--help` (of `predict` and `render`: `--help-all`) prints them.\n"
+    ]
+    for name in COMMANDS:
+        whole = "--help-all" if name in ("predict", "render") else "--help"
+        command = [sys.executable, "-m", "spackle", *name.split(), whole]
+        environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT / "src")}
+        text = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+        parts.append(f"## spackle {name}\n\n```text\n{text.replace('python -m spackle', 'spackle').strip()}\n```\n")
+    return "\n".join(parts)
+
+
+def _python() -> str:
+    """Every public name of the package, by its docstring."""
+    parts = ["# Python\n\nWhat `import spackle` gives. Conventions: [architecture](architecture.md).\n"]
+    first = ["predict", "Scene", "complete"]
+    for name in [*first, *(name for name in spackle.__all__ if name not in first)]:
+        parts.append(f"::: {spackle._HOMES[name]}.{name}\n")
+    return "\n".join(parts)
