@@ -57,9 +57,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def _commands() -> str:
     """The help of every command, with all options."""
-    parts = [
-        "# Commands\n\nAll options of every command, as `--help` (of `predict` and `render`: `--help-all`) prints them.\n"
-    ]
+    parts = ["# Commands\n\nAll options, as `--help` prints them, and `--help-all` of `predict` and `render`.\n"]
     for name in COMMANDS:
         whole = "--help-all" if name in ("predict", "render") else "--help"
         command = [sys.executable, "-m", "spackle", *name.split(), whole]
