@@ -8,10 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain_fill import plain_far_fill
 from torch import Tensor
 
-from spackle.fill import far_fill
+from spackle.fill import dense_far_fill, far_fill
 
 PROPERTY = settings(deadline=None, max_examples=50)
 SIZES = st.tuples(st.integers(1, 13), st.integers(1, 13))
@@ -58,7 +57,7 @@ def test_the_fill_matches_its_plain_twin(seed: int, size: tuple, bias: float, sw
     inverse, values, known = random_scene(seed, *size)
     biases = bias * torch.rand(size, generator=torch.Generator().manual_seed(seed)) if uneven else bias
     filled, carried = far_fill(inverse, values, known, far_bias=biases, sweeps=sweeps)
-    plain, beside = plain_far_fill(inverse, values, known, far_bias=biases, sweeps=sweeps)
+    plain, beside = dense_far_fill(inverse, values, known, biases, sweeps)
     torch.testing.assert_close(filled, plain, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(carried, beside, rtol=1e-3, atol=1e-3)
 

@@ -16,6 +16,7 @@ from spackle._numba import kernel
 from spackle.device import run_chunks
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
+from spackle.residual import dense
 
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
@@ -49,16 +50,17 @@ class Cues:
     @staticmethod
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> Cues:
         """Gather the cells of a rendering; an odd last row or column stands for its twin too."""
-        device = rendering.alpha.device
+        if dense.on_gpu(rendering.alpha):
+            return Cues(*dense.cells_of(rendering, threshold, float(CLOSEST)))
         images = (rendering.rgb.flatten(1), rendering.depth, rendering.alpha)
-        view = [image.detach().to("cpu", torch.float32).contiguous().numpy() for image in images]
+        view = [image.detach().float().contiguous().numpy() for image in images]
         rows, columns = (-(-size // CELL) for size in rendering.alpha.shape)
         rgb, mask = np.empty((rows, CHANNELS * columns), np.float32), np.empty((rows, columns), np.bool_)
         inverse_depth, alpha = (np.empty((rows, columns), np.float32) for _ in range(2))
         cells, low = (rgb, inverse_depth, alpha, mask), np.float32(threshold)
         run_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows, GRAIN)
         colors = rgb.reshape(rows, columns, CHANNELS)
-        return Cues(*(torch.from_numpy(image).to(device) for image in (colors, inverse_depth, alpha, mask)))
+        return Cues(*(torch.from_numpy(image) for image in (colors, inverse_depth, alpha, mask)))
 
     @property
     def covered(self) -> Tensor:

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
-from spackle.camera import Camera
+from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
+from spackle.residual import dense
 from spackle.residual.hole_features import MASK_THRESHOLD
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
@@ -38,11 +40,14 @@ class OcclusionGuard:
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
         """The guard of a rendered view."""
-        images = (rendering.depth, rendering.alpha)
-        depth, alpha = (image.detach().to("cpu", torch.float32).contiguous().numpy() for image in images)
+        images = [image.detach().float() for image in (rendering.depth, rendering.alpha)]
+        if dense.on_gpu(rendering.depth):
+            seen = torch.where(images[1] < threshold, 0, images[0])
+            return OcclusionGuard(camera, max_pool2d(seen[None], 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0])
+        depth, alpha = (image.contiguous().numpy() for image in images)
         wide, low = np.empty_like(depth), np.float32(threshold)
         run_chunks(lambda start, stop: _widest(start, stop, depth, alpha, low, wide), len(depth), ROWS)
-        return OcclusionGuard(camera, torch.from_numpy(wide).to(rendering.depth.device))
+        return OcclusionGuard(camera, torch.from_numpy(wide))
 
 
 @kernel
@@ -80,7 +85,20 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
     """
     if not len(aux) or not guards:
         return aux
-    eye = eye.to(aux.means)
+    eye = beside(eye, aux.means)
+    if dense.on_gpu(aux.means):
+        shown_by = [(guard.camera, guard.depth) for guard in guards]
+        factor = dense.free_factors(eye, aux, shown_by, STEPS, WINDOW_PX, REACH, MAX_REACH_PX, CLEARANCE)
+    else:
+        factor = _factors(aux, eye, guards)
+    factor = factor.to(aux.means)[:, None]
+    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
+    free = factor[:, 0] > 0
+    return moved if bool(free.all()) else moved.select(free)
+
+
+def _factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
+    """[N] float64 by which Gaussians move away from the eye; 0 for those that find no place."""
     rays = (aux.means - eye).detach().cpu().double().numpy()
     quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
     lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
@@ -95,10 +113,7 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
     run_chunks(
         lambda start, stop: _free_factors(start, stop, place, rays, quats, scales, *shown, factors), len(rays), GRAIN
     )
-    factor = torch.from_numpy(factors).to(aux.means)[:, None]
-    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
-    free = factor[:, 0] > 0
-    return moved if bool(free.all()) else moved.select(free)
+    return torch.from_numpy(factors)
 
 
 @kernel

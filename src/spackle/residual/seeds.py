@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from spackle._numba import kernel
-from spackle.camera import Camera
+from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.inpaint.exemplar import exemplar
+from spackle.residual import dense
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
 
@@ -66,15 +67,18 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=bias)
     inverse_depth = placed_behind(filled, cues.mask, cues, BLOB_CELLS)
     slope = surface_slope(inverse_depth) / CELL
-    return Seeds(cell_centers(camera), inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
+    uv = beside(cell_centers(camera), inverse_depth)
+    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
 
 
 def _sources(cues: Cues) -> Tensor:
     """[h, w] bool: cells to start from. Specks are none: a stray far one would colour a whole hole."""
-    mask = cues.mask.cpu().contiguous().numpy()
+    if dense.on_gpu(cues.mask):
+        return dense.sources_of(cues.mask, cues.inverse_depth)
+    mask = cues.mask.contiguous().numpy()
     solid = np.empty(mask.shape, np.bool_)
     run_chunks(lambda start, stop: _solid(start, stop, mask, solid), len(mask), GRAIN)
-    known = torch.from_numpy(solid).to(cues.mask.device)
+    known = torch.from_numpy(solid)
     if bool(known.any()):
         return known
     return cues.covered if bool(cues.covered.any()) else cues.inverse_depth > 0
@@ -98,13 +102,15 @@ def _solid(start: int, stop: int, mask: Any, solid: Any) -> None:
 
 def _inside(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
     """[h, w] bool: which cells' points lie in the photo's frame."""
-    image = inverse_depth.cpu().contiguous().numpy()
+    if dense.on_gpu(inverse_depth):
+        return dense.inside_photo(inverse_depth, beside(cell_centers(camera), inverse_depth), camera, photo_camera)
+    image = inverse_depth.contiguous().numpy()
     inside = np.empty(image.shape, np.bool_)
     lens, photo_lens = (view.K.detach().cpu().double().numpy() for view in (camera, photo_camera))
     here, there = (view.world_to_camera.detach().cpu().double() for view in (camera, photo_camera))
     views = (lens, photo_lens, (there @ here.inverse()).numpy(), photo_camera.width, photo_camera.height)
     run_chunks(lambda start, stop: _look(start, stop, image, *views, inside), len(image), GRAIN)
-    return torch.from_numpy(inside).to(inverse_depth.device)
+    return torch.from_numpy(inside)
 
 
 @kernel
@@ -126,11 +132,13 @@ def _look(
 
 def placed_behind(filled: Tensor, chosen: Tensor, cues: Cues, radius: int) -> Tensor:
     """Filled inverse depth [h, w]; in the chosen cells ([h, w] bool) behind everything seen within `radius` cells."""
-    seen, cells = (image.cpu().contiguous().numpy() for image in (cues.inverse_depth, chosen))
-    placed = filled.cpu().clone(memory_format=torch.contiguous_format)
     share = np.float32(1.0 - BEHIND)
+    if dense.on_gpu(filled):
+        return dense.placed_behind(filled, chosen, cues.inverse_depth, radius, float(share))
+    seen, cells = (image.contiguous().numpy() for image in (cues.inverse_depth, chosen))
+    placed = filled.clone(memory_format=torch.contiguous_format)
     run_chunks(lambda start, stop: _place(start, stop, seen, cells, radius, share, placed.numpy()), len(cells), GRAIN)
-    return placed.to(filled.device)
+    return placed
 
 
 @kernel
@@ -173,19 +181,23 @@ class Rim:
         photo's eye. So that line leads from a hole to the surface that goes on behind, and structure
         at the rim goes on along it more often than not. Where no line meets anything, the seeds stay.
         """
-        fields = (seeds.uv, seeds.rgb, seeds.inverse_depth, cues.mask)
-        uv, rgb, depths, mask = (image.detach().cpu().contiguous().numpy() for image in fields)
+        fields = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach(), cues.mask
         eye = photo_camera.position.double()
         # Where the view sees the photo's eye: homogeneous, for it may lie at infinity.
         epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
-        found, mirrored, distance = rgb.copy(), rgb.copy(), np.zeros(mask.shape, np.float32)
-        cells = (found, mirrored, distance)
-        run_chunks(
-            lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *cells), len(mask), GRAIN
-        )
+        if dense.on_gpu(cues.mask):
+            far, near, steps = dense.walk(*fields, epipole.tolist(), SAME_DEPTH, SAME_EYE)
+        else:
+            uv, rgb, depths, mask = (image.contiguous().numpy() for image in fields)
+            grids = (rgb.copy(), rgb.copy(), np.zeros(mask.shape, np.float32))
+            run_chunks(
+                lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *grids),
+                len(mask),
+                GRAIN,
+            )
+            far, near, steps = (torch.from_numpy(grid) for grid in grids)
         guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
         texture = exemplar(guess, cues.mask, seeds.inverse_depth)
-        far, near, steps = (torch.from_numpy(grid).to(seeds.rgb) for grid in cells)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
         return Rim(far, near, steps, texture.rgb, texture.mismatch, beyond)
 
