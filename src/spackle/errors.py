@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 
 
 class InputError(ValueError):
@@ -22,6 +26,11 @@ def one_line(text: str) -> str:
     """What may go to a terminal or a log: names and comments of strangers can hold escape codes and line breaks."""
     line = " ".join(text.splitlines())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+def shown(value: object) -> str:
+    """A stranger's value for the middle of a message: at most 60 characters, however long or deep it is."""
+    return _SHORT.repr(value)[:60]
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:

@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # looked for in folders
 MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as float32
+SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels in a byte
 MAX_SIDE = 1536  # long side of the working size
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -153,7 +154,7 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
         return photo
-    channels = [Image.fromarray(photo.rgb[..., c].contiguous().numpy()) for c in range(3)]
+    channels = (Image.fromarray(photo.rgb[..., c].contiguous().numpy()) for c in range(3))  # one at a time
     resized = [np.asarray(c.resize((width, height), Image.Resampling.LANCZOS)) for c in channels]
     rgb = torch.from_numpy(np.stack(resized, axis=-1)).clamp_(0, 1)
     return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width)
@@ -212,9 +213,7 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
 
                 pillow_heif.register_heif_opener()
             with Image.open(path) as image:
-                if image.width * image.height > MAX_PIXELS:
-                    megapixels = image.width * image.height / 1e6
-                    raise InputError(f"{path}: {megapixels:.0f} megapixels are too many (at most 100): shrink it first")
+                check_pixels(image.width, image.height, os.path.getsize(path), path)
                 return read(image)
     except InputError:
         raise
@@ -228,6 +227,20 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
         raise InputError(
             f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged or cut off"
         ) from error
+
+
+def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:
+    """The bound of every decoder, before it allocates: 100 megapixels, and in a small file 32.
+
+    A file of `size` bytes below 1 MB thus takes at most 1.5 GB of memory, whatever size it announces. InputError
+    beyond that.
+    """
+    most = min(MAX_PIXELS, max(SMALL_PIXELS, PIXELS_A_BYTE * size))
+    if width * height > most:
+        raise InputError(
+            f"{path}: {width}×{height} is too large (at most {most // 10**6} megapixels in {size:,} bytes): "
+            "shrink it first"
+        )
 
 
 def check_file(path: str | os.PathLike[str], kind: str) -> int:

@@ -12,12 +12,12 @@ from typing import NoReturn
 
 def exit_on_sigterm() -> None:
     """SIGTERM ends the process with code 143, after every `finally`: no half-written file stays."""
-
-    def end(number: int, frame: object) -> NoReturn:
-        sys.exit(128 + number)
-
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, end)
+        signal.signal(signal.SIGTERM, _end)
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    sys.exit(128 + number)
 
 
 @contextlib.contextmanager

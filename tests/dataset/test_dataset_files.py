@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import os
 import sys
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +35,7 @@ from spackle.dataset.sample import (
 )
 from spackle.dataset.shards import load_manifest
 from spackle.dataset.views import APART, PathChoice, path_cameras
+from spackle.digest import digest_of
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
@@ -124,6 +129,79 @@ def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) 
     refused(run("dataset", "info", copy), f"{manifest}: cannot be read: Is a directory")
 
 
+def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """A manifest with other fields, and the digest that goes with them."""
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    del content["sha256"]
+    change(content)
+    path.write_text(json.dumps(content | {"sha256": digest_of(content)}))
+
+
+FIELDS: list[tuple[str, object]] = [
+    *((name, value) for name in ("offset", "size") for value in ("1", -1, 1.5, True, None, 10**400)),
+    *(("file", name) for name in (["a"], "../photos.tar", "/etc/passwd", "shard-0.tar", "shard-000000.tar\n")),
+    *(("key", name) for name in ("../a", "", 3, ["a"])),
+    *(("holes", value) for value in (["a"], [2.0], "ab", None, [0.1])),
+    *((name, value) for name in ("photo", "sha256", "passed_over") for value in (3, [[]])),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), FIELDS)
+def test_fields_that_cannot_be_are_refused_although_the_digest_fits(copy: Path, name: str, value: object) -> None:
+    def change(content: dict[str, Any]) -> None:
+        shard = content["shards"][0]
+        (shard if name in shard and name != "sha256" else shard["samples"][0])[name] = value
+
+    resealed(copy, change)
+    for words in (("info", copy), ("verify", copy), ("preview", copy, "-o", copy / "look")):
+        refused(run("dataset", *words), f"{copy / 'manifest.json'}: damaged")
+
+
+def test_a_manifest_of_endless_depth_is_refused(copy: Path) -> None:
+    (copy / "manifest.json").write_text('{"format": 1, "config": ' + "[" * 10_000 + "]" * 10_000 + "}")
+    refused(run("dataset", "verify", copy), f"{copy / 'manifest.json'}: damaged")
+
+
+def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
+    """A member of a tar archive."""
+    info = tarfile.TarInfo(name)
+    info.size = len(content)
+    for key, value in fields.items():
+        setattr(info, key, value)
+    return info.tobuf(tarfile.GNU_FORMAT) + content + bytes(-len(content) % tarfile.BLOCKSIZE)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        member("000000.json", type=tarfile.SYMTYPE, linkname="/etc/passwd"),
+        member("000000.json", type=tarfile.LNKTYPE, linkname="000001.json"),
+        member("000000.json", type=tarfile.GNUTYPE_SPARSE),
+        member("000000.json", type=tarfile.FIFOTYPE),
+        member("000000.json", type=tarfile.XHDTYPE),
+        member("000000.json", size=1 << 40),
+        member("000000.json", size=-512),
+        member("000000.json", b"[" * 10_000),
+        member("000000.json", b'{"photo": {"name": "a"}, "trajectory": {"kind": "a"}, "views": [{"hole": 2}]}'),
+        bytes(512),
+        b"no tar",
+    ],
+)
+def test_what_is_no_plain_file_of_a_photo_is_refused_although_all_digests_fit(copy: Path, data: bytes) -> None:
+    def change(content: dict[str, Any]) -> None:
+        shard = content["shards"][0]
+        shard["samples"] = [shard["samples"][0] | {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}]
+        shard["size"] = len(data + END)
+        sizes = [shard["size"] for shard in content["shards"]]
+        content["counts"] = {"photos": 4, "views": 4 * VIEWS, "bytes": sum(sizes)}
+
+    (copy / "shard-000000.tar").write_bytes(data + END)
+    resealed(copy, change)
+    with pytest.raises(InputError, match="sample 000000: not a photo of a dataset"):
+        DatasetFiles(copy).group(0)
+
+
 def test_info_and_preview(whole: Path, tmp_path: Path) -> None:
     assert f"5 photos, {5 * VIEWS} views, 3 shards" in run("dataset", "info", whole).out
     done = run("dataset", "preview", whole, "-o", tmp_path / "look", "--photos", 2, "--views", 3)
@@ -151,6 +229,27 @@ def test_ranks_and_workers_read_every_view_once(whole: Path) -> None:
     assert sorted(name for loader in loaders for name in names_of(list(loader))) == every
     with pytest.raises(ValueError, match="rank"):
         ViewDataset(whole, rank=2, ranks=2)
+
+
+def test_damage_is_skipped_named_and_counted_where_that_is_asked_for(
+    copy: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    good = names_of(list(ViewDataset(copy, on_error="skip")))
+    assert len(good) == 5 * VIEWS
+    (copy / "shard-000001.tar").unlink()  # photos 2 and 3
+    path = copy / "shard-000000.tar"
+    data = bytearray(path.read_bytes())
+    data[3000] ^= 1  # of photo 0
+    path.write_bytes(data)
+    for shuffle in (0, 7):
+        caplog.clear()
+        dataset = ViewDataset(copy, on_error="skip", shuffle=shuffle)
+        assert sorted(names_of(list(dataset))) == [name for name in good if name[0] in ("000001", "000004")]
+        assert dataset.skipped == len(caplog.messages) == 3
+        assert sum("shard-000001.tar: not there" in line for line in caplog.messages) == 2
+        assert sum("sample 000000 (0.png) is damaged" in line for line in caplog.messages) == 1
+    with pytest.raises(InputError, match="000000"):
+        list(ViewDataset(copy))
 
 
 def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -275,6 +276,20 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
     ("eth3d", f"{MODEL}/images.txt", "1 0 0 0 0 0 0 0 4 a.jpg\n\n", "images.txt: "),
     ("llff", "fern/poses_bounds.npy", "not NumPy", "poses_bounds.npy: "),
     ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30, "points3D.bin: "),
+    ("eth3d", f"{MODEL}/images.txt", "1 1 0 0 0 0 0 4 a.jpg\n\n" * 2, "images.txt: "),  # a number is missing
+    ("eth3d", f"{MODEL}/images.txt", "1 1 0 0 0 0 0 1e300 4 a.jpg\n\n" * 2, "images.txt: "),
+    ("eth3d", f"{MODEL}/cameras.txt", f"4 PINHOLE {'9' * 400} 36 40 40 24 18\n", "cameras.txt: "),
+    ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 1e300 40 24 18\n", "cameras.txt: "),
+    ("wildrgbd", f"{WILD}/metadata", f'{{"w": {"9" * 400}, "h": 3, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}', "metadata: "),
+    ("wildrgbd", f"{WILD}/metadata", '{"w": 1e999, "h": 3, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}', "metadata: "),
+    ("wildrgbd", f"{WILD}/metadata", f'{{"w": 4, "h": 3, "K": [{"9" * 400}, 0, 0, 0, 1, 0, 0, 0, 1]}}', "metadata: "),
+    ("wildrgbd", f"{WILD}/cam_poses.txt", "0 " + "0 " * 16 + "\n1 " + "1 " * 16, "cam_poses.txt: "),
+    (
+        "middlebury",
+        f"{MIDDLEBURY}/calib.txt",
+        f"cam0=[9 0 9; 0 9 9; 0 0 1]\nbaseline=9\nwidth={'9' * 400}\nheight=9\n",
+        "c",
+    ),
 ]
 
 
@@ -287,6 +302,24 @@ def test_a_missing_or_damaged_file_is_named(
     if content is not None:
         (tmp_path / file).write_bytes(content.encode("latin-1"))
     assert says in error_of(name, tmp_path)
+
+
+@pytest.mark.parametrize("number", [0, 1e30])
+def test_a_pose_that_is_no_rotation_is_named(number: float, tmp_path: Path) -> None:
+    TREES["llff"](tmp_path)
+    table = np.load(tmp_path / "fern/poses_bounds.npy")
+    table[2, :3] = number
+    np.save(tmp_path / "fern/poses_bounds.npy", table)
+    assert "poses_bounds.npy: image002.png: " in error_of("llff", tmp_path)
+
+
+def test_empty_lines_of_a_calibration_cost_nothing(tmp_path: Path) -> None:
+    scene = middlebury_2014(tmp_path / "Piano-perfect")
+    path = scene / "calib.txt"
+    path.write_text("\n" * 30_000 + path.read_text() + " " * 30_000)
+    start = time.perf_counter()
+    assert len(cases("middlebury", tmp_path)) == 1
+    assert time.perf_counter() - start < 1
 
 
 def test_too_few_photos_and_lenses_that_bend_are_refused(tmp_path: Path) -> None:

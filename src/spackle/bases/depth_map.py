@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import MAX_PIXELS, check_file, read_image
+from spackle.image import MAX_PIXELS, check_file, check_pixels, read_image
 
 Array = NDArray[Any]
 StrPath = str | os.PathLike[str]
@@ -27,6 +27,7 @@ Quantity = Literal["depth", "disparity"]
 SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
 PNG_UNIT_M = 0.001
+LARGEST = 1e9  # in a calibration: single precision holds its square
 ASPECT_TOLERANCE = 0.01
 CALIBRATED_SIZE_TOLERANCE = 0.02
 MIN_DISTINCT = 16  # fewer values may share a divisor by chance
@@ -148,10 +149,12 @@ class Calibration:
     def check(self, path: StrPath) -> Calibration:
         """Itself; InputError naming the file where the numbers make no sense."""
         for name in ("focal_px", "baseline_m", "scale"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"{path}: {name} must be a positive number, got {getattr(self, name)}")
-        if not all(map(math.isfinite, (self.cx, self.cy, self.doffs_px))):
-            raise InputError(f"{path}: cx, cy and doffs must be finite numbers")
+            if not 1 / LARGEST <= getattr(self, name) <= LARGEST:
+                raise InputError(f"{path}: {name} must be a positive number below {LARGEST:g}")
+        if not all(abs(number) <= LARGEST for number in (self.cx, self.cy, self.doffs_px)):
+            raise InputError(f"{path}: cx, cy and doffs must be finite numbers below {LARGEST:g}")
+        if self.size is not None and not all(1 <= side <= MAX_PIXELS for side in self.size):
+            raise InputError(f"{path}: width and height must be numbers of pixels")
         return self
 
 
@@ -185,7 +188,8 @@ def _find_calibration(path: Path, calib: StrPath | None) -> Calibration | None:
 
 def _read_calib(path: StrPath) -> Calibration:
     """Middlebury's text: cam0=[f 0 cx; 0 f cy; 0 0 1], doffs in pixels, baseline in millimetres."""
-    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", read_text(path), re.MULTILINE))
+    pairs = (line.partition("=") for line in read_text(path).splitlines())
+    entries = {name.strip(): value.strip() for name, _, value in pairs}
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
     try:
         matrix = [float(n) for n in re.findall(number, entries["cam0"])]
@@ -284,8 +288,7 @@ def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
         raise InputError(f"{path}: an array of shape {shape} is not a depth map: give [height, width]")
     if min(shape) < 1:
         raise InputError(f"{path}: an array of shape {shape} is empty: give another depth map")
-    if shape[0] * shape[1] > MAX_PIXELS:
-        raise InputError(f"{path}: {shape[1]}×{shape[0]} is too large (at most 100 megapixels): shrink it first")
+    check_pixels(shape[1], shape[0], os.path.getsize(path), path)
 
 
 def _png_values(image: Image.Image, path: StrPath) -> Array:

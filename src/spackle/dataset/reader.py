@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import IO, Literal
 
 import numpy as np
 import torch.distributed
@@ -11,7 +15,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from spackle.dataset.sample import DatasetView, PhotoGroup
 from spackle.dataset.shards import Place, load_manifest, open_in, read_sample
-from spackle.errors import InputError
+from spackle.errors import InputError, one_line
 
 
 class DatasetFiles:
@@ -34,15 +38,21 @@ class DatasetFiles:
         (group,) = self.groups([self.samples[index]])
         return group
 
-    def groups(self, places: Sequence[Place]) -> Iterator[PhotoGroup]:
-        """Likewise of several photos, with one shard open at a time."""
-        start = 0
-        while start < len(places):
-            shard = places[start][0]
-            with open_in(self.location, shard.file) as file:
-                while start < len(places) and places[start][0] is shard:
-                    yield read_sample(file, places[start][1], f"{self.location}/{shard.file}")
-                    start += 1
+    def groups(self, places: Sequence[Place], skip: Callable[[InputError], None] | None = None) -> Iterator[PhotoGroup]:
+        """Likewise of several photos, with one shard open at a time; `skip` is told of what is damaged, if given."""
+        for shard, own in itertools.groupby(places, key=lambda place: place[0]):
+            with contextlib.ExitStack() as stack:
+                file: IO[bytes] | None = None
+                for _, sample in own:
+                    try:
+                        file = file or stack.enter_context(open_in(self.location, shard.file))
+                        group = read_sample(file, sample, f"{self.location}/{shard.file}")
+                    except InputError as error:
+                        if skip is None:
+                            raise
+                        skip(error)
+                    else:
+                        yield group
 
 
 class ViewDataset(IterableDataset[DatasetView]):
@@ -62,6 +72,7 @@ class ViewDataset(IterableDataset[DatasetView]):
         with_base: bool = False,
         rank: int | None = None,
         ranks: int | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
     ) -> None:
         """Read the manifest.
 
@@ -73,12 +84,14 @@ class ViewDataset(IterableDataset[DatasetView]):
             with_base: decode the photo's Gaussians with each view.
             rank: of this process, from 0; torch.distributed's where None.
             ranks: how many there are; likewise.
+            on_error: "skip" leaves out what is damaged, logs a warning for it and counts it in `skipped`.
 
         Raises InputError without a finished dataset, and ValueError for a rank outside 0..ranks - 1.
         """
         super().__init__()
         self.files = DatasetFiles(location)
         self.shuffle, self.seed, self.with_base, self.epoch = shuffle, seed, with_base, 0
+        self.on_error, self.skipped = on_error, 0  # photos and views, in this process
         here = torch.distributed.is_available() and torch.distributed.is_initialized()
         self.rank = rank if rank is not None else torch.distributed.get_rank() if here else 0
         self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if here else 1
@@ -90,7 +103,7 @@ class ViewDataset(IterableDataset[DatasetView]):
         self.epoch = epoch
 
     def __iter__(self) -> Iterator[DatasetView]:
-        """Views of this rank and worker; InputError for a shard that is missing or damaged."""
+        """Views of this rank and worker; InputError for a shard that is missing or damaged, unless `on_error` skips."""
         worker = get_worker_info()
         part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
         shards = list(self.files.manifest.shards)  # the same order for everybody
@@ -100,11 +113,22 @@ class ViewDataset(IterableDataset[DatasetView]):
         mine = order[self.rank * parts + part :: self.ranks * parts]
         views = (
             (group.only(index, with_base=self.with_base), index)
-            for group in self.files.groups(mine)
+            for group in self.files.groups(mine, self._skip if self.on_error == "skip" else None)
             for index in range(group.views)
         )
         for group, index in self._shuffled(views, self.rank * parts + part) if self.shuffle else views:
-            yield group.view(index, with_base=self.with_base)
+            try:
+                found = group.view(index, with_base=self.with_base)
+            except InputError as error:
+                if self.on_error != "skip":
+                    raise
+                self._skip(error)
+            else:
+                yield found
+
+    def _skip(self, error: InputError) -> None:
+        self.skipped += 1
+        logging.getLogger(__name__).warning("left out: %s", one_line(str(error)))
 
     def _shuffled(self, views: Iterator[tuple[PhotoGroup, int]], reader: int) -> Iterator[tuple[PhotoGroup, int]]:
         """A random one of those held back makes room for the next."""

@@ -25,9 +25,10 @@ from torch.nn.functional import normalize
 from spackle.camera import Camera
 from spackle.dataset.views import PathChoice, ViewStack
 from spackle.errors import InputError
-from spackle.formats.camera_files import checked_camera
+from spackle.formats.camera_files import checked_camera, read_matrix
 from spackle.formats.png import to_bytes
 from spackle.gaussians import Gaussians
+from spackle.image import check_pixels
 from spackle.render.protocol import Rendering
 
 COMPRESSION = 1  # zlib's: 6 takes three times as long and saves a tenth
@@ -104,16 +105,22 @@ class PhotoGroup:
         """Take apart the stretch of a shard that belongs to a photo; InputError where that cannot be."""
         files: dict[str, bytes] = {}
         try:
-            with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
-                for member in archive:
-                    file = archive.extractfile(member)
-                    if file is None:
-                        raise ValueError(f"{member.name} is no plain file")
-                    files[member.name] = file.read()
+            at = 0
+            while at < len(data):  # plain members as `pack_sample` writes them: no links, nothing sparse
+                member = tarfile.TarInfo.frombuf(data[at : at + tarfile.BLOCKSIZE], "utf-8", "strict")
+                begin = at + tarfile.BLOCKSIZE
+                if member.type != tarfile.REGTYPE or not 0 <= member.size <= len(data) - begin:
+                    raise ValueError(f"{member.name} is no plain file")
+                files[member.name] = data[begin : begin + member.size]
+                at = begin + member.size + -member.size % tarfile.BLOCKSIZE
             facts = json.loads(files[f"{key}.json"])
-            if not isinstance(facts["views"], list):
-                raise TypeError("its views are no list")
-        except (ValueError, KeyError, TypeError, tarfile.TarError) as error:
+            if not isinstance(facts["photo"]["name"], str) or not isinstance(facts["trajectory"]["kind"], str):
+                raise TypeError("its photo or its path has no name")
+            for view in facts["views"]:
+                near, far = view["depth_range"]
+                if not (0 <= float(view["hole"]) <= 1 and SMALLEST_SCALE <= float(near) <= float(far) < math.inf):
+                    raise ValueError("a view's holes or depths make no sense")
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError, tarfile.TarError) as error:
             raise InputError(f"{where}: not a photo of a dataset, or damaged: {error}") from error
         return PhotoGroup(key, files, facts, where)
 
@@ -134,7 +141,7 @@ class PhotoGroup:
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
             depth = decode_depth(self._file(index, "depth"), *facts["depth_range"])
             rendering = Rendering(rgb, depth, decode_alpha(self._file(index, "alpha")))
-            return DatasetView(
+            found = DatasetView(
                 key=self.key,
                 index=index,
                 kind=self.facts["trajectory"]["kind"],
@@ -146,6 +153,12 @@ class PhotoGroup:
                 target=target,
                 base=self.base() if with_base else None,
             )
+            pictures = {"camera": (rgb, depth, rendering.alpha, found.mask, target), "photo_camera": (found.photo,)}
+            for camera, own in pictures.items():
+                size = getattr(found, camera).height, getattr(found, camera).width
+                if any(tuple(picture.shape[:2]) != size for picture in own):
+                    raise ValueError(f"a picture has another size than its {camera}")
+            return found
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise InputError(f"{self.where}: view {index} cannot be read: {error}") from error
 
@@ -173,7 +186,7 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(facts: Mapping[str, Any], where: str) -> Camera:
-    K, matrix = (torch.tensor(facts[name], dtype=torch.float64) for name in ("K", "world_to_camera"))
+    K, matrix = (read_matrix(facts[name], n, name, where) for name, n in (("K", 3), ("world_to_camera", 4)))
     return checked_camera(K, matrix, facts["width"], facts["height"], where)
 
 
@@ -243,9 +256,12 @@ def decode_gaussians(data: bytes) -> Gaussians:
         scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
         opacities = arrays["opacities"].astype(np.float64) / DEEPEST
         columns = (arrays["means"], arrays["quats"], scales, opacities, arrays["colors"])
-        return Gaussians(*(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns))
-    except (SafetensorError, KeyError, TypeError) as error:
+        gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns))
+    except (SafetensorError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"no Gaussians: {error}") from error
+    if not gaussians.finite:
+        raise ValueError("Gaussians that are not finite")
+    return gaussians
 
 
 def _png(pixels: NDArray[Any]) -> bytes:
@@ -258,6 +274,7 @@ def _pixels(data: bytes, axes: int) -> NDArray[Any]:
     """The pixels of a PNG; ValueError where it is none."""
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+            check_pixels(*image.size, len(data), "a picture")
             pixels = np.array(image)
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"no picture: {error}") from error

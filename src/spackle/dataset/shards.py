@@ -6,7 +6,9 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,6 +20,7 @@ from spackle.progress import Step
 
 NAME = "manifest.json"
 FORMAT = 1  # of shards and manifest; a reader of another one refuses
+MAX_BYTES = 1 << 40  # of a shard
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
@@ -41,6 +44,11 @@ def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
         ) from error
 
 
+def _check(name: str, good: bool) -> None:
+    if not good:
+        raise ValueError(f"{name} makes no sense")
+
+
 @dataclasses.dataclass(frozen=True)
 class SampleEntry:
     """A photo in a shard."""
@@ -52,6 +60,14 @@ class SampleEntry:
     sha256: str  # of those bytes
     holes: tuple[float, ...]  # HAR of each view
 
+    def __post_init__(self) -> None:
+        """TypeError or ValueError for what no sample can have."""
+        _check("photo", isinstance(self.photo, str))
+        _check("key", isinstance(self.key, str) and self.key.isascii() and self.key.isalnum())
+        _check("size", all(type(n) is int and 0 <= n <= MAX_BYTES for n in (self.offset, self.size)))
+        _check("sha256", isinstance(self.sha256, str))
+        _check("holes", all(type(hole) in (int, float) and 0 <= hole <= 1 for hole in self.holes))
+
 
 @dataclasses.dataclass(frozen=True)
 class ShardEntry:
@@ -62,6 +78,15 @@ class ShardEntry:
     sha256: str
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
+
+    def __post_init__(self) -> None:
+        """TypeError or ValueError for what no shard can have, such as a file elsewhere."""
+        _check("file", isinstance(self.file, str) and re.fullmatch(r"shard-[0-9]{6}\.tar", self.file) is not None)
+        ends = list(accumulate((sample.size for sample in self.samples), initial=0))
+        _check("offset", [sample.offset for sample in self.samples] == ends[:-1])
+        _check("size of a shard", type(self.size) is int and self.size == ends[-1] + len(END))
+        _check("sha256", isinstance(self.sha256, str))
+        _check("passed_over", all(isinstance(line, str) for line in self.passed_over))
 
 
 Place = tuple[ShardEntry, SampleEntry]
@@ -98,7 +123,7 @@ class Manifest:
     def save(self, folder: Path) -> None:
         """Write manifest.json, whole or not at all."""
         text = json.dumps(self._plain() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
-        with atomic_path(folder / NAME) as temporary:
+        with atomic_path(folder / NAME, durable=True) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
     def _plain(self) -> dict[str, Any]:
@@ -120,11 +145,12 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
         recorded = content.pop("sha256")
         shards = tuple(_shard(shard) for shard in content["shards"])
         manifest = Manifest(dict(content["config"]), shards, bool(content["complete"]))
+        _check("holes", len({len(sample.holes) for _, sample in manifest.samples}) <= 1)
         if digest_of(content) != recorded or manifest.digest != recorded:
             raise ValueError("its digest does not fit")
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(f"{where}: damaged, or no manifest of a dataset: {error}") from error
     return manifest
 
@@ -157,10 +183,13 @@ def shard_name(number: int) -> str:
 
 
 def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Sequence[str] = ()) -> ShardEntry:
-    """Write a tar file of (key, file) samples, whole or not at all; InputError for a damaged part or a full disk."""
+    """Write a tar file of (key, file) samples to the disk, whole or not at all.
+
+    InputError for a damaged part or a full disk.
+    """
     samples: list[SampleEntry] = []
     whole, offset = hashlib.sha256(), 0
-    with atomic_path(target) as temporary, open(temporary, "wb") as file:
+    with atomic_path(target, durable=True) as temporary, open(temporary, "wb") as file:
         for key, path in parts:
             data = path.read_bytes()
             try:

@@ -12,12 +12,12 @@ from spackle.errors import InputError
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary name in the same folder; rename it to `path` where the block succeeds.
 
     Where the block raises, the temporary file goes and an older file at `path` stays as it was. The
-    temporary name keeps the suffix, because some writers choose a format by it. Nothing is synced to
-    the disk: a killed process leaves whole files, a power cut need not.
+    temporary name keeps the suffix, because some writers choose a format by it. Only a
+    `durable` file is synced to the disk: a killed process leaves whole files, a power cut need not.
 
     Raises:
         InputError: where nothing can be written there, or the disk fills up.
@@ -27,7 +27,11 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{stem}.{secrets.token_hex(6)}{target.suffix}")
     try:
         yield temporary
+        if durable:
+            _sync(temporary)
         os.replace(temporary, target)
+        if durable and os.name == "posix":
+            _sync(target.parent)  # its name, too
     except OSError as error:
         if error.filename not in (None, str(temporary)):
             raise  # about another file, such as an input that the block reads
@@ -35,6 +39,14 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_whole(path: str | os.PathLike[str], content: bytes) -> None:

@@ -17,6 +17,7 @@ from spackle.image import check_file
 MAX_CAMERA_BYTES, MAX_PATH_BYTES = 64 << 20, 4 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes
 MAX_SIZE = 16_384
+LARGEST = 1e9  # in a camera: single precision holds its square
 MAX_NUMBER = 1e6  # in a path: a thousand kilometres, eleven days
 RIGID_TOLERANCE = 1e-3
 ZERO_TOLERANCE = 1e-6
@@ -49,20 +50,34 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         if not isinstance(frame, dict):
             raise InputError(f'{where}: must be an object with "K" and "world_to_camera"')
         width, height = (frame.get(side, content.get(side)) for side in ("width", "height"))
-        K = _matrix(frame.get("K"), 3, "K", where)
-        pose = _matrix(frame.get("world_to_camera"), 4, "world_to_camera", where)
+        K = read_matrix(frame.get("K"), 3, "K", where)
+        pose = read_matrix(frame.get("world_to_camera"), 4, "world_to_camera", where)
         cameras.append(checked_camera(K, pose, width, height, where))
     return cameras
 
 
-def checked_camera(K: Tensor, world_to_camera: Tensor, width: object, height: object, where: str) -> Camera:
-    """A camera of float64 matrices [3, 3] and [4, 4]; InputError, beginning with `where`, if it cannot be."""
+def checked_camera(
+    K: Tensor,
+    world_to_camera: Tensor,
+    width: object,
+    height: object,
+    where: str,
+    *,
+    dtype: torch.dtype = torch.float32,
+    tolerance: float = RIGID_TOLERANCE,
+) -> Camera:
+    """A camera of float64 matrices [3, 3] and [4, 4]; InputError, beginning with `where`, if it cannot be.
+
+    A rotation's product with its transpose is the identity to `tolerance`.
+    """
     sizes = [n for n in (width, height) if isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SIZE]
     if len(sizes) != 2:
         raise InputError(f"{where}: width and height must be whole numbers from 1 to {MAX_SIZE}")
     if not (torch.isfinite(K).all() and torch.isfinite(world_to_camera).all()):
         raise InputError(f"{where}: K and world_to_camera must be finite")
-    if min(float(K[0, 0]), float(K[1, 1])) <= 0:
+    if max(float(K.abs().max()), float(world_to_camera.abs().max())) > LARGEST:
+        raise InputError(f"{where}: K and world_to_camera must stay below {LARGEST:g}")
+    if min(float(K[0, 0]), float(K[1, 1])) < 1 / LARGEST:
         raise InputError(f"{where}: K needs positive focal lengths at [0][0] and [1][1]")
     if K[2].tolist() != [0, 0, 1]:
         raise InputError(f"{where}: the last row of K must be 0 0 1")
@@ -70,11 +85,11 @@ def checked_camera(K: Tensor, world_to_camera: Tensor, width: object, height: ob
         raise InputError(f"{where}: K has skew, which is not supported: [0][1] and [1][0] must be 0")
     rotation = world_to_camera[:3, :3]
     error = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max()
-    if error > RIGID_TOLERANCE or torch.linalg.det(rotation) < 0:
+    if error > tolerance or torch.linalg.det(rotation) < 0:
         raise InputError(f"{where}: world_to_camera must be a rotation (no scale, no mirror) and a translation")
     if (world_to_camera[3] - world_to_camera.new_tensor([0, 0, 0, 1])).abs().max() > ZERO_TOLERANCE:
         raise InputError(f"{where}: the last row of world_to_camera must be 0 0 0 1")
-    return Camera(K.float(), world_to_camera.float(), *sizes)
+    return Camera(K.to(dtype), world_to_camera.to(dtype), *sizes)
 
 
 def load_path(path: str | os.PathLike[str]) -> KeyframePath:
@@ -117,7 +132,7 @@ def _read_json(path: str | os.PathLike[str], kind: str, limit: int, pairs: Any) 
         raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error
 
 
-def _matrix(rows: object, n: int, name: str, where: str) -> Tensor:
+def read_matrix(rows: object, n: int, name: str, where: str) -> Tensor:
     """A list of n lists of n numbers as float64 [n, n]."""
     problem = f"{where}: {name} must be a list of {n} rows of {n} numbers"
     if not (isinstance(rows, list) and len(rows) == n and all(isinstance(r, list) and len(r) == n for r in rows)):

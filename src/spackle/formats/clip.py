@@ -23,7 +23,7 @@ from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
-from spackle.image import MAX_PIXELS, check_file
+from spackle.image import check_file, check_pixels
 
 SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
@@ -107,8 +107,7 @@ def read_clip(
     width, height = _square_size(frame, aspect)
     if _quarters(frame) % 2:
         width, height = height, width
-    if width * height > MAX_PIXELS:
-        raise InputError(f"{path}: frames of {width}×{height} are too large: shrink the clip first")
+    check_pixels(width, height, os.path.getsize(path), path)
     times = _rising(ticks, Fraction(rate))
     hdr = HDR.get(int(frame.color_trc))
     return Clip(Path(path), width, height, times, ticks[0] or Fraction(0), Fraction(rate), audio, hdr)
@@ -147,6 +146,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, Vide
         stream = pictures[0]
         if stream.codec_context is None:
             raise InputError(f"{path}: its codec is unknown to this FFmpeg: convert it to H.264 first")
+        check_pixels(stream.codec_context.width, stream.codec_context.height, os.path.getsize(path), path)
         stream.thread_type = "AUTO"
         yield container, stream
 

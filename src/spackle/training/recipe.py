@@ -17,11 +17,12 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar, Union
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
 from spackle.downloads import installed
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reason_in_a_line, shown
 from spackle.image import check_file
 from spackle.residual.hole_features import CELL
 
 PACKAGED = Path(__file__).parent / "recipes"
+MAX_BYTES = 1 << 16
 POSITIVE = 1e-12
 LEAST_SIDE = 36  # pixels that the feature networks need
 # What may differ when a run goes on: how long it is, how often it looks up, and where its files lie.
@@ -237,7 +238,8 @@ def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence
         path = PACKAGED / f"{os.fspath(path)}.yaml"
     elif os.sep not in os.fspath(path) and not os.path.exists(path):
         raise InputError(f"{path}: no such recipe; there are {', '.join(names)}, or give a YAML file")
-    check_file(path, "recipe")
+    if check_file(path, "recipe") > MAX_BYTES:
+        raise InputError(f"{path}: too long for a recipe (at most {MAX_BYTES >> 10} KiB): is it the right file?")
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -260,7 +262,11 @@ def _parse(text: str, file: str) -> Any:
     except ImportError as error:
         raise InputError("recipes are YAML, which needs a package: pip install 'spackle-nvs[train]'") from error
     try:
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise InputError(f"{file}: aliases (*) are not read, because few of them make endless values: write it out")
         return yaml.safe_load(text)
+    except InputError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date that is none
         raise InputError(f"{file}: not YAML: {reason_in_a_line(error)}") from error
 
@@ -329,7 +335,7 @@ def _build_fields(kind: Any, value: Any, key: str, file: str) -> Any:
     here = f"{key}." if key else ""
     for name in value:
         if name not in fields:
-            raise InputError(f"{file}: {here}{name} is unknown; there are {', '.join(fields)}")
+            raise InputError(f"{file}: {here}{str(name)[:60]} is unknown; there are {', '.join(fields)}")
     for name, field in fields.items():
         if name not in value and field.default is dataclasses.MISSING:
             raise InputError(f"{file}: {here}{name} is missing; {key} needs it")
@@ -366,4 +372,4 @@ def _allowed(kind: Any) -> str:
 
 
 def _refused(key: str, value: Any, allowed: str, file: str) -> InputError:
-    return InputError(f"{file}: {key or 'the recipe'} cannot be {str(value)[:60]!r}; it takes {allowed}")
+    return InputError(f"{file}: {key or 'the recipe'} cannot be {shown(value)}; it takes {allowed}")

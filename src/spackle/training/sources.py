@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
@@ -185,7 +185,7 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
         scene = folder / "scene.json"
         facts = json.loads(scene.read_text(encoding="utf-8"))
         names = [folder / facts[key] for key in ("left", "right", "disparity")]
-        focal, cx, cy, doffs, baseline = (float(facts[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
+        lens = read_calibration(scene)
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{folder}: no stereo pair: needs a scene.json that names the photos and the lens") from error
     left, right = (load_photo(name).rgb for name in names[:2])
@@ -193,10 +193,9 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
         raise InputError(f"{folder}: the two photos differ in size")
     depth = load_depth(names[2], calib=scene)
     depth.check_shape(left.shape[0], left.shape[1], names[0])
-    K = torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
-    right_K, moved = K.clone(), torch.eye(4)
-    right_K[0, 2] += doffs
-    moved[0, 3] = -baseline
+    K, right_K, moved = lens.K, lens.K, torch.eye(4)
+    right_K[0, 2] += lens.doffs_px
+    moved[0, 3] = -lens.baseline_m
     height, width = left.shape[:2]
     cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
     return left, right, depth, *cameras

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from spackle.bases.depth_map import ASPECT_TOLERANCE, Quantity, grid_step
 from spackle.errors import reason_in_a_line
-from spackle.image import LENSES, MAX_PIXELS
+from spackle.image import LENSES, check_pixels
 
 Array = NDArray[Any]
 
@@ -144,7 +144,7 @@ class CodedDepth:
 def read_codes(picture: bytes) -> tuple[Array, int]:
     """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
     with decoding(), Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
-        check_pixels(*image.size)
+        check_pixels(*image.size, len(picture), "it")
         if image.mode.startswith("I"):
             return np.asarray(image).astype(np.uint16), 65535
         return np.asarray(image.convert("L")), 255
@@ -161,9 +161,3 @@ def decoding() -> Iterator[None]:
         raise
     except Exception as error:
         raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
-
-
-def check_pixels(width: int, height: int) -> None:
-    """BrokenDepth unless a map of this size may be decoded."""
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise BrokenDepth(f"is {width}×{height}, and at most 100 megapixels are read")

@@ -24,7 +24,6 @@ from spackle.bases.photo_depth.coded import (
     Lens,
     Scale,
     Turn,
-    check_pixels,
     decoding,
     read_codes,
 )
@@ -42,7 +41,7 @@ from spackle.bases.photo_depth.containers import (
 )
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.image import DEFAULT_FOCAL_MM, check_file, film_to_pixels, focal_from_exif, read_image
+from spackle.image import DEFAULT_FOCAL_MM, check_file, check_pixels, film_to_pixels, focal_from_exif, read_image
 
 _EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
 PLAUSIBLE_M = (0.3, 30.0)  # a scene's middle, where the file does not say its unit
@@ -322,7 +321,8 @@ def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
         images = pillow_heif.open_heif(os.fspath(path), hdr_to_16bit=False).info["depth_images"]
         if not images:
             raise BrokenDepth("is announced, but missing")
-        check_pixels(*images[0].size)
+        width, height = images[0].size
+        check_pixels(width, height, os.path.getsize(path), "it")
         codes = np.array(images[0])
         return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
 

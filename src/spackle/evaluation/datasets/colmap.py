@@ -13,8 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reason_in_a_line, shown
 from spackle.evaluation.case import Points
+from spackle.formats.camera_files import LARGEST, checked_camera
 from spackle.gaussians import quat_to_matrix
 from spackle.image import check_file
 
@@ -90,6 +91,7 @@ def read_model(folder: Path) -> Model:
     except (KeyError, ValueError) as error:
         raise InputError(f"{at[1]}: {reason_in_a_line(error)}: the file is damaged") from error
     table = np.array([point for point in points if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
+    table = table[(np.abs(table[:, :4]) <= [2**53, LARGEST, LARGEST, LARGEST]).all(axis=1)]
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Model(tuple(sorted(views, key=lambda view: view.name)), table[:, 0].astype(np.int64), table[:, 1:4])
 
@@ -109,8 +111,10 @@ def _lens(path: Path, camera: CameraRecord) -> Camera:
         raise InputError(f"{path}: lens model {model} is no pinhole: undistort the photos with COLMAP first")
     single = known[0].startswith(("SIMPLE", "RADIAL"))
     fx, fy, cx, cy, *bend = [parameters[0], *parameters] if single else parameters
-    if not (min(fx, fy, width, height) > 0 and np.isfinite(parameters).all()):
-        raise InputError(f"{path}: a camera of {width}×{height} with lens {parameters}: the file is damaged")
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    lens = checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{path}: a lens", dtype=torch.float64)
+    if not np.isfinite(bend).all():
+        raise InputError(f"{path}: a lens of {shown(parameters)}: the file is damaged")
     corner = np.array([max(cx, width - cx) / fx, max(cy, height - cy) / fy])
     square = float(corner @ corner)
     # k1, k2 bend along the radius; p1, p2 by at most three times as much as they would there.
@@ -118,20 +122,20 @@ def _lens(path: Path, camera: CameraRecord) -> Camera:
     tangential = 3 * sum(map(abs, bend[2:])) * square
     if (radial + tangential) * max(fx, fy) > MAX_BEND * max(width, height):
         raise InputError(f"{path}: this lens bends the corners by over {MAX_BEND:.0%}: undistort the photos first")
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, torch.eye(4, dtype=torch.float64), width, height)
+    return lens
 
 
 def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> ColmapView:
     quaternion, shift = torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64)
-    if not (torch.isfinite(quaternion).all() and torch.isfinite(shift).all() and float(quaternion.norm()) > 1e-6):
+    if len(shift) != 3 or not 1e-6 < float(quaternion.norm()) < LARGEST:
         raise ValueError(f"the pose of {name} is no rotation")
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
     seen = observed[observed["id"] >= 0]
     _, first = np.unique(seen["id"], return_index=True)  # a point may have been found twice in a photo
     seen = seen[first]
-    return ColmapView(name, dataclasses.replace(lens, world_to_camera=matrix), seen["uv"].copy(), seen["id"].copy())
+    camera = checked_camera(lens.K, matrix, lens.width, lens.height, f"the pose of {name}", dtype=torch.float64)
+    return ColmapView(name, camera, seen["uv"].copy(), seen["id"].copy())
 
 
 # The records of each file. A damaged file raises struct.error, ValueError or the like.

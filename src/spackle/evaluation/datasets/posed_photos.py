@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
@@ -21,11 +22,13 @@ from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
 from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, pair_of_2014
+from spackle.formats.camera_files import checked_camera
 
 ETH3D_MODEL = "dslr_calibration_undistorted"
 LLFF_PHOTOS = ("images_4", "images", "images_8")  # the first that is there
 LLFF_BOUNDS = "poses_bounds.npy"
 MAX_POSES_BYTES = 1 << 24
+POSE_TOLERANCE = 0.05  # of published poses' rotations, see `checked_camera`
 MIDDLE_DEPTH_M = 0.8  # objects are held before the phone; so second views are 4 to 20 cm beside
 
 
@@ -153,7 +156,8 @@ def _llff_cases(scene: Path) -> list[Case]:
     views = []
     for photo, row in zip(photos, rows, strict=True):  # a scene has one or the other
         near, far = bounds[photo]
-        views.append(Posed(f"{scene.name}/{photo.stem}", photo, _camera_of_row(row), 2 / (1 / near + 1 / far)))
+        camera = _camera_of_row(row, f"{scene / LLFF_BOUNDS}: {photo.name}")
+        views.append(Posed(f"{scene.name}/{photo.stem}", photo, camera, 2 / (1 / near + 1 / far)))
     return make_cases(views, bounds=bounds)
 
 
@@ -173,7 +177,7 @@ def _read_bounds(path: Path, count: int) -> NDArray[Any]:
     return table
 
 
-def _camera_of_row(row: NDArray[Any]) -> Camera:
+def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
     """A row of `poses_bounds.npy` as a float64 camera: down, right, backwards, the eye; height, width, focal length."""
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
     down, right, backwards, eye, lens = matrix.unbind(1)
@@ -181,7 +185,13 @@ def _camera_of_row(row: NDArray[Any]) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = torch.stack([right, down, -backwards, eye], dim=1)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(K, torch.linalg.inv(pose), round(width), round(height))
+    return _from_world_pose(K, pose, round(width), round(height), where)
+
+
+def _from_world_pose(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
+    """A float64 camera by its pose in the world; InputError where one of them cannot be."""
+    camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
+    return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
 
 
 def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
@@ -250,7 +260,8 @@ def _views(name: str, scene: Path) -> list[Posed]:
     views = []
     for number, pose in _poses(scene / "cam_poses.txt"):
         if photo := there.get(f"{number:05d}"):
-            camera = dataclasses.replace(lens, world_to_camera=torch.linalg.inv(torch.from_numpy(pose)))
+            where = f"{scene / 'cam_poses.txt'}: {photo.name}"
+            camera = _from_world_pose(lens.K, torch.from_numpy(pose), lens.width, lens.height, where)
             views.append(Posed(f"{name}/{photo.stem}", photo, camera, MIDDLE_DEPTH_M))
     check_two(scene, len(views))
     return views
@@ -261,22 +272,18 @@ def _lens(path: Path) -> Camera:
         facts = json.loads(read_text(path, "description of the camera"))
         width, height = int(facts["w"]), int(facts["h"])
         K = torch.tensor(facts["K"], dtype=torch.float64).reshape(3, 3).T.clone()
-        if not (torch.isfinite(K).all() and min(width, height, float(K[0, 0]), float(K[1, 1])) > 0):
-            raise ValueError("a size or a focal length is not positive")
-    except (ValueError, KeyError, TypeError, RuntimeError, RecursionError) as error:
+        K[:2, 2] += HALF_PIXEL
+        return checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, "the lens", dtype=torch.float64)
+    except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError) as error:
         raise InputError(
             f"{path}: not the metadata of a scene ({reason_in_a_line(error)}): needs w, h and K of nine numbers"
         ) from error
-    K[:2, 2] += HALF_PIXEL
-    return Camera(K, torch.eye(4, dtype=torch.float64), width, height)
 
 
 def _poses(path: Path) -> list[tuple[int, NDArray[Any]]]:
     try:
         rows = [line.split() for line in read_text(path, "list of poses", MAX_POSES_BYTES).splitlines() if line.strip()]
         found = [(int(row[0]), np.array(row[1:], np.float64).reshape(4, 4)) for row in rows]
-        if not all(np.isfinite(pose).all() and abs(np.linalg.det(pose)) > 0.5 for _, pose in found):
-            raise ValueError("a pose is no rotation")
     except ValueError as error:
         raise InputError(
             f"{path}: not a list of poses ({reason_in_a_line(error)}): needs a frame and 16 numbers a line"

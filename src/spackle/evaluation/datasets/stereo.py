@@ -261,7 +261,7 @@ def _read_opencv(path: Path) -> Calibration:
         left, right = (matrix(entries[name]) for name in ("proj_matL", "proj_matR"))
         cx, baseline = float(left[0, 2]), float(entries["baselineLR"].text or "") / 1000
         lens = Calibration(float(left[0, 0]), cx, float(left[1, 2]), float(right[0, 2]) - cx, baseline)
-    except (ElementTree.ParseError, KeyError, ValueError, IndexError) as error:
+    except (ElementTree.ParseError, KeyError, ValueError, IndexError, OverflowError) as error:
         raise InputError(
             f"{path}: not a Booster calibration ({reason_in_a_line(error)}): needs proj_matL, proj_matR and baselineLR"
         ) from error
