@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
     """A picture [..., H, W, C] under a Gaussian of `sigma` pixels; what lies beyond the border has no weight."""
-    reach = math.ceil(3 * sigma)
-    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
-    line = torch.exp(-0.5 * (offsets / sigma) ** 2).to(image).view(1, 1, 1, -1)
-    lead, (height, width, channels) = image.shape[:-3], image.shape[-3:]
-    planes = image.reshape(-1, height, width, channels).movedim(-1, 1).reshape(-1, 1, height, width)
-    ones = planes.new_ones(1, 1, height, width)
+    weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(math.ceil(3 * sigma) + 1)]
+    for dim in (-2, -3):
+        mass = _weighted_sum(image.new_ones(image.shape[dim]), weights, 0)
+        image = _weighted_sum(image, weights, dim) / mass.view(-1, *[1] * (-1 - dim))
+    return image
 
-    def smeared(maps: Tensor) -> Tensor:
-        return conv2d(conv2d(maps, line, padding=(0, reach)), line.mT, padding=(reach, 0))
 
-    mean = (smeared(planes) / smeared(ones)).reshape(-1, channels, height, width)
-    return mean.movedim(1, -1).reshape(*lead, height, width, channels)
+def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
+    """Of neighbours along a dimension, to both sides: many times faster on a processor than a thin convolution."""
+    size = values.shape[dim]
+    total = weights[0] * values
+    for offset, weight in enumerate(weights[1 : size], start=1):
+        total.narrow(dim, 0, size - offset).add_(values.narrow(dim, offset, size - offset), alpha=weight)
+        total.narrow(dim, offset, size - offset).add_(values.narrow(dim, 0, size - offset), alpha=weight)
+    return total

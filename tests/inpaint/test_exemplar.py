@@ -68,6 +68,23 @@ def test_votes_are_those_of_a_plain_loop() -> None:
         np.testing.assert_allclose(found[tuple(cell)], expected, rtol=1e-5)
 
 
+def test_blocks_are_those_of_the_matches_around_a_cell() -> None:
+    subject, rng = Subject(24, 31), np.random.default_rng(3)
+    places, costs = np.full((24, 31, 3), -1, np.int32), np.zeros((24, 31), np.float32)
+    places[tuple(subject.cells.T)], costs[tuple(subject.cells.T)] = subject.places, subject.costs
+    blocks = rng.random((24, 31, 2, 3, 1)).astype(np.float32)
+    grids = [torch.from_numpy(grid) for grid in (subject.level.rgb, np.sqrt(costs), places)]
+    found = room.Exemplar(*grids).of_blocks(torch.from_numpy(blocks)).numpy()
+    assert np.array_equal(found[~subject.level.hole], blocks[~subject.level.hole])
+    sources = (blocks, blocks[:, ::-1, :, ::-1])
+    for cell in subject.cells:
+        over = np.abs(subject.cells - cell).max(1) <= 1
+        moved = subject.places[over] + np.pad(cell - subject.cells[over], [(0, 0), (1, 0)])
+        weights = np.exp(-room.BLOCK_CHOICE * subject.costs[over] / subject.costs.mean()) + 1e-6
+        expected = np.average([sources[m][v, u] for m, v, u in moved], axis=0, weights=weights)
+        np.testing.assert_allclose(found[tuple(cell)], expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize("width", [61, 62])
 def test_a_level_begins_where_its_parent_ended_also_in_a_mirrored_picture_of_odd_size(width: int) -> None:
     coarse, fine = Subject(25, 31), Subject(49, width)

@@ -41,7 +41,8 @@ FAINTEST_CELL = np.float32(1e-30)  # weight of the deepest: still far from what 
 DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.04, math.sqrt(2), 0.05
 LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
 SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
-FAINTEST_VOTE, LEAST_COST = np.float32(1e-6), 1e-8
+FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
+BLOCK_CHOICE = 3.0  # how much harder votes for blocks depend on their costs
 FAR = 1 << 14  # cells to a place that is not there
 GRAIN = 256  # cells that a thread takes at a time
 
@@ -56,6 +57,32 @@ class Exemplar:
 
     rgb: Tensor  # [H, W, 3] sRGB; outside of the hole as it was
     mismatch: Tensor  # [H, W] root of the cost of each cell's patch; 0 outside of the hole
+    matches: Tensor  # [H, W, 3] picture (1 is the mirrored one), row, column of that patch; -1 where there is none
+
+    def of_blocks(self, blocks: Tensor) -> Tensor:
+        """The same of a finer picture, of which each cell is a block: [H, W, k, k, c], in the hole as elsewhere in it.
+
+        A block is the mean of those that its cell's own match and its eight neighbours' say, the better ones counting
+        more. In `rgb` whole patches have a say, and what is fine is lost.
+        """
+        height, width = self.mismatch.shape
+        sources = torch.stack([blocks, blocks.flip(1, 3)])
+        there = self.matches[..., 0] >= 0
+        y, x = there.nonzero(as_tuple=True)
+        costs = self.mismatch.square()
+        limit = (costs[there].mean() / BLOCK_CHOICE).clamp_min(LEAST_COST)
+        total, mass = torch.zeros_like(blocks[y, x]), torch.zeros_like(costs[y, x])
+        for dy, dx in itertools.product((-1, 0, 1), repeat=2):
+            v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
+            source, row, column = self.matches[v, u].long().unbind(-1)
+            counts = (v == y + dy) & (u == x + dx) & there[v, u]  # and then its patch lies within its source
+            weight = counts * ((-costs[v, u] / limit).exp() + FAINTEST_VOTE)
+            found = sources[source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)]
+            total += weight[:, None, None, None] * found
+            mass += weight
+        filled = blocks.clone()
+        filled[y, x] = total / mass[:, None, None, None]
+        return filled
 
 
 class ExemplarInpainter(PlainInpainter):
@@ -95,10 +122,10 @@ def exemplar(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Exemplar:
     matches = None
     for number in reversed(range(len(levels))):
         matches = _fit(levels[number], matches, number)
-    mismatch = np.zeros(hole.shape, np.float32)
+    mismatch, places = np.zeros(hole.shape, np.float32), np.full((*hole.shape, 3), -1, np.int32)
     if matches is not None:
-        mismatch[levels[0].hole] = np.sqrt(matches.costs)
-    return Exemplar(torch.from_numpy(levels[0].rgb).to(guess.device), torch.from_numpy(mismatch).to(guess.device))
+        mismatch[levels[0].hole], places[levels[0].hole] = np.sqrt(matches.costs), matches.places
+    return Exemplar(*(torch.from_numpy(grid).to(guess.device) for grid in (levels[0].rgb, mismatch, places)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -388,7 +415,7 @@ def _vote(
                     continue
                 # A patch lies within its source, so this is there.
                 m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
-                weight = np.float32(np.exp(-costs[k] / mean)) + FAINTEST_VOTE
+                weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(FAINTEST_VOTE)
                 red += weight * sources[m, v, u, 0]
                 green += weight * sources[m, v, u, 1]
                 blue += weight * sources[m, v, u, 2]

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import torch
+from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
@@ -17,18 +18,19 @@ from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
-from spackle.residual.hole_features import MASK_THRESHOLD, Cues, hole_area_ratio
+from spackle.residual.hole_features import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, in_cells
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
 from spackle.residual.rim_underlay import rim_underlay
-from spackle.residual.seeds import Rim, make_seeds
-from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
+from spackle.residual.seeds import BEHIND, FINE_SPREAD_PX, Rim, Seeds, fitting_patches, make_seeds
+from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture, sharpened
 from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first, reach_of
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 WIDEST = 8  # views of a path whose own content stays in front from the first
 PAINTED_VIEWS = 2  # of a scene for which an inpainter paints: the widest ones
+FLAT = 0.005  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
 
@@ -161,7 +163,10 @@ class Completer:
         return dataclasses.replace(self, texture=EXEMPLAR)
 
     def _propose(self, rendering: Rendering, camera: Camera, underlay: bool) -> Gaussians:
-        """Masked selection (eq. 7): one Gaussian for each masked cell of a rendering; and those beneath the rims."""
+        """Masked selection (eq. 7): a Gaussian for each masked cell of a rendering, with a texture one for each pixel.
+
+        With `underlay` also those beneath the rims.
+        """
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return Gaussians.empty()
@@ -170,13 +175,36 @@ class Completer:
         if self.network is None and self.texture is None:
             new = compose(chosen, None, camera)
         else:
-            rim, deltas = Rim.of(cues, seeds, camera, self.photo_camera), None
+            patches = fitting_patches(cues, seeds)
+            rim, deltas = Rim.of(cues, seeds, camera, self.photo_camera, patches), None
             if self.network is not None:
                 deltas = predict_deltas(self.network, cues, seeds, rim, self.precision)[cues.mask]
             new = compose(chosen, deltas, camera)
             if self.texture is not None:
                 structure = cues.rgb.clone()
                 structure[cues.mask] = linear_to_srgb(new.colors)
-                colors = self.texture.colors(structure, rendering, cues, seeds, rim)[cues.mask]
-                new = dataclasses.replace(new, colors=srgb_to_linear(colors.clamp(0, 1)))
+                picture = self.texture.colors(structure, rendering, cues, seeds, rim, patches)
+                colors = (in_cells(image)[cues.mask] for image in (picture, sharpened(picture)))
+                new = Gaussians.cat(_in_pixels(chosen, deltas, camera, *colors))
         return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new
+
+
+def _in_pixels(
+    chosen: Seeds, deltas: Tensor | None, camera: Camera, wanted: Tensor, blobs: Tensor
+) -> tuple[Gaussians, Gaussians]:
+    """Gaussians for the pixels of the chosen cells, and behind them one for each cell, as a lifted photo has them.
+
+    Args:
+        chosen: flat seeds [n] of cells.
+        deltas: [n, 14], or None.
+        camera: the view.
+        wanted: [n, 2, 2, 3] sRGB that the pixels are to show.
+        blobs: the same of the pixels' Gaussians, which overlap.
+    """
+    back = dataclasses.replace(chosen, inverse_depth=(1 - BEHIND) * chosen.inverse_depth)
+    own = None if deltas is None else deltas.repeat_interleave(CELL**2, 0)
+    shown, colors = (srgb_to_linear(image.flatten(1, 2).clamp(0, 1)) for image in (wanted, blobs))
+    cells = dataclasses.replace(compose(back, deltas, camera), colors=shown.mean(1))
+    pixels = dataclasses.replace(compose(chosen.for_pixels(), own, camera, FINE_SPREAD_PX), colors=colors.flatten(0, 1))
+    rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
+    return pixels.select(rough.repeat_interleave(CELL**2)), cells

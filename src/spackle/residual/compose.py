@@ -33,13 +33,14 @@ MIN_SCALE, MAX_SCALE = 0.25, 4.0  # bounds of the scale factor, which is 1, with
 COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
 
 
-def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera) -> Gaussians:
+def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX) -> Gaussians:
     """Aux Gaussians [n] of flat seeds; deltas of None or zero give the seeds themselves.
 
     Args:
         seeds: flat, as `Seeds.select` gives them: fields [n, ...].
         deltas: [n, 14], or None. Gradients flow through them.
         camera: the view that the seeds belong to.
+        spread_px: standard deviation of a blob.
     """
     uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
     opacities = torch.full_like(inverse_depth, OPACITY)
@@ -49,7 +50,7 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera) -> Gaussians:
         inverse_depth = _shift_positive(inverse_depth, shift, seeds.unit)
         rgb = torch.sigmoid(color_logit(rgb) + deltas[:, COLOR])
         opacities = torch.sigmoid(color_logit(opacities) + deltas[:, ALPHA].squeeze(1))
-    surfels = surface_gaussians(camera, uv, inverse_depth, seeds.slope, SPREAD_PX, srgb_to_linear(rgb), opacities)
+    surfels = surface_gaussians(camera, uv, inverse_depth, seeds.slope, spread_px, srgb_to_linear(rgb), opacities)
     if deltas is None:
         return surfels
     quats = surfels.quats + QUAT_GAIN * deltas[:, QUAT]

@@ -68,6 +68,19 @@ class Cues:
         return ~self.mask
 
 
+def in_cells(picture: Tensor) -> Tensor:
+    """The pixels of each cell, [h, w, 2, 2, c] of [H, W, c]; an odd last row or column stands for its twin too."""
+    below, beside = (size % CELL for size in picture.shape[:2])
+    whole = torch.cat([picture, picture[-1:]]) if below else picture
+    whole = torch.cat([whole, whole[:, -1:]], dim=1) if beside else whole
+    return whole.unflatten(0, (-1, CELL)).unflatten(2, (-1, CELL)).transpose(1, 2)
+
+
+def from_cells(blocks: Tensor) -> Tensor:
+    """The picture [2h, 2w, c] of pixels [h, w, 2, 2, c]."""
+    return blocks.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+
+
 @kernel
 def _gather(
     start: int, stop: int, rgb: Any, depth: Any, alpha: Any, threshold: Any,

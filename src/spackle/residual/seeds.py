@@ -17,7 +17,7 @@ from spackle._numba import kernel
 from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.inpaint.exemplar import exemplar
+from spackle.inpaint.exemplar import Exemplar, exemplar
 from spackle.residual import dense
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
@@ -25,6 +25,7 @@ from spackle.surface import surface_slope
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
+FINE_SPREAD_PX = 0.5  # of one blob a pixel, which a wide one for its cell backs
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
@@ -48,6 +49,14 @@ class Seeds:
         fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
         uv, inverse_depth, slope, rgb = (field.flatten(0, lead)[index.to(field.device)] for field in fields)
         return Seeds(uv, inverse_depth, slope, rgb, self.unit)
+
+    def for_pixels(self) -> Seeds:
+        """Of flat seeds [n, ...] those of their cells' pixels [4n, ...], row by row in each cell."""
+        offsets = self.uv.new_tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+        uv = (self.uv[:, None] + offsets).flatten(0, 1)
+        rise = (self.slope[:, None] * offsets).sum(-1).flatten()
+        inverse_depth, slope, rgb = (field.repeat_interleave(4, 0) for field in (self.inverse_depth, self.slope, self.rgb))
+        return Seeds(uv, (inverse_depth + rise).clamp_min(0.5 * inverse_depth), slope, rgb, self.unit)
 
 
 def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
@@ -162,6 +171,12 @@ def cell_centers(camera: Camera) -> Tensor:
     return camera.even().pixel_centers(stride=CELL)
 
 
+def fitting_patches(cues: Cues, seeds: Seeds) -> Exemplar:
+    """Patches of the view that fit its masked cells, for their tone by the seeds' colours."""
+    guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
+    return exemplar(guess, cues.mask, seeds.inverse_depth)
+
+
 @dataclasses.dataclass(frozen=True)
 class Rim:
     """For each masked cell, what its line meets; elsewhere the cell itself."""
@@ -174,7 +189,9 @@ class Rim:
     beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
 
     @staticmethod
-    def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera) -> Rim:
+    def of(
+        cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera, patches: Exemplar | None = None
+    ) -> Rim:
         """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
@@ -196,10 +213,9 @@ class Rim:
                 GRAIN,
             )
             far, near, steps = (torch.from_numpy(grid) for grid in grids)
-        guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
-        texture = exemplar(guess, cues.mask, seeds.inverse_depth)
+        patches = patches or fitting_patches(cues, seeds)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
-        return Rim(far, near, steps, texture.rgb, texture.mismatch, beyond)
+        return Rim(far, near, steps, patches.rgb, patches.mismatch, beyond)
 
 
 @kernel

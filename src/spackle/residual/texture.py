@@ -11,38 +11,53 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import interpolate
 
 from spackle.blur import blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.inpaint.exemplar import nearest_known
+from spackle.inpaint.exemplar import Exemplar, nearest_known
 from spackle.render.protocol import Rendering
-from spackle.residual.hole_features import CELL, Cues, hole_mask
-from spackle.residual.seeds import SPREAD_PX, Rim, Seeds
+from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in_cells
+from spackle.residual.seeds import Rim, Seeds
 
-TEXTURE_CELLS = 1.5  # standard deviation: what this blur takes away is texture, what it leaves is structure
-GAIN, GOOD_FIT = 0.9, 0.15  # of texture that fits perfectly; mismatch at which a third of it is left
+TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
+GOOD_FIT = 0.18  # mismatch at which a third of the texture is left
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
-OVERLAP_CELLS = SPREAD_PX / CELL  # standard deviation of a blob
+OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
 STEPS = 2
 
 
 class Texture(Protocol):
-    """Gives the cells of a hole their colours."""
+    """Says which colours the pixels of a hole are to show."""
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
-        """Colours [h, w, 3] sRGB of blobs: those of masked cells count; `structure` [h, w, 3] is the residual's."""
+    def colors(
+        self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim, patches: Exemplar
+    ) -> Tensor:
+        """Colours [2h, 2w, 3] sRGB that pixels are to show: those of masked cells count.
+
+        Args:
+            structure: [h, w, 3] sRGB, the residual's.
+            rendering: of the view.
+            cues, seeds, rim: of its cells.
+            patches: that fit its masked cells.
+        """
         ...
 
 
 class ExemplarTexture:
     """High frequencies of the view itself over the residual's structure; at its border the photo goes on."""
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+    def colors(
+        self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim, patches: Exemplar
+    ) -> Tensor:
         """See `Texture.colors`."""
-        fine = rim.exemplar - blurred(rim.exemplar, TEXTURE_CELLS)
-        gain = GAIN * (-rim.mismatch / GOOD_FIT).exp()[..., None]
-        return sharpened(continued(structure, cues, seeds, rim), 1) + sharpened(gain * fine)
+        known = in_cells(rendering.rgb)
+        found = from_cells(patches.of_blocks(known))
+        gain = (-patches.mismatch / GOOD_FIT).exp()[..., None, None, None].expand_as(known)
+        fine = from_cells(gain) * (found - blurred(found, TEXTURE_PX))
+        smooth = in_cells(_magnified(continued(structure, cues, seeds, rim), cues.mask))
+        masked = cues.mask[..., None, None, None]
+        return from_cells(torch.where(masked, smooth, known)) + fine
 
 
 EXEMPLAR = ExemplarTexture()
@@ -54,14 +69,20 @@ class PaintedTexture:
 
     painter: Inpainter
 
-    def colors(self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+    def colors(
+        self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim, patches: Exemplar
+    ) -> Tensor:
         """See `Texture.colors`."""
         hole = hole_mask(rendering.alpha)
         views = (rendering.rgb[None], hole[None], known_inverse_depth(rendering.depth, hole)[None])
-        painted = self.painter.paint(*views)[0].permute(2, 0, 1)
-        share = avg_pool2d(hole[None].to(painted), CELL, ceil_mode=True)[0, ..., None]
-        cells = avg_pool2d(painted * hole, CELL, ceil_mode=True).permute(1, 2, 0) / share.clamp_min(1e-6)
-        return sharpened(torch.where(share > 0, cells, cues.rgb))
+        return from_cells(in_cells(self.painter.paint(*views)[0]))
+
+
+def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
+    """A pixel's colours [2h, 2w, 3] between those of the cells [h, w, 3] around it, masked ones [h, w] alone."""
+    both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
+    pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
+    return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
 
 
 def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
@@ -78,11 +99,11 @@ def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 
 
 def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
-    """Colours [h, w, c] of blobs that show the wanted ones [h, w, c] where they overlap, by Jacobi steps.
+    """Colours [H, W, c] of blobs that show the wanted ones [H, W, c] where they overlap, by Jacobi steps.
 
-    A cell shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_CELLS.
+    A pixel shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_PX.
     """
     colors = wanted
     for _ in range(steps):
-        colors = colors + wanted - blurred(colors, OVERLAP_CELLS)
+        colors = colors + wanted - blurred(colors, OVERLAP_PX)
     return colors
