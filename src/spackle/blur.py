@@ -21,7 +21,7 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
     """Of neighbours along a dimension, to both sides: many times faster on a processor than a thin convolution."""
     size = values.shape[dim]
     total = weights[0] * values
-    for offset, weight in enumerate(weights[1 : size], start=1):
+    for offset, weight in enumerate(weights[1:size], start=1):
         total.narrow(dim, 0, size - offset).add_(values.narrow(dim, offset, size - offset), alpha=weight)
         total.narrow(dim, offset, size - offset).add_(values.narrow(dim, 0, size - offset), alpha=weight)
     return total

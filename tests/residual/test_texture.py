@@ -110,7 +110,9 @@ def test_a_painted_picture_is_asked_for_once_and_reaches_the_hole(size: tuple[in
 def test_a_scene_asks_for_its_widest_views_and_goes_on_from_the_exemplar(monkeypatch: pytest.MonkeyPatch) -> None:
     subject, _, painter = painted_box((96, 72))
     later: list[Tensor] = []
-    monkeypatch.setattr(ExemplarTexture, "colors", lambda self, structure, *_: later.append(structure) or structure.repeat(2, 2, 1))
+    monkeypatch.setattr(
+        ExemplarTexture, "colors", lambda self, structure, *_: later.append(structure) or structure.repeat(2, 2, 1)
+    )
     path = trajectory("rotate-forward", subject.photo_camera, 0.4, DepthRange.of(subject.base), 9)
     subject.complete_scene(path, exact=True)
     assert (len(painter.asked), len(later) > 0) == (PAINTED_VIEWS, True)
@@ -123,7 +125,9 @@ def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None
     patches = fitting_patches(cues, seeds)
     structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
     found, plain = (
-        EXEMPLAR.colors(structure, view, cues, seeds, rim, dataclasses.replace(patches, mismatch=patches.mismatch + bad))
+        EXEMPLAR.colors(
+            structure, view, cues, seeds, rim, dataclasses.replace(patches, mismatch=patches.mismatch + bad)
+        )
         for bad in (0, 100)
     )
     fine = found - plain

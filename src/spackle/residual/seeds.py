@@ -55,7 +55,8 @@ class Seeds:
         offsets = self.uv.new_tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
         uv = (self.uv[:, None] + offsets).flatten(0, 1)
         rise = (self.slope[:, None] * offsets).sum(-1).flatten()
-        inverse_depth, slope, rgb = (field.repeat_interleave(4, 0) for field in (self.inverse_depth, self.slope, self.rgb))
+        fields = (self.inverse_depth, self.slope, self.rgb)
+        inverse_depth, slope, rgb = (field.repeat_interleave(len(offsets), 0) for field in fields)
         return Seeds(uv, (inverse_depth + rise).clamp_min(0.5 * inverse_depth), slope, rgb, self.unit)
 
 
@@ -189,9 +190,7 @@ class Rim:
     beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
 
     @staticmethod
-    def of(
-        cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera, patches: Exemplar | None = None
-    ) -> Rim:
+    def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera, patches: Exemplar | None = None) -> Rim:
         """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
