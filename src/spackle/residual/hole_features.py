@@ -73,7 +73,8 @@ def in_cells(picture: Tensor) -> Tensor:
     below, beside = (size % CELL for size in picture.shape[:2])
     whole = torch.cat([picture, picture[-1:]]) if below else picture
     whole = torch.cat([whole, whole[:, -1:]], dim=1) if beside else whole
-    return whole.unflatten(0, (-1, CELL)).unflatten(2, (-1, CELL)).transpose(1, 2)
+    rows, columns = (size // CELL for size in whole.shape[:2])
+    return whole.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
 
 
 def from_cells(blocks: Tensor) -> Tensor:
