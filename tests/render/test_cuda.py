@@ -21,7 +21,7 @@ from torch import Tensor
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer, cuda, get_renderer, render_batch
+from spackle.render import CpuRenderer, cuda, get_renderer, render_batch, touched_tiles
 from spackle.render.cuda import (
     VERSIONS,
     GsplatRenderer,
@@ -166,7 +166,7 @@ def test_the_host_waits_once_and_nothing_is_left_on_another_device(
     assert all(isinstance(t.grad, FarTensor) for t in asking.tensors)
     drawn = gpu.render(BASE, SIDE)  # one wait more: the images come back together
     assert far_device.waits == ["isect_tiles"] * 2 + ["aten._to_copy.default"]
-    assert same_bits(drawn, cuda._at(gpu.render(there, SIDE), torch.device("cpu")))
+    assert same_bits(drawn, gpu.render(there, SIDE).to(torch.device("cpu")))
 
 
 def test_covariances_are_single_precision_whatever_the_caller_has_set() -> None:
@@ -336,3 +336,10 @@ def test_each_step_of_the_gpus_first_minutes_says_why_it_is_skipped_without_one(
     for step in steps.STEPS:
         with pytest.raises(steps.Skip, match=r"GPU|gsplat|path"):
             list(step(argparse.Namespace(checkpoint=None)))
+
+
+def test_touched_tiles_hold_all_that_the_processor_finds(gpu: GsplatRenderer) -> None:
+    for part in (BASE.select(slice(0, 7)), BASE.select(slice(300, 340)), Gaussians.empty()):
+        found, expected = gpu.touched_tiles(part, SIDE).cpu(), touched_tiles(part, SIDE)
+        assert bool((found >= expected).all())
+        assert int((found & ~expected).sum()) <= 2

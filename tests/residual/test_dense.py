@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 import torch
-from far_device import FarDevice, far_device
-from holes import random_view
+from far_device import FarDevice, Watched, far_device
+from holes import box_view, random_network, random_view
 from scenes import away, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
+from spackle.render import CpuRenderer, GsplatRenderer, cuda
 from spackle.render.protocol import Rendering
 from spackle.residual import Cues, make_seeds
 from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
@@ -103,3 +104,23 @@ def test_what_is_pushed_goes_as_far(far_device: FarDevice) -> None:
     expected, found = push_behind(aux, eye, guards), push_behind(to_far(aux), eye, [to_far(g) for g in guards])
     assert len(found) == len(expected)
     agree(found, expected)
+
+
+def test_a_view_and_a_path_are_completed_where_the_renderer_is(
+    far_device: FarDevice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    completer, camera = box_view(width=48, height=36)
+    completer = dataclasses.replace(completer, network=random_network())
+    expected = completer.complete_view(camera)
+    path = [camera, shifted(camera, 0.1)]
+    along = completer.complete_scene(path, exact=True)
+    monkeypatch.setattr(cuda, "load_gsplat", lambda device: Watched(far_device))
+    there = dataclasses.replace(completer, renderer=GsplatRenderer("meta"))
+    found, view = there.completed_view(camera)
+    assert found.means.device == view.rgb.device == torch.device("cpu")
+    assert abs(len(found) - len(expected)) <= 0.02 * len(expected)
+    drawn, best = (CpuRenderer().render([completer.base, aux], camera) for aux in (found, expected))
+    assert float((drawn.rgb - best.rgb).abs().mean()) < 0.005
+    assert float((view.rgb - drawn.rgb).abs().mean()) < 1e-4
+    assert float(drawn.alpha.min()) > 0.5
+    assert abs(len(there.complete_scene(path, exact=True)) - len(along)) <= 0.05 * len(along)

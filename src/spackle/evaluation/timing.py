@@ -71,6 +71,9 @@ class _LappedRenderer:
     renderer: Renderer
     lap: Lap
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.renderer, name)
+
     def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
         self.lap("completion")
         drawn = self.renderer.render(gaussians, camera, **options)
@@ -81,6 +84,7 @@ class _LappedRenderer:
 @torch.no_grad()
 def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussians:
     """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
+    completer = completer.there
     before = completer.renderer.render(completer.base, camera)
     lap("view")
     guard = completer.photo_guard()

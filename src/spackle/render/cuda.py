@@ -172,8 +172,21 @@ class GsplatRenderer:
                 if here is not None:
                     kept = [] if under is None else [t.to(view.rgb, non_blocking=True) for t in under.tensors]
                     view = paste(view, here, Rendering(*kept) if kept else None)
-                results.append(_at(view, parts[0].means.device if len(parts) else torch.device("cpu")))
+                results.append(view.to(parts[0].means.device if len(parts) else torch.device("cpu")))
         return results
+
+    def touched_tiles(self, gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> Tensor:
+        """[rows, columns] bool on the GPU, see `spackle.render.touched_tiles`; tiles that boxes touch, more or less."""
+        rows, columns = tile_grid(camera.height, camera.width)
+        corners = torch.zeros((rows + 1) * (columns + 1), dtype=torch.int32, device=self.device)
+        if len(gaussians):
+            (numbers,) = self._numbers([camera])
+            _, seen = self._seen(gaussians, camera, *numbers, eps2d)
+            there = (seen.radii > 0).all(-1).int()
+            left, top, right, bottom = _boxes(seen.means2d.detach(), seen.radii, rows, columns)
+            for y, x, sign in ((top, left, 1), (bottom, right, 1), (top, right, -1), (bottom, left, -1)):
+                corners.index_add_(0, y * (columns + 1) + x, sign * there)
+        return corners.view(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns] > 0
 
     def _draw(
         self,
@@ -248,15 +261,6 @@ class GsplatRenderer:
         return self._store.seen(part, (eps2d, camera.width, camera.height, numbers), project)
 
 
-def _at(view: Rendering, place: torch.device) -> Rendering:
-    """The images at a place; in one copy, for each waits for the GPU."""
-    if view.rgb.device == place:
-        return view
-    flat = torch.cat([image.flatten() for image in view.tensors]).to(place)
-    parts = torch.split(flat, [image.numel() for image in view.tensors])
-    return Rendering(*(part.view(image.shape) for part, image in zip(parts, view.tensors, strict=True)))
-
-
 @contextlib.contextmanager
 def _enough_memory(what: str) -> Iterator[None]:
     """Turn a shortage of memory into one `MemoryShort` line."""
@@ -311,16 +315,19 @@ def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
     """[N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
     rows, columns = wanted.shape
     before = torch.nn.functional.pad(wanted.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).flatten()  # [(rows+1)(columns+1)]
-    radii = radii.to(means2d)
-
-    def tile(place: Tensor) -> tuple[Tensor, Tensor]:  # of what is out of sight gsplat leaves the place as it was
-        x, y = place.nan_to_num(0, 0, 0).unbind(-1)
-        return x.clamp(0, columns).long(), y.clamp(0, rows).long()
-
-    left, top = tile(((means2d - radii) / TILE).floor())
-    right, bottom = tile(((means2d + radii) / TILE).ceil())
+    left, top, right, bottom = _boxes(means2d, radii, rows, columns)
 
     def at(x: Tensor, y: Tensor) -> Tensor:
         return before[y * (columns + 1) + x]
 
     return ((at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)) > 0).int()
+
+
+def _boxes(means2d: Tensor, radii: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The tiles of each box, [N] long: left and top, right and bottom (exclusive)."""
+
+    def tile(place: Tensor) -> tuple[Tensor, Tensor]:  # of what is out of sight gsplat leaves the place as it was
+        x, y = place.nan_to_num(0, 0, 0).unbind(-1)
+        return x.clamp(0, columns).long(), y.clamp(0, rows).long()
+
+    return *tile(((means2d - radii) / TILE).floor()), *tile(((means2d + radii) / TILE).ceil())

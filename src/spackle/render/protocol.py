@@ -30,6 +30,14 @@ class Rendering:
         """The three images in field order."""
         return self.rgb, self.depth, self.alpha
 
+    def to(self, device: torch.device) -> Rendering:
+        """The images on another device; in one copy, for each waits for a GPU."""
+        if self.rgb.device == device:
+            return self
+        flat = torch.cat([image.flatten() for image in self.tensors]).to(device)
+        parts = torch.split(flat, [image.numel() for image in self.tensors])
+        return Rendering(*(part.view(image.shape) for part, image in zip(parts, self.tensors, strict=True)))
+
     def detach(self) -> Rendering:
         """The same values cut off from autograd."""
         return Rendering(*(image.detach() for image in self.tensors))

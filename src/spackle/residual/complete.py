@@ -5,7 +5,9 @@ The union 𝒢_final = 𝒢_base ∪ 𝒢̃_aug (eq. 8) is `Gaussians.cat([base,
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import torch
@@ -15,7 +17,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.render import Renderer, touched_tiles
+from spackle.render import Renderer, place_of, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, in_cells
@@ -49,8 +51,19 @@ class Completer:
     threshold: float = MASK_THRESHOLD
     precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
 
+    @functools.cached_property
+    def there(self) -> Completer:
+        """The same with base and network where the renderer computes, so that nothing travels but what comes of it."""
+        place = place_of(self.renderer)
+        if self.base.means.device.type == place.type:
+            return self
+        network = None if self.network is None else copy.deepcopy(self.network).to(place)
+        return dataclasses.replace(self, base=self.base.to(place), network=network)
+
     def photo_guard(self) -> OcclusionGuard:
         """What the photo itself shows: no completion may stand in front of that."""
+        if self.there is not self:
+            return self.there.photo_guard()
         rendering = self.renderer.render(self.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
@@ -81,6 +94,11 @@ class Completer:
             rendering: base and aux from this view, where that is at hand.
         """
         guards = [self.photo_guard()] if guards is None else guards
+        if self.there is not self:
+            home, place = self.base.means.device, self.there.base.means.device
+            moved = [part if part is None else part.to(place) for part in (aux, rendering)]
+            new, view = self.there.completed_view(camera, [guard.to(place) for guard in guards], *moved)  # type: ignore[arg-type]
+            return new.to(home), view.to(home)
         there = [self.base] if aux is None else [self.base, aux]
         return self._fill(camera, guards, there, rendering or self.renderer.render(there, camera))
 
@@ -102,12 +120,14 @@ class Completer:
         """
         if not cameras:
             return Gaussians.empty()
+        if self.there is not self:
+            return self.there.complete_scene(cameras, exact, progress).to(self.base.means.device)
         order = farthest_first(cameras, self.photo_camera)
         guards = {-1: self.photo_guard()}
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
             view = self.renderer.render(self.base, cameras[index])
             guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
-        settled, aux, filled = SettledFrames(len(cameras)), Gaussians.empty(), 0
+        settled, aux, filled = SettledFrames(len(cameras)), self._nothing, 0
         enough = CLOSED_HAR if exact else QUIET_HAR
         for count, index in enumerate(order):
             if exact or not settled.known(index):
@@ -138,7 +158,7 @@ class Completer:
         underlay: bool = False,
     ) -> tuple[Gaussians, Rendering]:
         """New aux Gaussians for a view, and the view with them; with `underlay` also beneath the rims of its holes."""
-        added = [Gaussians.empty()]
+        added = [self._nothing]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
             new = (self._seeds_alone if turn else self)._propose(rendering, camera, underlay)
@@ -146,11 +166,16 @@ class Completer:
                 break
             new = push_behind(new, camera.position, guards)
             added.append(new)
-            tiles = touched_tiles(new, camera)  # the others keep what they show
+            tiles = touched_tiles(new, camera, self.renderer)  # the others keep what they show
             rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
             if hole_area_ratio(rendering.alpha, self.threshold) < enough:
                 break
         return Gaussians.cat(added), rendering
+
+    @property
+    def _nothing(self) -> Gaussians:
+        """No Gaussians, beside the base's."""
+        return Gaussians.empty(self.base.means.device)
 
     @property
     def _seeds_alone(self) -> Completer:
@@ -169,7 +194,7 @@ class Completer:
         """
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
-            return Gaussians.empty()
+            return self._nothing
         seeds = make_seeds(cues, camera, self.photo_camera)
         chosen = seeds.select(cues.mask)
         if self.network is None and self.texture is None:

@@ -49,6 +49,10 @@ class OcclusionGuard:
         run_chunks(lambda start, stop: _widest(start, stop, depth, alpha, low, wide), len(depth), ROWS)
         return OcclusionGuard(camera, torch.from_numpy(wide))
 
+    def to(self, device: torch.device) -> OcclusionGuard:
+        """The same on another device."""
+        return OcclusionGuard(self.camera, self.depth.to(device))
+
 
 @kernel
 def _widest(start: int, stop: int, depth: Any, alpha: Any, threshold: Any, wide: Any) -> None:

@@ -52,7 +52,7 @@ class Seeds:
 
     def for_pixels(self) -> Seeds:
         """Of flat seeds [n, ...] those of their cells' pixels [4n, ...], row by row in each cell."""
-        offsets = self.uv.new_tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+        offsets = beside(torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]]), self.uv)
         uv = (self.uv[:, None] + offsets).flatten(0, 1)
         rise = (self.slope[:, None] * offsets).sum(-1).flatten()
         fields = (self.inverse_depth, self.slope, self.rgb)

@@ -75,7 +75,7 @@ class PaintedTexture:
         """See `Texture.colors`."""
         hole = hole_mask(rendering.alpha)
         views = (rendering.rgb[None], hole[None], known_inverse_depth(rendering.depth, hole)[None])
-        return from_cells(in_cells(self.painter.paint(*views)[0]))
+        return from_cells(in_cells(self.painter.paint(*(view.cpu() for view in views))[0].to(hole.device)))
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
