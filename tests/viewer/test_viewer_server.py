@@ -11,11 +11,28 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from viewer_client import PAGES, QUICK, a_scene, answer_of, ask, complete, dial, eventually, get, raw, send, serving
+import torch
+from viewer_client import (
+    PAGES,
+    QUICK,
+    a_scene,
+    answer_of,
+    ask,
+    complete,
+    dial,
+    events,
+    eventually,
+    get,
+    raw,
+    send,
+    serving,
+)
 
 from spackle.errors import InputError
+from spackle.formats import save_png
 from spackle.viewer.page import PageScene
 from spackle.viewer.server import ViewerServer
 from spackle.viewer.work import Tell
@@ -218,3 +235,33 @@ def test_where_nothing_can_listen_the_option_is_named(server: ViewerServer) -> N
         with pytest.raises(InputError) as caught:
             ViewerServer(PAGES, complete, **where)  # type: ignore[arg-type]
         assert str(caught.value).startswith(option)
+
+
+def test_a_scene_is_downloaded_in_the_formats_that_it_offers_as_long_as_it_is_kept() -> None:
+    with serving(bases=["auto", "lite"]) as server:
+        scene = dataclasses.replace(a_scene(), downloads={".ply": lambda: b"ply"})
+        description = ask(server, server.show(scene)).json
+        place = description["downloads"][".ply"]
+        assert (ask(server, place).status, ask(server, place).body) == (200, b"ply")
+        assert ask(server, "/scene.json").json["upload"]["bases"] == ["auto", "lite"]
+        for _ in range(QUICK.kept_scenes):
+            server.show(a_scene())
+        assert ask(server, place).status == 404
+
+
+def test_a_photos_choices_and_its_depth_map_reach_what_completes_it(tmp_path: Path) -> None:
+    heard: list[dict[str, Any]] = []
+
+    def choosing(photo: Path, name: str, tell: Tell, **choices: Any) -> PageScene:
+        read = {key: value.read_bytes() if isinstance(value, Path) else value for key, value in choices.items()}
+        heard.append({**read, "photo": photo.read_bytes()})
+        return a_scene(name)
+
+    save_png(torch.rand(8, 8, 3), tmp_path / "a.png")
+    photo, depth = (tmp_path / "a.png").read_bytes(), b"depth"
+    with serving(choosing) as server:
+        url = "/photos?name=a.png&base=lite&disparity=0.2&depth=.npy:"
+        for wrong in ("0", "99999999", "x"):
+            assert ask(server, url + wrong, "POST", photo + depth).status == 400
+        events(server, ask(server, url + str(len(depth)), "POST", photo + depth).json["job"])
+    assert heard == [{"base": "lite", "disparity": "0.2", "depth": depth, "photo": photo}]

@@ -43,6 +43,7 @@ async function first() {
   upload = state.upload;
   element("open").hidden = !upload;
   if (upload) element("file").accept = upload.suffixes.join(",");
+  element("choices").querySelector("select").replaceChildren(...(upload?.bases ?? []).map((name) => new Option(name)));
   if (state.scene) await show(await source.load(state.scene, (share) => progress("load", share)));
   if (state.job) await watch(state.job);
   else if (!state.scene) notice("Spackle", "Open a photo, or drop one here, to look around in it.");
@@ -59,6 +60,10 @@ async function show({ description, layers }) {
   await viewer.stage.settled();
   element("frame").classList.remove("waiting");
   element("notice").hidden = true;
+  const places = description.downloads ?? {};
+  const saved = element("download");
+  saved.hidden = !Object.keys(places).length;
+  saved.replaceChildren(saved.options[0], ...Object.entries(places).map(([suffix, place]) => new Option(suffix, place)));
   if (description.note) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
@@ -88,7 +93,7 @@ async function open(photo) {
   working = true;
   progress(null, null);
   try {
-    await watch(await source.send(photo));
+    await watch(await source.send(photo, choices()));
   } catch (error) {
     failed(error);
   }
@@ -97,8 +102,12 @@ async function open(photo) {
 
 function uploads() {
   const file = element("file");
-  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = () => file.click();
+  const dialog = element("choices");
+  const ask = () => (upload?.bases?.length ? dialog.showModal() : file.click());
+  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = ask;
+  element("choose").onclick = () => file.click();
   file.onchange = () => {
+    dialog.close();
     open(file.files[0]);
     file.value = "";
   };
@@ -113,6 +122,13 @@ function uploads() {
     document.body.classList.remove("dropping");
     if (holdsFile(event)) open(event.dataTransfer.files[0]);
   });
+}
+
+/** What the dialog says: {base, disparity, depth}. */
+function choices() {
+  const form = new FormData(element("choices").querySelector("form"));
+  element("choices").querySelector("[name=depth]").value = ""; // it is of one photo
+  return Object.fromEntries(form);
 }
 
 function notice(title, text, busy = false) {

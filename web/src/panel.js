@@ -1,5 +1,5 @@
 // The bar below the picture, what stands beside it, and the size of the picture.
-import { recorder, savePicture } from "./save.js";
+import { recorder, saveFile, savePicture } from "./save.js";
 
 const MOST_CROP = 0.62; // of the photo's width, or height, that a window of another shape still shows
 const element = (id) => document.getElementById(id);
@@ -24,6 +24,14 @@ export function panel(viewer, say) {
   }
   element("heat").onclick = () => viewer.setHeat(!viewer.stage.heat);
   element("compare").onclick = () => viewer.setCompare(viewer.stage.split === null ? 0.5 : null);
+  element("reset").onclick = () => viewer.home();
+  element("full").hidden = !document.fullscreenEnabled;
+  element("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
+  document.addEventListener("fullscreenchange", () => press("full", Boolean(document.fullscreenElement)));
+  element("download").onchange = ({ target }) => {
+    saveFile(viewer, target.value, target.selectedOptions[0].text);
+    target.value = "";
+  };
   element("shot").onclick = () => savePicture(viewer).catch((error) => say(`The picture was not saved: ${error.message}`));
   element("record").hidden = !record;
   element("record").onclick = async () => {

@@ -8,6 +8,11 @@ export async function savePicture(viewer) {
   download(blob, `${fileName(viewer)}.png`);
 }
 
+/** A file that the server makes of the scene. */
+export function saveFile(viewer, place, suffix) {
+  Object.assign(document.createElement("a"), { href: place, download: fileName(viewer) + suffix }).click();
+}
+
 function sharpest({ canvas, description }) {
   const { width, height } = description.camera;
   const larger = Math.max(1, width / canvas.width, height / canvas.height);

@@ -35,10 +35,14 @@ export async function load(url, onProgress = () => {}) {
   });
 }
 
-/** Give the server a photo; the URL of the job that completes it. */
-export async function send(photo) {
-  const url = `/photos?name=${encodeURIComponent(photo.name)}`;
-  const response = await fetch(url, { method: "POST", body: photo, headers: { "Content-Type": "application/octet-stream" } });
+/** Give the server a photo, and a depth map behind it; the URL of the job that completes it. */
+export async function send(photo, { base = "", disparity = "", depth = null } = {}) {
+  const fields = new URLSearchParams({ name: photo.name });
+  if (base) fields.set("base", base);
+  if (disparity) fields.set("disparity", disparity);
+  if (depth?.size) fields.set("depth", `${/\.[^.]*$/.exec(depth.name.toLowerCase())?.[0]}:${depth.size}`);
+  const body = depth?.size ? new Blob([photo, depth]) : photo;
+  const response = await fetch(`/photos?${fields}`, { method: "POST", body, headers: { "Content-Type": "application/octet-stream" } });
   return (await (await answer(response)).json()).job;
 }
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
+import functools
 import os
 import socket
 import sys
+import tempfile
 import threading
 import time
 import webbrowser
@@ -18,16 +21,18 @@ from spackle.app.export import page_of
 from spackle.app.video import PathOptions
 from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, ROUGH, BaseSettings
-from spackle.errors import InputError
+from spackle.downloads import installed
+from spackle.errors import InputError, check_name
 from spackle.formats.scene_files import SceneFile
 from spackle.image import Photo, check_file, load_photo
 from spackle.progress import Reporter, Step
-from spackle.scene import ResidualChoice
+from spackle.scene import ResidualChoice, Scene
 from spackle.signals import asked_to_stop
 from spackle.viewer import PageScene, page_files, page_scene
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell
 
+DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
 OPEN_TO_ALL = (
     "warning: everybody in the network can see this photo at --host {host}, send photos of their own and use this "
@@ -71,7 +76,8 @@ def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
     uploads = Uploads(options, reporter)
     begin = _first(target, options, uploads, reporter)
     with asked_to_stop(alone=True) as stopped:
-        server = ViewerServer(page_files(), uploads.complete, host=options.host, port=options.port, log=reporter.detail)
+        where = {"host": options.host, "port": options.port}
+        server = ViewerServer(page_files(), uploads.complete, **where, log=reporter.detail, bases=uploads.bases)  # type: ignore[arg-type]
         try:
             server.start()
             begin(server)
@@ -93,7 +99,9 @@ def _first(
         if depth is not None:
             raise InputError(f"--depth {depth}: {target.name} is a scene already: leave the option out")
         with reporter.stage("load", seconds):
-            scene = page_of(SceneFile.load(target), options.focal_px, options.fov)
+            file = SceneFile.load(target)
+            page = page_of(file, options.focal_px, options.fov)
+            scene = with_downloads(page, Scene.of_file(file, options.focal_px, options.fov))
         return lambda server: server.show(scene)
     completer = options.completer(options.base)
     if depth is None:
@@ -116,10 +124,23 @@ def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller
         done = completer.complete(photo, teller, seconds)
         scene, note = done.scene, ROUGH if done.choice.base == LiteBase.name else ""
         with teller.stage("page", seconds):
-            return page_scene(name, scene.base, scene.aux, scene.camera, done.disparity, note)
+            page = page_scene(name, scene.base, scene.aux, scene.camera, done.disparity, note)
+            return with_downloads(page, dataclasses.replace(scene, disparity=done.disparity))
     except InputError as error:
         Reporter.log(teller, f"error: {error}")  # the page is told as the job ends
         raise
+
+
+def with_downloads(page: PageScene, scene: Scene) -> PageScene:
+    """The page's scene, and the files that it can be saved as."""
+
+    def made(suffix: str) -> bytes:
+        with tempfile.TemporaryDirectory(prefix="spackle-view-") as folder:
+            file = Path(folder) / f"scene{suffix}"
+            scene.export(file)
+            return file.read_bytes()
+
+    return dataclasses.replace(page, downloads={suffix: functools.partial(made, suffix) for suffix in DOWNLOADS})
 
 
 class Uploads:
@@ -135,14 +156,48 @@ class Uploads:
         PathOptions(disparity=options.disparity).check()
         self.completer: PhotoCompleter | None = None
 
-    def complete(self, path: Path, name: str, tell: Tell) -> PageScene:
-        """A photo's file to what the page shows; the server calls it for one photo at a time."""
+    @property
+    def bases(self) -> list[str]:
+        """What the page offers: the command's own, auto, and those that need no download."""
+        here = [name for name in ("sharp", "depth") if installed(name)]
+        return list(dict.fromkeys([self._base.name, AUTO, *here, LiteBase.name]))
+
+    def complete(
+        self, path: Path, name: str, tell: Tell, *, base: str = "", disparity: str = "", depth: Path | None = None
+    ) -> PageScene:
+        """A photo's file to what the page shows, as it chose; the server calls it for one photo at a time.
+
+        InputError for a choice that was not offered.
+        """
         teller = Teller(self._reporter, tell, path, name)
-        self.completer = self.completer or self._options.completer(self._base)
+        settings = self._chosen(base, depth)
+        if settings is not self._base:
+            completer = self._options.completer(settings)
+        else:
+            completer = self.completer = self.completer or self._options.completer(settings)
+        if disparity:
+            completer = copy.copy(completer)
+            completer.path = PathOptions(disparity=_number(disparity))
+            completer.path.check()
         seconds: dict[str, float] = {}
         with teller.stage("load", seconds):
             photo = load_photo(path, keep_frame=self._options.keep_frame)
-        return complete_for_page(photo, name, self.completer, teller)
+        return complete_for_page(photo, name, completer, teller)
+
+    def _chosen(self, base: str, depth: Path | None) -> BaseSettings:
+        if depth is not None:
+            return dataclasses.replace(self._base, name=AUTO, depth=depth, checkpoint=None)
+        if base in ("", self._base.name):
+            return self._base
+        check_name("base", base, self.bases)
+        return dataclasses.replace(self._base, name=base, checkpoint=None)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"disparity {text}: give a number from 0 to 2") from error
 
 
 class Teller(Reporter):

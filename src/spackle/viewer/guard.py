@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import ipaddress
+import os
 import re
 import socket
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from email.message import Message
 from http import HTTPStatus
 from io import BufferedIOBase
@@ -21,6 +22,8 @@ from PIL import Image
 
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES, read_image
+
+DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle predict --depth` takes them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +127,8 @@ class Declared:
     name: str  # for people; no file is ever called so
     suffix: str  # one of PHOTO_SUFFIXES
     length: int
+    choices: Mapping[str, str] = dataclasses.field(default_factory=dict)  # base, disparity
+    depth: tuple[str, int] | None = None  # suffix and bytes of a depth map that follows the photo
 
 
 def declared(headers: Message, query: str, max_bytes: int) -> Declared:
@@ -147,18 +152,48 @@ def declared(headers: Message, query: str, max_bytes: int) -> Declared:
         raise RefusedError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, line)
     if length == 0:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: the file is empty")
-    return Declared(name, suffix, length)
+    fields = _fields(query)
+    choices = {key: fields[key][:MAX_NAME] for key in ("base", "disparity") if fields.get(key)}
+    return Declared(name, suffix, length, choices, _declared_depth(fields.get("depth", ""), length))
+
+
+def _declared_depth(text: str, length: int) -> tuple[str, int] | None:
+    """`.png:1234`: kind and bytes of what follows the photo; RefusedError for anything else."""
+    if not text:
+        return None
+    match = re.fullmatch(r"(\.[a-z]{3}):([0-9]{1,18})", text)
+    if not match or match[1] not in DEPTH_SUFFIXES or not 0 < int(match[2]) < length:
+        kinds = ", ".join(DEPTH_SUFFIXES)
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"the depth map makes no sense: give a file of {kinds}")
+    return match[1], int(match[2])
+
+
+def _fields(query: str) -> dict[str, str]:
+    """The first value of each field of a query; none where it makes no sense."""
+    try:
+        return {key: values[0] for key, values in parse_qs(query, errors="replace", max_num_fields=6).items()}
+    except ValueError:
+        return {}
 
 
 def shown_name(query: str) -> str:
     """The last part of `name=…` in a form that no terminal, page or log can take for anything but a name."""
-    try:
-        values = parse_qs(query, errors="replace", max_num_fields=4).get("name", [])
-    except ValueError:
-        values = []
-    last = re.split(r"[/\\]", values[0])[-1] if values else ""
+    last = re.split(r"[/\\]", _fields(query).get("name", ""))[-1]
     name = "".join(character for character in last if character.isprintable()).strip()
     return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"
+
+
+def split_depth(path: Path, promise: Declared) -> Path | None:
+    """Cut the depth map off a received photo, into a file beside it."""
+    if promise.depth is None:
+        return None
+    suffix, length = promise.depth
+    depth = path.with_name(f"depth{suffix}")
+    with path.open("r+b") as file:
+        file.seek(-length, os.SEEK_END)
+        depth.write_bytes(file.read())
+        file.truncate(promise.length - length)
+    return depth
 
 
 def receive(stream: BufferedIOBase, path: Path, promise: Declared) -> None:

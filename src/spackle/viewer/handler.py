@@ -12,7 +12,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
@@ -52,24 +52,28 @@ def as_json(value: object) -> bytes:
 class Routes:
     """Every path that can be asked, to its bytes: a path is looked up as it came, and no file is ever opened."""
 
-    def __init__(self, pages: Mapping[str, Body], limits: Limits) -> None:
+    def __init__(self, pages: Mapping[str, Body], limits: Limits, bases: Sequence[str]) -> None:
         self._lock = threading.Lock()
         self._bodies: dict[str, Body] = dict(pages)
         self._scenes: list[str] = []
         self._count = 0
-        self._limits = limits
+        self._limits, self._bases = limits, list(bases)
+        self._downloads: dict[str, Callable[[], bytes]] = {}
 
     def get(self, path: str) -> Body | None:
         """Content type and bytes; None for an unknown path."""
         with self._lock:
-            return self._bodies.get(path)
+            body, make = self._bodies.get(path), self._downloads.get(path)
+        return ("application/octet-stream", make()) if make else body
 
     def add(self, scene: PageScene) -> str:
         """A scene becomes the one that is shown; the path of its description."""
-        description = as_json(scene.description)
         with self._lock:
             self._count += 1
             root = f"/scenes/{self._count}"
+            downloads = {suffix: f"{root}/scene{suffix}" for suffix in scene.downloads}
+            self._downloads |= {place: scene.downloads[suffix] for suffix, place in downloads.items()}
+            description = as_json(scene.description | ({"downloads": downloads} if downloads else {}))
             self._bodies[f"{root}.json"] = (JSON, description)
             for name, content in scene.files.items():
                 self._bodies[f"{root}/{name}"] = ("application/octet-stream", content)
@@ -78,6 +82,7 @@ class Routes:
                 old = self._scenes.pop(0)
                 for path in [path for path in self._bodies if path.startswith((f"{old}/", f"{old}.json"))]:
                     del self._bodies[path]
+                self._downloads = {p: make for p, make in self._downloads.items() if not p.startswith(f"{old}/")}
             return f"{root}.json"
 
     def state(self, worker: Worker) -> bytes:
@@ -87,7 +92,7 @@ class Routes:
             scene = f"{self._scenes[-1]}.json" if self._scenes else None
         # One that failed is named as long as there is nothing else to see, so that a late page learns why.
         busy = newest is not None and (not newest[1].ended or scene is None)
-        upload = {"suffixes": list(PHOTO_SUFFIXES), "max_bytes": self._limits.upload_bytes}
+        upload = {"suffixes": list(PHOTO_SUFFIXES), "max_bytes": self._limits.upload_bytes, "bases": self._bases}
         return as_json({"scene": scene, "job": f"/jobs/{newest[0]}" if newest and busy else None, "upload": upload})
 
 
@@ -270,8 +275,9 @@ class Listener(ThreadingHTTPServer):
         limits: Limits,
         log: Callable[[str], None],
         take: Callable[[io.BufferedIOBase, Declared], int],
+        bases: Sequence[str] = (),
     ) -> None:
-        self.routes, self.worker = Routes(pages, limits), Worker(log, limits.kept_jobs)
+        self.routes, self.worker = Routes(pages, limits, bases), Worker(log, limits.kept_jobs)
         self.limits, self.log, self.take = limits, log, take
         self.listeners = threading.BoundedSemaphore(limits.listeners)
         self._places = threading.BoundedSemaphore(limits.connections)

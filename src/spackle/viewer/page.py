@@ -8,6 +8,7 @@ import hashlib
 import json
 import math
 import zlib
+from collections.abc import Callable, Mapping
 from importlib import resources
 
 import numpy as np
@@ -40,6 +41,9 @@ class PageScene:
 
     description: dict[str, object]  # what becomes JSON
     files: dict[str, bytes]  # the layers, by the names that the description gives them
+    downloads: Mapping[str, Callable[[], bytes]] = dataclasses.field(
+        default_factory=dict
+    )  # what a server makes: ".ply"
 
 
 def page_scene(

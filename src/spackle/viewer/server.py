@@ -6,20 +6,22 @@ files out of memory. A framework would be one more thing to install, to keep up 
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from io import BufferedIOBase
 from pathlib import Path
 
 from spackle.errors import InputError
-from spackle.viewer.guard import DEFAULT, Declared, Limits, check_photo, receive
+from spackle.viewer.guard import DEFAULT, Declared, Limits, check_photo, receive, split_depth
 from spackle.viewer.handler import Body, Listener
 from spackle.viewer.page import PageScene
 from spackle.viewer.work import Tell
 
-Complete = Callable[[Path, str, Tell], PageScene]  # a photo's file, its name for people, where progress goes
+# A photo's file, its name for people, where progress goes; by keyword `base`, `disparity`, `depth`, as the page chose.
+Complete = Callable[..., PageScene]
 HOST = "127.0.0.1"
 
 
@@ -33,6 +35,7 @@ class ViewerServer:
         port: 0 takes a free one.
         limits: what a client may take.
         log: gets a line for each request.
+        bases: that the page offers for photos.
 
     Raises:
         InputError: nothing can listen there.
@@ -47,8 +50,9 @@ class ViewerServer:
         port: int = 0,
         limits: Limits = DEFAULT,
         log: Callable[[str], None] = lambda line: None,
+        bases: Sequence[str] = (),
     ) -> None:
-        self._http = Listener(host, port, pages, limits, log, self._take)
+        self._http = Listener(host, port, pages, limits, log, self._take, bases)
         self._worker = self._http.worker
         self.uploads = tempfile.TemporaryDirectory(prefix="spackle-view-")
         self._complete, self._limits = complete, limits
@@ -116,14 +120,19 @@ class ViewerServer:
         def remove() -> None:
             shutil.rmtree(path.parent, ignore_errors=True)
 
+        choices: dict[str, object] = dict(promise.choices)
+
         def job(tell: Tell) -> str:
             try:
-                return self.show(self._complete(path, promise.name, tell))
+                return self.show(self._complete(path, promise.name, tell, **choices))
             except InputError as error:
-                raise InputError(str(error).replace(str(path), promise.name)) from error
+                line = str(error).replace(str(path), promise.name).replace(f"{path.parent}{os.sep}", "")
+                raise InputError(line) from error
 
         try:
             receive(stream, path, promise)
+            if depth := split_depth(path, promise):
+                choices["depth"] = depth
             check_photo(path, promise.name)
             return self._worker.start(job, remove)
         except BaseException:
