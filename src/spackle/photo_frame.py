@@ -2,7 +2,7 @@
 
 A false find costs part of the picture, so a side counts only if its lines have one colour up to JPEG's noise, end at
 a straight edge along nearly all of their length, and agree with the other sides. A sky, a studio's background and a
-vignette have no such edge.
+vignette have no such edge. A fringe of up to four pixels that a scanner darkened costs little, so one step is enough.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ MIXED_PX = 1  # more is cut off, in which both are still mixed
 SHARP_PX = 3  # the edge of a side that stands alone is not longer than this, or half of the above
 SAME = 8 / 255  # colours of different sides
 BLACK, WHITE = 16 / 255, 250 / 255  # a side without its opposite is as dark or as bright as this
+FRINGE_PX, BESIDE_PX = 4, 20  # lines that may be a fringe; lines beside them, whose steps are the picture's own
+FRINGE_STEP, FRINGE_RATIO = 6 / 255, 3.0  # the least step at a fringe's end, and the least over the picture's own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +53,7 @@ class PhotoFrame:
     def note(self) -> str:
         """For the log."""
         widths = ", ".join(map(str, self.widths))
-        return f"a uniform {self.shade} frame ({widths} pixels: left, top, right, bottom) is cut off"
+        return f"a {self.shade} frame ({widths} pixels: left, top, right, bottom) is cut off"
 
     def inside(self, picture: Tensor, width: int, height: int) -> Tensor:
         """What a picture [H, W, ...] of a width×height photo shows inside the frame, to the nearest pixel."""
@@ -93,10 +95,30 @@ def find_frame(rgb: Tensor) -> PhotoFrame | None:
             break
         cut = cut + found
         color = sides[found.argmax()].color if color is None else color
-    if color is None:
-        return None
     left, top, right, bottom = (int(n + MIXED_PX * (n > 0)) for n in cut)
+    inner = pixels[top : height - bottom, left : width - right]
+    across = inner.swapaxes(0, 1)
+    fringes = [_fringe(lines) for lines in (across, inner, across[::-1], inner[::-1])]
+    left, top, right, bottom = (n + more for n, more in zip((left, top, right, bottom), fringes, strict=True))
+    if not left + top + right + bottom:
+        return None
+    if color is None:
+        color = pixels[[0, -1][bottom > top]].mean(0) if top + bottom else pixels[:, [0, -1][right > left]].mean(0)
     return PhotoFrame(left, top, right, bottom, "light" if color.mean() > 0.5 else "dark")
+
+
+def _fringe(lines: Pixels) -> int:
+    """How many of the outermost lines [N, M, 3] a straight step parts from the picture: what scanning or cropping left.
+
+    Where the lines beside them have such steps, too, it is the picture's own.
+    """
+    if len(lines) < 2 * (FRINGE_PX + BESIDE_PX):
+        return 0
+    grey = lines[: FRINGE_PX + BESIDE_PX].mean(-1)
+    steps = np.abs(np.median(np.diff(grey, axis=0), axis=1))
+    least = max(FRINGE_STEP, FRINGE_RATIO * float(steps[FRINGE_PX:].max()))
+    ends = np.flatnonzero(steps[:FRINGE_PX] > least)
+    return int(ends[-1]) + 1 if len(ends) else 0
 
 
 def _sides(pixels: Pixels) -> list[_Side]:

@@ -363,7 +363,7 @@ def test_a_frame_is_cut_off_photo_and_depth_and_can_be_kept(tmp_path: Path) -> N
     Image.fromarray(whole).save(photo)
     write_depth(depth, np.pad(metres(), ((6, 7), (3, 4)), constant_values=1))
     result = predicted(photo, depth, out, "--no-render")
-    assert "a.png: a uniform dark frame (4, 7, 5, 8 pixels: left, top, right, bottom)" in result.lines[0]
+    assert "a.png: a dark frame (4, 7, 5, 8 pixels: left, top, right, bottom)" in result.lines[0]
     cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8, "shade": "dark"}  # the outermost pixels are mixed
     inner = {"width": WIDTH - 2, "height": HEIGHT - 2}
     assert report_of(out / "a")["photo"] == {"file": "a.png", **inner, "frame_cut_off": cut_off}

@@ -72,6 +72,18 @@ def test_a_frame_is_found_on_the_sides_that_have_it(widths: Sequence[int], color
         assert (ours == 0) if wanted == 0 else wanted <= ours <= wanted + 4
 
 
+def test_an_edge_that_a_scanner_darkened_is_cut_off_and_lines_of_the_picture_are_not() -> None:
+    picture = scene()
+    picture[:, -2:] *= 0.6
+    picture[:1] *= 0.8
+    frame = found(picture, 92)
+    assert frame is not None
+    assert (frame.widths, frame.shade) == ((0, 1, 2, 0), "dark")
+    picture = scene()
+    picture[np.arange(HEIGHT) % 6 < 2] *= 0.6  # blinds begin at the border, and go on
+    assert found(picture) is None
+
+
 def test_a_line_between_mount_and_picture_belongs_to_the_frame() -> None:
     inner = framed(scene(), (2, 2, 2, 2), (0.0, 0.0, 0.0))
     frame = found(framed(inner, (12, 12, 12, 12), (1.0, 1.0, 1.0)))
