@@ -1,8 +1,10 @@
 # `make demo` and `make test` each work as the first command on a fresh machine.
 PYTHON ?= python3
-VENV := .venv
+VENV ?= .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/pip install --disable-pip-version-check --quiet --constraint constraints.txt
+# The pinned versions need Python 3.11; with 3.10 pip chooses.
+PINNED := $(shell $(PYTHON) -c "import sys; print('--constraint constraints.txt' * (sys.version_info >= (3, 11)))")
+PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
@@ -10,6 +12,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	./install_torch.sh $(PIP)
 	$(PIP) --editable '.[demo]'
 	touch $@
 
