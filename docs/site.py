@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 ELSEWHERE = {
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
+    "comfyui.md": "integrations/comfyui/README.md",
     "weights.md": "src/spackle/weights/README.md",
 }
 COMMANDS = ("predict", "view", "render", "export", "demo", "weights get", "weights list", "weights make", "train")

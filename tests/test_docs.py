@@ -14,7 +14,12 @@ from typer.main import get_command
 from spackle.cli import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(page for d in ("docs", "research", "src") for page in (ROOT / d).rglob("*.md"))])
+PAGES = sorted(
+    [
+        *ROOT.glob("*.md"),
+        *(page for d in ("docs", "integrations", "research", "src") for page in (ROOT / d).rglob("*.md")),
+    ]
+)
 
 
 def names_in(path: Path) -> set[str]:

@@ -1,0 +1,163 @@
+"""Spackle's nodes for ComfyUI: copy or link this folder into ComfyUI/custom_nodes, and install Spackle beside ComfyUI.
+
+IMAGE is [B, H, W, 3] sRGB in 0..1 and MASK [B, H, W] in 0..1, as ComfyUI has them; depth is an IMAGE in greys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from spackle import DepthMap, Photo, Scene, get_renderer, hole_mask
+from spackle import complete as complete_scene
+from spackle.bases.open import AUTO, KINDS, BaseSettings, OpenedBase, open_base
+from spackle.bases.protocol import BasePrediction
+from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
+from spackle.gaussians import Gaussians
+from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.scene import PATH_FRAMES
+
+FILLS = ("auto", "network", "exemplar", "lama", "none")
+FORMATS = (".ply", ".spz", ".sog", ".glb", ".splat", ".html")
+FARTHEST = 0.01  # inverse depths below this share of the nearest count as this
+DISPARITY = ("FLOAT", {"default": 0.2, "min": 0.0, "max": MAX_DISPARITY, "step": 0.01})
+TRAJECTORY = (list(TRAJECTORIES), {"default": "rotate-forward"})
+
+
+class LoadBase:
+    """What turns an image into Gaussians."""
+
+    CATEGORY, FUNCTION = "Spackle", "load"
+    RETURN_TYPES: ClassVar = ("SPACKLE_BASE",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """`checkpoint` is a file of SHARP's or lite's weights; empty takes what `spackle weights get` brought."""
+        names = [AUTO, *(name for name, kind in KINDS.items() if kind.network and ":" not in name)]
+        return {"required": {"name": (names,)}, "optional": {"checkpoint": ("STRING", {"default": ""})}}
+
+    def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:
+        """InputError for a base that is not here, or a file that is not its weights."""
+        return (open_base(BaseSettings(name, checkpoint=Path(checkpoint) if checkpoint else None)),)
+
+
+class PredictScene:
+    """The Gaussians of the first image, with its holes still open."""
+
+    CATEGORY, FUNCTION = "Spackle", "predict"
+    RETURN_TYPES: ClassVar = ("SPACKLE_SCENE",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """`fov` 0 is a 30 mm lens; `depth` is inverse depth, white at `nearest_m` metres, and replaces the base."""
+        optional = {
+            "depth": ("IMAGE",),
+            "nearest_m": ("FLOAT", {"default": 1.5, "min": 0.01, "max": 1000.0}),
+            "fov": ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0}),
+        }
+        return {"required": {"image": ("IMAGE",), "base": ("SPACKLE_BASE",)}, "optional": optional}
+
+    def predict(
+        self, image: Tensor, base: OpenedBase, depth: Tensor | None = None, nearest_m: float = 1.5, fov: float = 0.0
+    ) -> tuple[Scene]:
+        """InputError for an image that the base cannot use."""
+        rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
+        height, width = rgb.shape[:2]
+        focal = film_to_pixels(DEFAULT_FOCAL_MM, width, height)
+        if fov:
+            focal = width / 2 / float(torch.tensor(fov / 2).deg2rad().tan())
+        photo = Photo(rgb, focal, "--fov" if fov else "default 30 mm", Path("image"))
+        if depth is not None:
+            inverse = depth[0].detach().float().cpu().mean(dim=-1).clamp(min=FARTHEST)
+            valid = torch.ones_like(inverse, dtype=torch.bool)
+            step = 1 / (255 * nearest_m)  # of an 8-bit picture
+            given = DepthMap(nearest_m / inverse, valid, None, step, "disparity", Path("depth"))
+            base = open_base(BaseSettings(depth=given))
+        prediction, _ = base.predict(photo)
+        return (Scene(prediction.gaussians, Gaussians.empty(), prediction.camera),)
+
+
+class CompleteScene:
+    """Fills the holes that a camera path uncovers."""
+
+    CATEGORY, FUNCTION = "Spackle", "complete"
+    RETURN_TYPES: ClassVar = ("SPACKLE_SCENE",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """`disparity`: how far the camera goes; 0.3 is large."""
+        given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY}
+        return {"required": {**given, "fill": (list(FILLS),)}}
+
+    def complete(self, scene: Scene, trajectory: str, disparity: float, fill: Any) -> tuple[Scene]:
+        """The base's Gaussians stay as they are, and new ones are added."""
+        cameras = scene.path(trajectory_kind(trajectory), disparity)
+        made = complete_scene(BasePrediction(scene.base, scene.camera, {}), cameras, fill=fill)
+        return (dataclasses.replace(made, disparity=disparity),)
+
+
+class RenderView:
+    """Views along a path: pictures, what is still hole, and depth in greys, near is white."""
+
+    CATEGORY, FUNCTION = "Spackle", "render"
+    RETURN_TYPES: ClassVar = ("IMAGE", "MASK", "IMAGE")
+    RETURN_NAMES: ClassVar = ("image", "holes", "depth")
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """`frames` views are a batch."""
+        frames = ("INT", {"default": PATH_FRAMES, "min": 1, "max": 1000})
+        given = {"scene": ("SPACKLE_SCENE",), "trajectory": TRAJECTORY, "disparity": DISPARITY, "frames": frames}
+        return {"required": given}
+
+    def render(self, scene: Scene, trajectory: str, disparity: float, frames: int) -> tuple[Tensor, Tensor, Tensor]:
+        """[frames, H, W, 3], [frames, H, W] and [frames, H, W, 3], at the photo's size made even."""
+        cameras = scene.path(trajectory_kind(trajectory), disparity, frames)
+        renderer = get_renderer()
+        views = [scene.render(camera, renderer) for camera in cameras]
+        inverse = torch.stack([torch.where(view.alpha > 0, 1 / view.depth.clamp(min=1e-6), 0.0) for view in views])
+        grey = inverse / inverse.amax().clamp(min=1e-12)
+        holes = torch.stack([hole_mask(view.alpha).float() for view in views])
+        return torch.stack([view.rgb for view in views]).cpu(), holes.cpu(), grey[..., None].expand(-1, -1, -1, 3).cpu()
+
+
+class SaveScene:
+    """Writes the scene into ComfyUI's output folder."""
+
+    CATEGORY, FUNCTION, OUTPUT_NODE = "Spackle", "save", True
+    RETURN_TYPES: ClassVar = ("STRING",)
+    RETURN_NAMES: ClassVar = ("file",)
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, Any]:
+        """The file is NAME_00001.FORMAT, and so on."""
+        name = ("STRING", {"default": "spackle"})
+        return {"required": {"scene": ("SPACKLE_SCENE",), "name": name, "format": (list(FORMATS),)}}
+
+    def save(self, scene: Scene, name: str, format: str) -> dict[str, Any]:
+        """No file is replaced."""
+        folder, stem = _output_folder(), Path(name).name or "spackle"
+        count = next(k for k in range(1, 100_000) if not (folder / f"{stem}_{k:05d}{format}").exists())
+        file = folder / f"{stem}_{count:05d}{format}"
+        scene.export(file)
+        return {"ui": {"text": [str(file)]}, "result": (str(file),)}
+
+
+@functools.cache
+def _output_folder() -> Path:
+    import folder_paths  # ComfyUI's own
+
+    return Path(folder_paths.get_output_directory())
+
+
+NODES = (LoadBase, PredictScene, CompleteScene, RenderView, SaveScene)
+TITLES = ("load base", "predict scene", "complete for a path", "render views", "save scene")
+NODE_CLASS_MAPPINGS = {f"Spackle{node.__name__}": node for node in NODES}
+NODE_DISPLAY_NAME_MAPPINGS = {
+    name: f"Spackle: {title}" for name, title in zip(NODE_CLASS_MAPPINGS, TITLES, strict=True)
+}
