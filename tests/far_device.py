@@ -91,7 +91,8 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
         far = torch.device(device) == FAR
         kwargs = {**kwargs, "device": CPU}
     out = func(*unwrapped(args), **unwrapped(kwargs))
-    if func is ATEN.copy_.default or str(func).split(".")[1].endswith("_"):
+    name = str(func).split(".")[1]
+    if name.endswith("_") and not name.endswith("__"):
         return args[0]  # in place
     return tree_map(lambda t: FarTensor.of(t) if isinstance(t, Tensor) else t, out) if far else out
 

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
+from spackle.inpaint.exemplar import exemplar, nearest_known
+from spackle.inpaint.exemplar_dense import dense_exemplar, dense_nearest_known
 from spackle.render import CpuRenderer, GsplatRenderer, cuda
 from spackle.render.protocol import Rendering
 from spackle.residual import Cues, make_seeds
@@ -123,4 +125,25 @@ def test_a_view_and_a_path_are_completed_where_the_renderer_is(
     assert float((drawn.rgb - best.rgb).abs().mean()) < 0.005
     assert float((view.rgb - drawn.rgb).abs().mean()) < 1e-4
     assert float(drawn.alpha.min()) > 0.5
+    far_device.waits.clear()
+    there.there.completed_view(camera, [there.photo_guard()])
+    assert far_device.waits.count("aten._to_copy.default") == 1  # the mask, which the network is cut out by; no picture
     assert abs(len(there.complete_scene(path, exact=True)) - len(along)) <= 0.05 * len(along)
+
+
+@pytest.mark.parametrize(("height", "width"), [(120, 110), (40, 61)])
+def test_patches_are_those_that_the_processor_finds(height: int, width: int) -> None:
+    rgb = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+    hole = torch.zeros(height, width, dtype=torch.bool)
+    hole[height // 3 : height // 2, width // 3 : width // 2] = hole[-height // 5 :, -3:] = True
+    inverse = (torch.linspace(-1.5, 0, width) + 0.1 * rgb[..., 0]).exp()
+    near, far = torch.from_numpy(nearest_known(hole.numpy())), dense_nearest_known(hole)
+    own = torch.stack(torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
+    assert bool(((far - own).square().sum(0) <= (near - own).square().sum(0)).all())
+    expected, found = exemplar(rgb, hole, inverse), dense_exemplar(rgb, hole, inverse)
+    assert torch.equal(found.rgb[~hole], rgb[~hole])
+    assert torch.equal(found.mismatch > 0, hole)
+    assert float((found.matches == expected.matches).all(-1)[hole].float().mean()) > 0.8
+    assert float(found.mismatch[hole].mean()) == pytest.approx(float(expected.mismatch[hole].mean()), rel=0.01)
+    for bad in (torch.zeros_like(hole), torch.ones_like(hole)):
+        assert torch.equal(dense_exemplar(rgb, bad, inverse).rgb, exemplar(rgb, bad, inverse).rgb)

@@ -111,21 +111,21 @@ def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 def exemplar(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Exemplar:
-    """Fill a hole by patches; the result is the same for any number of threads.
+    """Fill a hole by patches, on the processor; the result is the same for any number of threads.
 
     Args:
         guess: [H, W, 3] sRGB; in the hole smooth colours, which decide the tone of what is looked for.
         hole: [H, W] bool.
         inverse_depth: [H, W], positive everywhere.
     """
-    levels = _pyramid(guess.detach().cpu().float(), hole.cpu(), inverse_depth.detach().cpu().float())
+    levels = _pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
     matches = None
     for number in reversed(range(len(levels))):
         matches = _fit(levels[number], matches, number)
     mismatch, places = np.zeros(hole.shape, np.float32), np.full((*hole.shape, 3), -1, np.int32)
     if matches is not None:
         mismatch[levels[0].hole], places[levels[0].hole] = np.sqrt(matches.costs), matches.places
-    return Exemplar(*(torch.from_numpy(grid).to(guess.device) for grid in (levels[0].rgb, mismatch, places)))
+    return Exemplar(*(torch.from_numpy(grid) for grid in (levels[0].rgb, mismatch, places)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,12 +168,12 @@ def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
         if min(hole.shape) < 2 * COARSEST or bool(coarse_hole.all()) or not bool(hole.any()):
             return levels
-        rgb, tone, depth = _halved(rgb), _halved(tone), _halved(depth[..., None])[..., 0]
+        rgb, tone, depth = halved(rgb), halved(tone), halved(depth[..., None])[..., 0]
         hole = coarse_hole
     raise AssertionError
 
 
-def _halved(image: Tensor) -> Tensor:
+def halved(image: Tensor) -> Tensor:
     """Means of 2×2 cells of [h, w, c]."""
     planes = image.permute(2, 0, 1)
     return avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)

@@ -18,6 +18,7 @@ from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.inpaint.exemplar import Exemplar, exemplar
+from spackle.inpaint.exemplar_dense import dense_exemplar
 from spackle.residual import dense
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
@@ -175,7 +176,7 @@ def cell_centers(camera: Camera) -> Tensor:
 def fitting_patches(cues: Cues, seeds: Seeds) -> Exemplar:
     """Patches of the view that fit its masked cells, for their tone by the seeds' colours."""
     guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
-    return exemplar(guess, cues.mask, seeds.inverse_depth)
+    return (dense_exemplar if dense.on_gpu(guess) else exemplar)(guess, cues.mask, seeds.inverse_depth)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,9 @@ from torch.nn.functional import interpolate
 from spackle.blur import blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.inpaint.exemplar import Exemplar, nearest_known
+from spackle.inpaint.exemplar_dense import dense_nearest_known
 from spackle.render.protocol import Rendering
+from spackle.residual.dense import on_gpu
 from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in_cells
 from spackle.residual.seeds import Rim, Seeds
 
@@ -90,8 +92,10 @@ def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 
     Behind an object the nearest cell is the object's, and nothing is continued.
     """
-    near = torch.from_numpy(nearest_known(cues.mask.cpu().numpy())).to(cues.mask.device).long()
-    own = torch.stack(torch.meshgrid(*(torch.arange(size) for size in cues.mask.shape), indexing="ij")).to(near)
+    gpu = on_gpu(cues.mask)
+    near = dense_nearest_known(cues.mask) if gpu else torch.from_numpy(nearest_known(cues.mask.numpy())).long()
+    sides = (torch.arange(size, device=near.device) for size in cues.mask.shape)
+    own = torch.stack(torch.meshgrid(*sides, indexing="ij"))
     row, column = (place.clamp_min(0) for place in near)
     apart = (seeds.inverse_depth / cues.inverse_depth[row, column].clamp_min(1e-9)).log()
     fading = torch.exp((1 - (near - own).float().norm(dim=0)) / CONTINUED_CELLS - (apart / SAME_DEPTH).square())
