@@ -129,7 +129,7 @@ def _mirrored(rgb: Tensor, hole: Tensor, depth: Tensor, near: Tensor, own: Tenso
 
 def _fit(level: _DenseLevel, coarse: _DenseMatches | None, number: int) -> _DenseMatches | None:
     """Search and vote in turn; None where there is no hole, or no patch for it."""
-    hole, (height, width) = level.hole, level.hole.shape
+    hole = level.hole
     usable = max_pool2d(hole[None].float(), SIDE, stride=1, padding=RADIUS)[0] == 0
     usable[:RADIUS] = usable[-RADIUS:] = False
     usable[:, :RADIUS] = usable[:, -RADIUS:] = False
