@@ -1,0 +1,306 @@
+"""What is fuzzed: small valid files for each reader of strangers' files, and the reader."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import portraits
+import torch
+from clips import moving, write_clip
+from photos import calibration, camera_file, metres, picture, write_depth, write_photo
+from PIL import Image
+from safetensors.torch import save_file
+from test_eval_datasets import EYES, booster, eth3d, llff, middlebury_2014, tanks, wildrgbd
+
+from spackle.bases.depth_map import load_depth
+from spackle.bases.photo_depth.layouts import load_photo_depth
+from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
+from spackle.camera import Camera
+from spackle.dataset import DatasetFiles
+from spackle.dataset.photos import find_photos
+from spackle.dataset.shards import load_manifest, problems
+from spackle.digest import digest_of
+from spackle.evaluation.case import load_case
+from spackle.evaluation.datasets import get_dataset
+from spackle.formats import load_cameras, load_path, save_ply
+from spackle.formats.clip import clip_frames, is_clip, read_clip
+from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
+from spackle.gaussians import Gaussians
+from spackle.image import load_photo, resize_photo
+from spackle.network_file import read_tensors
+from spackle.training.checkpoint import Checkpoint, Progress, load_checkpoint, save_checkpoint
+from spackle.training.recipe import Recipe, load_recipe
+
+Files = dict[str, bytes]  # name in the case's folder → content
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """What makes valid files in a folder, and what reads them."""
+
+    makers: Sequence[Callable[[Path], object]]
+    read: Callable[[Path], object]
+
+
+def sealed(files: Files) -> Files:
+    """The files with checksums that fit again, so that damage gets past them."""
+    done = {name: _sealed(name, data) for name, data in files.items()}
+    if "manifest.json" in done:
+        try:
+            content = json.loads(done["manifest.json"])
+            del content["sha256"]
+            for sample, data in ((s, done[shard["file"]]) for shard in content["shards"] for s in shard["samples"]):
+                sample["sha256"] = hashlib.sha256(data[sample["offset"] :][: sample["size"]]).hexdigest()
+            done["manifest.json"] = json.dumps(content | {"sha256": digest_of(content)}).encode()
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            pass
+    return done
+
+
+def _sealed(name: str, data: bytes) -> bytes:
+    if data.startswith(b"\x89PNG"):
+        parts, at = [data[:8]], 8
+        while at + 12 <= len(data):
+            (length,) = struct.unpack_from(">I", data, at)
+            body = data[at + 4 : at + 8 + length]
+            parts += [data[at : at + 4], body, struct.pack(">I", zlib.crc32(body))]
+            at += 12 + length
+        return b"".join([*parts, data[at:]])
+    if name.endswith(".npz") and not data.startswith(b"PK"):
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("depth.npy", data)
+        return packed.getvalue()
+    return data
+
+
+def _only(folder: Path) -> Path:
+    (path,) = folder.iterdir()
+    return path
+
+
+def _pictures(name: str, mode: str = "RGB", **options: Any) -> Callable[[Path], object]:
+    exif = Image.Exif()
+    exif[0x0112], exif[0xA405] = 6, 28
+    return lambda folder: Image.fromarray(picture()).convert(mode).save(folder / name, exif=exif, **options)
+
+
+def _grey16(folder: Path) -> None:
+    Image.fromarray((1000 * metres()).astype(np.uint16)).save(folder / "a.png")
+
+
+def _npz(folder: Path) -> None:
+    np.save(folder / "a.npy", metres())
+    (folder / "a.npy").rename(folder / "a.npz")  # `sealed` packs it
+
+
+def _pfm(folder: Path) -> None:
+    (folder / "a.pfm").write_bytes(b"Pf\n64 48\n-1.0\n" + metres()[::-1].tobytes())
+
+
+def _portrait(name: str, data: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(data)
+
+
+def _scene() -> Gaussians:
+    rng = np.random.default_rng(0)
+    parts = [torch.from_numpy(rng.uniform(0.1, 0.9, shape)).float() for shape in ((9, 3), (9, 4), (9, 3), (9,), (9, 3))]
+    return Gaussians(*parts)
+
+
+def _ply(folder: Path) -> None:
+    save_ply(_scene(), folder / "a.ply", camera=Camera.from_focal(50, 64, 48), base_count=4, disparity=0.3)
+
+
+def _sharp_ply(folder: Path) -> None:
+    """ASCII, with SHARP's camera behind the Gaussians."""
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in names)]
+    tables = {"intrinsic": [50, 0, 32, 0, 50, 24, 0, 0, 1], "image_size": [64, 48], "color_space": [1]}
+    for name, numbers in tables.items():
+        lines += [f"element {name} {len(numbers)}", f"property float {name}"]
+    rows = [" ".join(["0.5"] * len(names))] * 3 + [str(n) for numbers in tables.values() for n in numbers]
+    (folder / "a.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
+
+
+def _read_ply(folder: Path) -> None:
+    for read in (load_ply_camera, load_ply_base_count, load_ply_disparity, load_ply):
+        read(_only(folder))
+
+
+def _keyframes(folder: Path) -> None:
+    keys = [{"time": k, "eye": [k, 0, 0], "target": [0, 0, 3], "up": [0, -1, 0], "fov": 60} for k in range(3)]
+    (folder / "a.json").write_text(json.dumps({"keyframes": keys, "closed": False, "unit": "metres"}))
+
+
+def _calib(folder: Path) -> None:
+    write_depth(folder / "disp0.npy")
+    calibration(folder / "calib.txt", 55.0, 193.0, 3.5)
+
+
+def _described(folder: Path) -> None:
+    write_depth(folder / "disp.npy")
+    lens = {"focal_px": 55.5, "cx": 32.0, "cy": 24.0, "doffs_px": 0.5, "baseline_m": 0.2, "disparity_scale": 1.0}
+    (folder / "scene.json").write_text(json.dumps({"disparity": "disp.npy", "invalid": 0, **lens}))
+
+
+def _tree(name: str, *makers: Callable[[Path], object]) -> Reader:
+    def read(folder: Path) -> None:
+        case = get_dataset(name).cases(folder)[0]
+        load_case(case)
+        for facts in (case.depth, case.points):
+            if facts is not None:
+                facts()
+
+    return Reader(makers, read)
+
+
+def _text_model(folder: Path) -> None:
+    """COLMAP's text files, as ETH3D has them."""
+    scene = eth3d(folder / "Truck", EYES[:2])
+    (scene / "dslr_calibration_undistorted").rename(scene / "sparse")
+
+
+def _recipe(folder: Path) -> None:
+    (folder / "a.yaml").write_text(
+        "data: {photos: a, disparity: [0.1, 0.5], rgbd: [{folder: b, focal_px: 500}]}\n"
+        "loss: {features: none, color: 1e1}\noptim: {lr: 1e-4, betas: [0.9, 0.99], steps: 100}\nrun: {seed: 3}\n"
+    )
+
+
+def _coco(folder: Path) -> None:
+    (folder / "images").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        write_photo(folder / "images" / name, 40, 32)
+    images = [{"id": k, "file_name": f"{name}.jpg", "width": 40} for k, name in enumerate("abc")]
+    (folder / "a.json").write_text(json.dumps({"info": {}, "images": images}))
+
+
+def _dataset(folder: Path) -> None:
+    from dataset_builds import build, write_inputs
+
+    place = write_inputs(folder / "in", 2, 36, 32)
+    assert build(place, folder / "out", "--views", 2, "--shard-size", 1).code == 0
+    for path in (folder / "out").iterdir():
+        path.rename(folder / path.name)
+    (folder / "out").rmdir()
+    for path in sorted((folder / "in").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    (folder / "in").rmdir()
+
+
+def _read_dataset(folder: Path) -> None:
+    list(problems(folder, load_manifest(folder), lambda done, total: None))
+    files = DatasetFiles(folder)
+    for place in range(len(files)):
+        group = files.group(place)
+        for index in range(group.views):
+            group.view(index, with_base=True)
+
+
+def _checkpoint(folder: Path) -> None:
+    tensors = {"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}
+    state = Checkpoint(Progress(3, 0.5, history=({"loss": 1.0},)), tensors, tensors, {"state": {}}, {"run": {}}, "x")
+    save_checkpoint(state, folder)
+
+
+def _safetensors(folder: Path) -> None:
+    save_file({"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}, folder / "a.safetensors")
+
+
+def _read_weights(folder: Path) -> None:
+    if (folder / "checkpoint.pt").exists():
+        load_checkpoint(folder)
+        read_checkpoint_tensors(folder / "checkpoint.pt")
+    else:
+        read_checkpoint_tensors(_only(folder))
+        read_tensors(_only(folder), "some", "others")
+
+
+def _clip(name: str, **options: Any) -> Callable[[Path], object]:
+    return lambda folder: write_clip(folder / name, moving(3, 16, 24), **options)
+
+
+def _animation(folder: Path) -> None:
+    first, *others = (Image.fromarray(frame) for frame in moving(3, 16, 24))
+    first.save(folder / "a.gif", save_all=True, append_images=others, duration=100)
+
+
+def _read_clip(folder: Path) -> None:
+    path = _only(folder)
+    if is_clip(path):
+        for _ in clip_frames(read_clip(path, 4)):
+            pass
+
+
+READERS: dict[str, Reader] = {
+    "pictures": Reader(
+        [
+            *(_pictures(f"a.{kind}") for kind in ("jpg", "png", "webp", "tif", "heic")),
+            *(_pictures("a.png", mode) for mode in ("P", "LA", "RGBA", "1")),
+            _pictures("a.jpg", "CMYK"),
+            _pictures("a.tif", compression="tiff_lzw"),
+        ],
+        lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
+    ),
+    "depth": Reader([_grey16, _npz, _pfm, lambda f: np.save(f / "a.npy", metres())], lambda f: load_depth(_only(f))),
+    "portraits": Reader(
+        [
+            _portrait("a.jpg", portraits.apple_jpeg(portraits.codes())),
+            _portrait("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
+            _portrait("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
+            _portrait("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
+        ],
+        lambda folder: load_photo_depth(_only(folder)),
+    ),
+    "ply": Reader([_ply, _sharp_ply], _read_ply),
+    "cameras": Reader([lambda folder: camera_file(folder / "a.json", [0.0, 0.2])], lambda f: load_cameras(_only(f))),
+    "keyframes": Reader([_keyframes], lambda folder: load_path(_only(folder))),
+    "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),
+    "recipes": Reader([_recipe], lambda folder: load_recipe(Recipe, _only(folder))),
+    "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images")),
+    "datasets": Reader([_dataset], _read_dataset),
+    "weights": Reader([_checkpoint, _safetensors], _read_weights),
+    "clips": Reader(
+        [_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4"), _animation], _read_clip
+    ),
+    "middlebury": _tree("middlebury", lambda folder: middlebury_2014(folder / "a")),
+    "booster": _tree("booster", lambda folder: booster(folder / "a")),
+    "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a", EYES[:2])),
+    "llff": _tree("llff", lambda folder: llff(folder / "fern", EYES[:2])),
+    "colmap": _tree(
+        "tanks",
+        lambda folder: tanks(folder / "Truck", EYES[:2]),
+        lambda folder: _text_model(folder),
+    ),
+}
+
+
+def contents(folder: Path) -> Files:
+    """Every file below a folder."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -1,0 +1,72 @@
+"""A few hundred damaged files for each reader; `make fuzz N=5000` tries more, and writes what fails to fuzz-failures/."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "evaluation")]
+
+import fuzz
+from readers import READERS, sealed
+
+Failure = tuple[int, str, dict[str, str]]
+
+
+@pytest.fixture(scope="module")
+def failures() -> dict[str, list[Failure]]:
+    """Of all readers: one child is enough for them."""
+    found: dict[str, list[Failure]] = {name: [] for name in READERS}
+    for name, number, problem, files in fuzz.fuzz(list(READERS), 300):
+        found[name].append((number, problem, files))
+    return found
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_are_refused_in_time_and_in_memory(name: str, failures: dict[str, list[Failure]]) -> None:
+    for number, problem, files in failures[name]:
+        pytest.fail(f"python tests/fuzz/fuzz.py --replay {fuzz.save(name, number, files)}: {problem}")
+
+
+def gif(side: int) -> bytes:
+    head = b"GIF89a" + struct.pack("<HHBBB", side, side, 0x80, 0, 0) + b"\0\0\0\xff\xff\xff"
+    return head + b",\0\0\0\0" + struct.pack("<HHB", side, side, 0) + b"\x02\x02\x4c\x01\0;"
+
+
+def png(side: int, kind: int, depth: int = 8) -> bytes:
+    """Black, and as small as zlib makes it."""
+    row = side * depth // 8 * {0: 1, 2: 3, 6: 4}[kind] + 1
+    packer = zlib.compressobj(9)
+    body = b"".join(packer.compress(bytes(row)) for _ in range(side)) + packer.flush()
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, kind, 0, 0, 0)), (b"IDAT", body), (b"IEND", b"")]
+    parts = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def npz(side: int) -> bytes:
+    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({side}, {side})}}".ljust(117) + "\n"
+    array = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + head.encode() + np.ones(side * side).tobytes()
+    return sealed({"a.npz": array})["a.npz"]
+
+
+@pytest.mark.parametrize(
+    ("reader", "name", "data"),
+    [
+        ("pictures", "a.gif", gif(9_999)),
+        *(("pictures", "a.png", png(side, 2)) for side in (9_999, 5_600)),
+        ("depth", "a.png", png(9_999, 0, 16)),
+        ("depth", "a.npz", npz(5_600)),
+    ],
+    ids=lambda value: f"{len(value)} bytes" if isinstance(value, bytes) else value,
+)
+def test_small_files_that_announce_much_stay_below_the_bound(
+    tmp_path: Path, reader: str, name: str, data: bytes
+) -> None:
+    assert len(data) < 1_000_000
+    assert fuzz.replayed(fuzz.save(reader, 0, {name: base64.b64encode(data).decode()}, tmp_path)) is None
