@@ -8,7 +8,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
-.PHONY: demo test test-wheel test-slow wheel docs lint types check bench viewer clean clean-cache
+.PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -35,6 +35,11 @@ test-wheel: $(VENV)/.installed
 wheel: $(VENV)/.demo
 	rm -rf dist
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
+
+# Damaged files for every reader, N of each; what fails is written to fuzz-failures/, which --replay takes.
+N ?= 5000
+fuzz: $(VENV)/.installed
+	$(BIN)/python tests/fuzz/fuzz.py -n $(N)
 
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow tests research/lite/tests

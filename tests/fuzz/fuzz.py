@@ -34,38 +34,10 @@ sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "evaluation"), st
 SECONDS, BYTES = 10, 1_500_000_000  # at most, of a case
 FAILURES = Path("fuzz-failures")
 NUMBERS = [b"0", b"-1", b"1e300", b"-1e39", b"1e-300", b"nan", b"inf", b"9" * 400, b"9" * 5000, b"2147483648", b"0.5"]
-WORDS = [
-    b"",
-    b"null",
-    b"true",
-    b"[]",
-    b"{}",
-    b'""',
-    b"\x1b[2J",
-    b"\0",
-    b"../../etc/passwd",
-    b"[" * 10_000,
-    b'"\\ud800"',
-    b"*a",
-]
-VALUES: list[Any] = [
-    None,
-    True,
-    0,
-    -1,
-    1.5,
-    1e300,
-    10**400,
-    "",
-    "../x",
-    "a" * 5000,
-    [],
-    {},
-    [[]],
-    ["a"],
-    {"a": {}},
-    "\x1b[2J",
-]
+WORDS = [b"", b"null", b"true", b"[]", b"{}", b'""', b"\x1b[2J", b"\0", b"../../etc/passwd", b"[" * 10_000]
+WORDS += [b'"\\ud800"', b"*a"]
+VALUES: list[Any] = [None, True, 0, -1, 1.5, 1e300, 10**400, "", "../x", "a" * 5000, "\x1b[2J"]
+VALUES += [[], {}, [[]], ["a"], {"a": {}}]
 
 Files = dict[str, bytes]
 

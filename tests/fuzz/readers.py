@@ -124,22 +124,8 @@ def _ply(folder: Path) -> None:
 
 def _sharp_ply(folder: Path) -> None:
     """ASCII, with SHARP's camera behind the Gaussians."""
-    names = [
-        "x",
-        "y",
-        "z",
-        "f_dc_0",
-        "f_dc_1",
-        "f_dc_2",
-        "opacity",
-        "scale_0",
-        "scale_1",
-        "scale_2",
-        "rot_0",
-        "rot_1",
-        "rot_2",
-        "rot_3",
-    ]
+    rest = [f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)]
+    names = ["x", "y", "z", "opacity", *rest]
     lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in names)]
     tables = {"intrinsic": [50, 0, 32, 0, 50, 24, 0, 0, 1], "image_size": [64, 48], "color_space": [1]}
     for name, numbers in tables.items():

@@ -1,19 +1,15 @@
-"""A few hundred damaged files for each reader; `make fuzz N=5000` tries more, and writes what fails to fuzz-failures/."""
+"""Some hundred damaged files for each reader; `make fuzz N=5000` tries more. What fails lies in fuzz-failures/."""
 
 from __future__ import annotations
 
 import base64
 import struct
-import sys
 import zlib
 from pathlib import Path
 
+import fuzz
 import numpy as np
 import pytest
-
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "evaluation")]
-
-import fuzz
 from readers import READERS, sealed
 
 Failure = tuple[int, str, dict[str, str]]
