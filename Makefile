@@ -11,6 +11,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 .PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
+	@echo "Installing Spackle and what it needs into $(VENV), once: some minutes, and about 400 MB of downloads."
 	$(PYTHON) -m venv $(VENV)
 	./install_torch.sh $(PIP)
 	$(PIP) --editable '.[demo]'
@@ -30,7 +31,7 @@ test: $(VENV)/.installed
 
 # In an environment that is empty but for the wheel: pip fetches what it asks for.
 test-wheel: $(VENV)/.installed
-	SPACKLE_EMPTY=1 $(BIN)/python -m pytest tests/test_quick_start.py
+	SPACKLE_EMPTY=1 $(BIN)/python -m pytest tests/test_quick_start.py tests/test_container.py
 
 wheel: $(VENV)/.demo
 	rm -rf dist

@@ -1,0 +1,92 @@
+"""The Dockerfile without Docker: its rules, and its steps in a shell, in an empty environment under another root."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import urllib.request
+import venv
+from pathlib import Path
+
+import pytest
+from photos import write_photo
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+
+
+def steps() -> list[tuple[str, str]]:
+    lines = [line for line in TEXT.splitlines() if line.strip() and not line.startswith("#")]
+    joined = re.sub(r"\\\n\s*", " ", "\n".join(lines)).splitlines()
+    return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in joined)]
+
+
+def test_the_rules_of_a_good_image_hold() -> None:
+    words = [word for word, _ in steps()]
+    assert words[0] == "FROM"
+    assert re.fullmatch(r"python:3\.\d+-slim-\w+", steps()[0][1])  # a version, not latest
+    assert "ADD" not in words
+    assert words.count("USER") == 1
+    last = dict(steps())
+    assert last["USER"] not in ("0", "root")
+    assert words.index("USER") < words.index("ENTRYPOINT")
+    assert json.loads(last["ENTRYPOINT"]) == ["spackle"]
+    assert "PIP_NO_CACHE_DIR=1" in last["ENV"]
+    assert not re.search(r"\bsudo\b|apt-get|curl|wget", TEXT)
+    copied = [name for word, rest in steps() if word == "COPY" for name in rest.split()[:-1]]
+    assert all((ROOT / name).exists() for name in copied)
+    kept = {line.removeprefix("!") for line in (ROOT / ".dockerignore").read_text().splitlines() if line[0] == "!"}
+    assert set(copied) == kept
+
+
+@pytest.mark.skipif(os.environ.get("SPACKLE_EMPTY") != "1", reason="fetches torch: make test-wheel")
+def test_its_steps_make_a_command_that_predicts_and_views(tmp_path: Path) -> None:
+    root = tmp_path / "image"
+    venv.create(root / "python", with_pip=True)
+    place, variables = root, {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "NUMBA"))}
+    variables["PATH"] = f"{root / 'python' / 'bin'}:{variables['PATH']}"
+    under = lambda text: text.replace("/opt/spackle", f"{root}/opt/spackle")  # noqa: E731
+    for word, rest in steps():
+        if word in ("ENV", "ARG"):
+            variables |= dict(pair.split("=", 1) for pair in shlex.split(under(rest)))
+        elif word == "WORKDIR":
+            place = Path(under(rest))
+            place.mkdir(parents=True, exist_ok=True)
+        elif word == "COPY":
+            *names, target = rest.split()
+            for name in names:
+                source = ROOT / name
+                if source.is_dir():
+                    shutil.copytree(source, place / target, dirs_exist_ok=True)
+                else:
+                    shutil.copy(source, place / target)
+        elif word == "RUN":
+            command = under(rest)
+            if sys.version_info[:2] < (3, 11):
+                command = command.replace("--constraint constraints.txt", "")
+            subprocess.run(["sh", "-ec", command], cwd=place, env=variables, check=True, timeout=1800)
+    assert list((root / "opt/spackle/kernels").rglob("*.nbi"))
+    write_photo(place / "photo.png")
+    spackle = root / "python" / "bin" / "spackle"
+    words = ["predict", "photo.png", "-o", "out", "--frames", "2"]
+    subprocess.run([spackle, *words], cwd=place, env=variables, check=True, timeout=300)
+    assert (place / "out" / "photo" / "scene.ply").is_file()
+    words = ["view", "out/photo/scene.ply", "--host", "0.0.0.0", "--port", "0", "--no-open"]
+    server = subprocess.Popen([spackle, *words], cwd=place, env=variables, stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr is not None
+        found, until = None, time.monotonic() + 120
+        while found is None and time.monotonic() < until:
+            found = re.search(r"http://127\.0\.0\.1:(\d+)\S*", server.stderr.readline())
+        assert found
+        with urllib.request.urlopen(found[0].replace("127.0.0.1", "localhost"), timeout=60) as answer:
+            assert b"<canvas" in answer.read()
+    finally:
+        server.terminate()
+        server.communicate(timeout=60)
