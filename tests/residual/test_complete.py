@@ -135,7 +135,7 @@ def test_the_neighbours_of_a_completed_view_have_fewer_holes_for_it(
 ) -> None:
     completer, index, before, fill, beneath = wide
     path = path_of(completer)
-    beside = [path[index + step] for step in (-4, -2, 2, 4)]
+    beside = [path[index + step] for step in (-8, -4, 4, 8)]
     without, both = (
         sum(holes_of(camera, completer.base, *aux) for camera in beside) / 4 for aux in ((fill,), (fill, beneath))
     )

@@ -26,7 +26,7 @@ from spackle.surface import surface_slope
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-FINE_SPREAD_PX = 0.5  # of one blob a pixel, which a wide one for its cell backs
+FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
