@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import json
@@ -10,7 +11,7 @@ import resource
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,11 @@ from far_device import FarDevice, Watched, far_device
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
+from torch import nn
 from training_runs import assert_same_weights, run_two, started, state, trained
 
 from spackle.downloads import hold
+from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, GsplatRenderer, cuda, get_renderer
 from spackle.residual.network import ResidualNet, load_residual
@@ -31,7 +34,7 @@ from spackle.training.method import Objective
 from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
 from spackle.training.residual_method import ResidualMethod, complete_samples
 from spackle.training.sample import Sample, load_sample, save_sample
-from spackle.training.trainer import Trainer
+from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
 __all__ = ["far_device"]  # a fixture
@@ -327,3 +330,48 @@ def test_a_step_on_a_gpu_waits_for_it_once_and_gives_what_the_processor_gives(
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
     one, other = network.texture[-1].weight.grad, there.texture[-1].weight.grad.cpu()
     assert float((one - other).norm() / one.norm()) < 1e-2
+
+
+@pytest.mark.parametrize("bad", [None, 3])
+def test_numbers_read_late_are_those_read_at_once_and_nothing_is_learned_from_a_bad_one(
+    tmp_path: Path, bad: int | None
+) -> None:
+    save_sample(sample_of(box_before_wall(width=96, height=80).base()), tmp_path / "0.safetensors")
+    files = SampleFiles([tmp_path / "0.safetensors"], [tmp_path / "0.safetensors"], "one")
+    recipe = Recipe(
+        loss=LossRecipe(features="none"),
+        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=7, batch=1, ema=0.5),
+        run=RunRecipe(log_every=5, validate_every=7, save_every=100),
+    )
+    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
+
+    class Broken(ResidualMethod):
+        def loss(
+            self, network: nn.Module, step: int, items: Sequence[int]
+        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+            loss, terms = super().loss(network, step, items)
+            return loss * (math.nan if step == bad else 1), terms
+
+    found: list[tuple[list[dict[str, float]], dict[str, torch.Tensor], Trainer]] = []
+    for late in (False, True):
+        torch.manual_seed(0)
+        network, logged, folder = ResidualNet(), list[dict[str, float]](), tmp_path / str(late)
+        folder.mkdir()
+        callbacks = Callbacks(lambda _, n, to=logged: to.append(n), lambda *_: None, lambda _: None, lambda: False)  # type: ignore[misc]
+        optimizer = torch.optim.AdamW(network.parameters(), recipe.optim.lr, weight_decay=0.01, fused=True)
+        method = Broken(files, objective, recipe.optim.batch)
+        trainer = Trainer(recipe, method, network, torch.device("cpu"), folder, callbacks, optimizer=optimizer)
+        trainer.late = late
+        with contextlib.nullcontext() if bad is None else pytest.raises(InputError, match="step 3 gave numbers"):
+            trainer.run()
+        found.append(
+            (
+                logged,
+                dict(network.state_dict()) | {f"mean.{n}": t for n, t in trainer.average.state_dict().items()},
+                trainer,
+            )
+        )
+    (logs, weights, early), (late_logs, late_weights, trainer) = found
+    assert logs == late_logs
+    assert all(torch.equal(weights[name], late_weights[name]) for name in weights)
+    assert early.progress.step == trainer.progress.step == (7 if bad is None else bad)

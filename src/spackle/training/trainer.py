@@ -74,9 +74,15 @@ class Trainer:
         self.wrapped: nn.Module = DistributedDataParallel(network) if self.ranks.count > 1 else network
         self.optimizer = optimizer or adamw([{"params": [w for w in network.parameters() if w.requires_grad]}], recipe)
         self.progress, self.on_disk = Progress(), -1  # the step of the newest checkpoint
+        # A fused optimizer leaves the weights alone where a flag says so: then numbers may be looked at later.
+        self.late = self.ranks.count == 1 and bool(self.optimizer.defaults.get("fused"))
+        self._sound = torch.ones((), dtype=torch.bool).to(device)  # whether all numbers were finite so far
+        self._unread: list[tuple[int, dict[str, Tensor]]] = []
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Go on where a checkpoint was written; InputError, naming the folder, where it is of another network."""
+        for group in checkpoint.optimizer["param_groups"]:
+            group["fused"] = self.optimizer.defaults.get("fused")  # of this device, not of the one that wrote it
         try:
             self.network.load_state_dict(checkpoint.network)
             self.average.load_state_dict(checkpoint.average)
@@ -96,13 +102,13 @@ class Trainer:
         run, last, since = self.recipe.run, self.recipe.optim.steps, time.perf_counter()
         before, stopped, recent = self.progress.seconds, False, list[dict[str, float]]()
         while self.progress.step < last and self.progress.stale < run.patience and not stopped:
-            numbers = self.step(self.progress.step)
-            stopped = numbers.pop("stop") > 0
-            recent.append(numbers)
+            for numbers in self.step(self.progress.step):
+                stopped = numbers.pop("stop") > 0 or stopped
+                recent.append(numbers)
             step, seconds = self.progress.step + 1, before + time.perf_counter() - since
             self.progress = dataclasses.replace(self.progress, step=step, seconds=seconds)
             if step % run.log_every == 0 or step == last:
-                means = {name: sum(each[name] for each in recent) / len(recent) for name in numbers}
+                means = {name: sum(each[name] for each in recent) / len(recent) for name in recent[0]}
                 self.callbacks.step(step, means)
                 recent = []
             if step % run.validate_every == 0 or step == last:
@@ -114,10 +120,13 @@ class Trainer:
             return "steps"
         return "patience" if self.progress.stale >= run.patience else "stopped"
 
-    def step(self, step: int) -> dict[str, float]:
-        """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0."""
+    def step(self, step: int) -> list[dict[str, float]]:
+        """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0.
+
+        A GPU that works alone is not waited for at each step: its numbers come together, once something depends on them.
+        """
         method, ranks, optim = self.method, self.ranks, self.recipe.optim
-        items = samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
+        items = self._items(step)
         found: dict[str, Tensor] = {}
         parts = [items[start : start + method.at_once] for start in range(0, len(items), method.at_once)]
         self.optimizer.zero_grad(set_to_none=True)
@@ -131,24 +140,50 @@ class Trainer:
             for name, value in {"loss": loss.detach(), **terms}.items():
                 found[name] = found.get(name, 0.0) + share * value.double()
         found["gradient"] = clip_grad_norm_(self.network.parameters(), optim.clip).double()
-        mine = dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))  # a GPU is waited for once
-        mine["stop"] = float(self.callbacks.stop())
-        sums = ranks.sum(list(mine.values()), self.device)
-        numbers = {name: total / ranks.count for name, total in zip(mine, sums, strict=True)}
-        if not (math.isfinite(numbers["loss"]) and math.isfinite(numbers["gradient"])):
-            self._reject(step, items, mine["loss"], numbers)
+        self._unread.append((step, found))
+        numbers = [] if self.late else self._read()
+        if self.late:
+            self._sound = self._sound & found["loss"].isfinite() & found["gradient"].isfinite()
+            self.optimizer.found_inf = (~self._sound).float()  # type: ignore[attr-defined]  # as torch's GradScaler does
 
         rate = learning_rate(step, optim)
         for group in self.optimizer.param_groups:
             group["lr"] = group.get("lr_scale", 1.0) * rate
         self.optimizer.step()
         with torch.no_grad():
+            share = 1 - ema_decay(step, optim.ema)
             for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
-        return {**numbers, "lr": rate}
+                mean.lerp_(weight, share * self._sound.to(mean.dtype) if self.late else share)
+        return self._read() if self.late and self._due(step + 1) else numbers
 
-    def _reject(self, step: int, items: Sequence[int], loss: float, numbers: dict[str, float]) -> None:
+    def _due(self, step: int) -> bool:
+        """Whether something depends on the numbers of all steps so far."""
+        run = self.recipe.run
+        often = any(step % every == 0 for every in (run.log_every, run.validate_every, run.save_every))
+        return often or step == self.recipe.optim.steps or self.callbacks.stop()
+
+    def _read(self) -> list[dict[str, float]]:
+        """The numbers of all steps since the last look, for which a GPU is waited for once; none that is not finite."""
+        ranks, read = self.ranks, list[dict[str, float]]()
+        table = torch.stack([torch.stack(list(found.values())) for _, found in self._unread]).tolist()
+        unread, self._unread = self._unread, []
+        for (step, found), row in zip(unread, table, strict=True):
+            mine = {**dict(zip(found, row, strict=True)), "stop": float(self.callbacks.stop())}
+            sums = ranks.sum(list(mine.values()), self.device)
+            numbers = {name: total / ranks.count for name, total in zip(mine, sums, strict=True)}
+            if not (math.isfinite(numbers["loss"]) and math.isfinite(numbers["gradient"])):
+                self._reject(step, mine["loss"], numbers)
+            read.append({**numbers, "lr": learning_rate(step, self.recipe.optim)})
+        return read
+
+    def _items(self, step: int) -> list[int]:
+        """What this process learns from at a step."""
+        method, ranks = self.method, self.ranks
+        return samples_of_step(step, method.items, method.items_a_step, self.recipe.run.seed, ranks.rank, ranks.count)
+
+    def _reject(self, step: int, loss: float, numbers: dict[str, float]) -> None:
         """Keep what made a loss that is no number, and end the run; nothing has learned from it."""
+        items, self.progress = self._items(step), dataclasses.replace(self.progress, step=step)
         place = self.folder / BAD
         place.mkdir(exist_ok=True)
         if not math.isfinite(loss) or math.isfinite(numbers["loss"]):  # else it is another process that has them
@@ -218,7 +253,9 @@ class Trainer:
 def adamw(groups: Sequence[dict[str, object]], recipe: AnyRecipe) -> AdamW:
     """The recipe's optimizer of groups of weights, each with "params" and perhaps "lr_scale"."""
     optim = recipe.optim
-    return AdamW(groups, optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
+    weights: list[Tensor] = [weight for group in groups for weight in group["params"]]  # type: ignore[attr-defined]
+    fused = all(weight.is_cuda for weight in weights) or None
+    return AdamW(groups, optim.lr, betas=optim.betas, weight_decay=optim.weight_decay, fused=fused)
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
