@@ -123,7 +123,7 @@ class Trainer:
     def step(self, step: int) -> list[dict[str, float]]:
         """One step; returns its numbers as means over the processes: loss, terms, gradient, lr, and stop above 0.
 
-        A GPU that works alone is not waited for at each step: its numbers come together, once something depends on them.
+        A GPU that works alone is not waited for at each step: numbers come together, once something depends on them.
         """
         method, ranks, optim = self.method, self.ranks, self.recipe.optim
         items = self._items(step)
