@@ -50,10 +50,16 @@ class ResidualChoice:
 
     named: str | None = None  # a file, "seeds", "none", or None for the shipped weights if there are any
     wanted: Fill = "auto"
+    mode: Mode = "scene"
 
     @property
     def fill(self) -> Fill:
-        """Where the texture comes from, "auto" resolved; "none" also where the residual is."""
+        """Where the texture comes from, "auto" resolved; "none" also where the residual is.
+
+        Where each view is filled by itself, "auto" paints none: that would take seconds a view.
+        """
+        if self.mode == "view" and self.wanted == "auto" and self.named != "none":
+            return "exemplar"
         return "none" if self.named == "none" else resolved(self.wanted)
 
     @property

@@ -201,7 +201,13 @@ def test_lamas_weights_are_painted_with_where_they_are_and_missed_where_they_are
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--fill", "lama", named="spackle weights get lama")
     assert (ResidualChoice().fill, ResidualChoice(None, "network").fill) == ("exemplar", "network")
     (tmp_path / known_weights("lama").file).write_text("not LaMa's")
-    assert (ResidualChoice().fill, ResidualChoice("none").fill) == ("lama", "none")
+    choices = (
+        ResidualChoice(),
+        ResidualChoice(mode="view"),
+        ResidualChoice(None, "lama", "view"),
+        ResidualChoice("none"),
+    )
+    assert [choice.fill for choice in choices] == ["lama", "exemplar", "lama", "none"]
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], named=known_weights("lama").file)
 
 

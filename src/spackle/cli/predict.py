@@ -98,7 +98,7 @@ def predict(
     from spackle.scene import ResidualChoice
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
-    choice = ResidualChoice(residual, fill)
+    choice = ResidualChoice(residual, fill, mode)
     options = PredictOptions(settings, choice, path, render, mode, focal_px, focal_mm, fov, overwrite, keep_frame)
     if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
