@@ -17,7 +17,6 @@ from spackle.bases.cleanup import (
     LEAST_NOISE,
     OUTLIERS,
     attach_flying_pixels,
-    attach_mixed_pixels,
     noise_level,
     smooth_noise,
 )
@@ -206,7 +205,7 @@ def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> Non
 
 def test_a_sharp_map_of_the_photos_size_is_lifted_as_it_is() -> None:
     for scene in (box_before_wall(), slanted_plane(1.5, 1000, 0), wall()):
-        clean = attach_mixed_pixels(attach_flying_pixels(1 / scene.depth), scene.rgb)
+        clean = attach_flying_pixels(1 / scene.depth)
         torch.testing.assert_close(front(scene, scene.depth_map), clean, rtol=1e-6, atol=0)
         edges = find_edges((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), scene.camera.focal)
         sampled = sample((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), edges, *scene.depth.shape)

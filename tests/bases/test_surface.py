@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import slanted_plane
 from torch import Tensor
 
-from spackle.bases.cleanup import attach_flying_pixels, attach_mixed_pixels, undo_quantisation
+from spackle.bases.cleanup import attach_flying_pixels, undo_quantisation
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, surface_gaussians, surface_slope
@@ -119,27 +119,6 @@ def test_no_pixel_of_a_plane_flies_however_slanted(axis: int) -> None:
     """Near the horizon each row of a floor is much farther than the one below it, and yet one surface."""
     inverse = 1 / slanted_plane(1.5, 1000, axis, width=40, height=30).depth
     torch.testing.assert_close(attach_flying_pixels(inverse), inverse, rtol=1e-5, atol=0)
-
-
-def silhouette(color: float) -> tuple[Tensor, Tensor]:
-    """A white near side, a black far side, and a pixel of some grey on the far side of the edge."""
-    inverse = torch.tensor([1.0, 1.0, 1.0, 0.2, 0.2, 0.2, 0.2])
-    shade = torch.tensor([1.0, 1.0, 1.0, color, 0.0, 0.0, 0.0])
-    return inverse.expand(5, 7), shade[None, :, None].expand(5, 7, 3)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("flipped", [False, True])
-@pytest.mark.parametrize(("color", "moves"), [(0.8, True), (0.55, True), (0.45, False), (0.0, False)])
-def test_a_mixed_pixel_goes_where_its_colour_belongs(color: float, moves: bool, turned: bool, flipped: bool) -> None:
-    inverse, rgb = silhouette(color)
-    expected = inverse.clone()
-    expected[:, 3] = 1.0 if moves else 0.2
-    if flipped:
-        inverse, rgb, expected = inverse.flip(1), rgb.flip(1), expected.flip(1)
-    if turned:
-        inverse, rgb, expected = inverse.T, rgb.transpose(0, 1), expected.T
-    assert torch.equal(attach_mixed_pixels(inverse, rgb), expected)
 
 
 @PROPERTY

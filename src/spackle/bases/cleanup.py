@@ -55,24 +55,6 @@ def _neighbours(image: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     return wide.narrow(axis, 0, size), wide.narrow(axis, 2, size)
 
 
-def attach_mixed_pixels(inverse_depth: Tensor, rgb: Tensor) -> Tensor:
-    """Give a background pixel that a depth edge touches to the foreground, where its colour says so.
-
-    A lens blurs a silhouette over a pixel or two, so the first background pixel often has the foreground's colour, and
-    draws a ghost outline as soon as the camera moves. Takes inverse depth [H, W] > 0 and sRGB [H, W, 3].
-    """
-    result = inverse_depth
-    for axis in (1, 0):
-        depths = _neighbours(inverse_depth, axis)
-        colors = [torch.stack(c, dim=-1) for c in zip(*(_neighbours(c, axis) for c in rgb.unbind(-1)), strict=True)]
-        for near, far in ((0, 1), (1, 0)):
-            silhouette = depths[near] - inverse_depth > EDGE * inverse_depth
-            silhouette &= (depths[far] - inverse_depth).abs() < EDGE * inverse_depth
-            to_near, to_far = ((rgb - colors[side]).abs().sum(-1) for side in (near, far))
-            result = torch.where(silhouette & (to_near < to_far), torch.maximum(result, depths[near]), result)
-    return result
-
-
 def undo_quantisation(inverse_depth: Tensor, valid: Tensor, quantum: float, sweeps: int = SWEEPS) -> Tensor:
     """The smoothest inverse depth [H, W] that would round to the stored one, of pixels valid [H, W]; others stay out.
 

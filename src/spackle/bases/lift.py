@@ -1,4 +1,4 @@
-"""A photo and its depth map, lifted: one surface-aligned Gaussian for each pixel, and a coarse backing."""
+"""A photo and its depth map, lifted: from the map as measured to surface-aligned Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from spackle.bases.cleanup import (
     attach_flying_pixels,
-    attach_mixed_pixels,
     fill_missing,
     smooth_noise,
     undo_quantisation,
@@ -18,24 +17,11 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import find_edges, sample, settle
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sky import push_sky
+from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
-from spackle.gaussians import Gaussians
 from spackle.image import Photo, resize_photo
-from spackle.surface import surface_gaussians, surface_slope
-
-# Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
-# behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
-OPACITY = 0.99
-# Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
-# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels, closes it from behind:
-# 2 dB sharper at the photo's camera than one layer of wider blobs.
-FRONT_SPREAD_PX = 0.5
-BACKING_SPREAD_PX = 1.1
-BACKING_GAP = 0.005  # the backing's distance behind the front, relative
-BACKING_SLOPE_GAP = 4.0  # and this many pixels further along a slanted surface, so that none pokes through
-MAX_BACKING_GAP = 0.2
 
 
 class RgbdBase:
@@ -65,7 +51,7 @@ class RgbdBase:
 
 
 def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
-    """A photo and its depth to Gaussians, first one for each pixel in row-major order, then the backing.
+    """A photo and its depth to Gaussians, first one for each pixel in row-major order, see `layered_gaussians`.
 
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
@@ -85,13 +71,8 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
     if not known.any():
         raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
     inverse_depth = fill_missing(inverse_depth, rgb, known)
-    inverse_depth = attach_mixed_pixels(attach_flying_pixels(inverse_depth), rgb)
-    slope = surface_slope(inverse_depth)
-    colors = srgb_to_linear(rgb)
-    uv, flat = camera.pixel_centers().reshape(-1, 2), inverse_depth.reshape(-1)
-    opacities = torch.full((len(uv),), OPACITY)
-    front = surface_gaussians(camera, uv, flat, slope.reshape(-1, 2), FRONT_SPREAD_PX, colors.reshape(-1, 3), opacities)
-    gaussians = Gaussians.cat([front, _backing(colors, inverse_depth, slope, camera)])
+    inverse_depth = attach_flying_pixels(inverse_depth)
+    gaussians = layered_gaussians(inverse_depth, srgb_to_linear(rgb), camera)
     notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
     if sky:
         notes["sky"] = round(sky, 4)
@@ -113,36 +94,3 @@ def _inverse_depth(depth: DepthMap, rgb: Tensor, camera: Camera) -> tuple[Tensor
     sampled = sample(smooth, known, edges, camera.height, camera.width)
     settled, found = settle(sampled, rgb.contiguous().numpy())
     return torch.from_numpy(settled), torch.from_numpy(found)
-
-
-def _backing(colors: Tensor, inverse_depth: Tensor, slope: Tensor, camera: Camera) -> Gaussians:
-    """One wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface."""
-    cells = _cells(inverse_depth)
-    if not cells.numel():  # one pixel high or wide
-        return Gaussians.empty()
-    far, pick = cells.min(dim=-1)
-    slope = _cells(slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
-    # The cell's centre lies half a pixel from the farthest pixel's.
-    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
-    at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
-    gap = BACKING_GAP + BACKING_SLOPE_GAP * slope.abs().sum(-1) / at_center
-    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
-    # Its colour is the mean of the pixels on that surface.
-    same = (cells - far[..., None] < 0.02 * far[..., None]).to(colors)
-    mean = (_cells(colors) * same[..., None]).sum(2) / same.sum(2)[..., None]
-    return surface_gaussians(
-        camera,
-        camera.pixel_centers(stride=2).reshape(-1, 2),
-        (at_center * recede).reshape(-1),
-        (slope * recede[..., None]).reshape(-1, 2),
-        BACKING_SPREAD_PX,
-        mean.reshape(-1, 3),
-        torch.full((far.numel(),), OPACITY),
-    )
-
-
-def _cells(image: Tensor) -> Tensor:
-    """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order."""
-    height, width = (n // 2 for n in image.shape[:2])
-    grid = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *image.shape[2:])
-    return grid.transpose(1, 2).flatten(2, 3)

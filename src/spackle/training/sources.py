@@ -30,6 +30,7 @@ from spackle.training.composites import composite
 from spackle.training.sample import Sample
 
 TOLERANCE = 0.02  # how far behind what the virtual camera sees a Gaussian may lie and still count as seen, relative
+CORNER = 0.25  # pixels; centres of pixels are half of one from their corners
 
 
 def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
@@ -38,13 +39,13 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
     The virtual camera plays the part of the photo's, and the photo that of the novel view.
 
     Args:
-        prediction: what `lift` makes of a photo: a Gaussian a pixel, then the backing.
+        prediction: what `lift` makes of a photo: a Gaussian a pixel, the rest of mixed pixels, the backing.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
     """
     camera, gaussians = prediction.camera, prediction.gaussians
-    seen = with_backing(seen_from(gaussians, viewer, renderer), gaussians.means[:, 2], camera.height, camera.width)
+    seen = with_backing(seen_from(gaussians, viewer, renderer), gaussians, camera)
     kept = gaussians.select(seen)
     return Sample.of(kept, renderer.render(kept, camera), camera, viewer, photo)
 
@@ -64,20 +65,21 @@ def seen_from(gaussians: Gaussians, viewer: Camera, renderer: Renderer) -> Tenso
     return inside & ((depth[at] == 0) | (z <= around[at] * (1 + TOLERANCE)))
 
 
-def with_backing(seen: Tensor, z: Tensor, height: int, width: int) -> Tensor:
-    """`seen` [N] of a lifted photo's Gaussians with depths `z` [N], a backing one counting as the pixel that it backs.
+def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
+    """`seen` [N] of a lifted photo's Gaussians, a backing one counting as the farthest of the pixels around it.
 
-    A backing Gaussian lies behind its surface on purpose, so its own depth says nothing. The photo's height · width
-    pixels come first, then the backing (see `spackle.bases.lift.lift`).
+    A backing Gaussian lies behind its surface on purpose, so its own depth says nothing. The photo's pixels come first;
+    of all others those backing ones stand at the corners of pixels (see `spackle.bases.lift.lift`).
     """
-    pixels, rows, columns = height * width, height // 2, width // 2
-
-    def cells(image: Tensor) -> Tensor:
-        grid = image[:pixels].reshape(height, width)[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2)
-        return grid.transpose(1, 2).reshape(rows * columns, 4)
-
-    backed = cells(z).argmax(-1, keepdim=True)
-    return torch.cat([seen[:pixels], cells(seen).gather(-1, backed)[:, 0]])
+    width, height = camera.width, camera.height
+    uv, z = camera.project(gaussians.means)
+    corner = uv.round().long()
+    x, y = (corner[:, :1] - torch.tensor([1, 0, 1, 0])), (corner[:, 1:] - torch.tensor([1, 1, 0, 0]))
+    around = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+    backed = around.gather(1, z[around].argmax(-1, keepdim=True))[:, 0]
+    backing = (uv - corner).abs().amax(-1) < CORNER
+    backing[: width * height] = False
+    return torch.where(backing, seen[backed], seen)
 
 
 COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright

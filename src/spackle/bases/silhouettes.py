@@ -1,0 +1,252 @@
+"""Silhouettes in two layers: how much of a pixel beside a depth step the near surface covers, and both colours."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spackle._numba import kernel
+from spackle.bases.edges import Floats
+from spackle.device import run_chunks
+from spackle.surface import EDGE
+
+REACH = 3  # pixels to either side of a step that may be mixtures
+STEADILY = 0.5  # of a difference on both sides of it, and it is a plane's
+WINDOW = 5  # pixels to each side in which both surfaces are looked at
+FALL = np.float32(3.0)  # pixels at which a sample's weight has fallen to 1/e
+PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
+STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round things fall off towards their rims
+RIM = 2  # rings of the near surface that are put on its plane
+STEEPEST = np.float32(0.01)  # slope of such a plane, relative to the inverse depth
+BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
+SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
+AROUND = 2  # pixels to each side that say together where the photo has the outline
+STEPS, STEP = 6, 0.33  # shifts that are tried to each side, and their size in pixels
+SHIFT_COST = 0.02  # of a shift by one step, in variances of the colours
+RAMPS = np.array([1.75, 0.8])  # pixels from nothing to all of a surface across an outline, as lenses blur it
+VARIED = 2.0  # a colour is known to this many times the variance of those that it is a mean of
+NOISE = 4e-4  # and this much more
+OUTLIER = 0.5  # most that one pixel's share may be off, squared
+MARGIN, TEXTURE = np.float32(0.02), np.float32(1.0)  # a hidden colour leaves the mean so far: plus this many deviations
+GRAIN = 32
+
+
+@dataclasses.dataclass(frozen=True)
+class Layers:
+    """Both surfaces beside the depth steps of a map. Elsewhere `ring` and `alpha` are 0, and far is what is there."""
+
+    ring: NDArray[np.uint8]  # [H, W] pixels to the nearest step, 1 beside it; 0 beyond `REACH`
+    alpha: Floats  # [H, W] share of a pixel that the near surface covers
+    depth: Floats  # [2, H, W] inverse depth of the near and the far surface
+    slope: Floats  # [2, H, W, 2] of it by pixel x and y
+    color: Floats  # [2, H, W, 3] linear RGB
+
+
+def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
+    """Take the pixels beside depth steps apart, so that near and far colour mix by alpha to what the photo shows.
+
+    A lens blurs a silhouette, so that a pixel or two on each side show both surfaces; and the map's step may lie a
+    pixel or two beside the photo's outline. Both surfaces are continued across the step, their colours from pixels
+    that are pure; the outline is shifted to where the photo has it.
+
+    Args:
+        inverse_depth: [H, W].
+        slope: [H, W, 2] of it by pixel x and y.
+        colors: [H, W, 3] linear RGB of the photo.
+    """
+    height, width = inverse_depth.shape
+    ring, levels = _rings(inverse_depth)
+    depth, slopes, color = (np.stack([image, image]) for image in (inverse_depth, slope, colors))
+    alpha, inside, texture = (np.zeros((n, height, width), np.float32) for n in (1, 1, 2))
+    found = (inside[0], depth, slopes, color, texture)
+    run_chunks(lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height, GRAIN)
+    looks = (colors, ring, inside[0], color, texture)
+    run_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height, GRAIN)
+    _unmix(colors, ring, alpha[0], color, texture)
+    return Layers(ring, alpha[0], depth, slopes, color)
+
+
+@kernel
+def _rings(image: Any) -> Any:
+    """Rings around the steps, and for the first ring the inverse depths [H, W, 2] above and below its step."""
+    height, width = image.shape
+    ring = np.zeros((height, width), np.uint8)
+    levels = np.zeros((height, width, 2), np.float32)
+    for y in range(height):
+        for x in range(width):
+            for k in range(2):
+                v, u = y + k, x + 1 - k
+                if v >= height or u >= width:
+                    continue
+                high, low = max(image[y, x], image[v, u]), min(image[y, x], image[v, u])
+                if high - low <= EDGE * low:
+                    continue
+                # On a steep plane, as the ground towards the horizon, the depth goes on falling on both sides.
+                jump = image[v, u] - image[y, x]
+                before = image[y, x] - image[y - k, x - 1 + k] if (y if k else x) > 0 else jump
+                after = image[v + k, u + 1 - k] - image[v, u] if (v + 1 < height if k else u + 1 < width) else jump
+                if min(before * jump, after * jump) > STEADILY * jump * jump:
+                    continue
+                for b, a in ((y, x), (v, u)):
+                    if ring[b, a] == 0 or high - low > levels[b, a, 0] - levels[b, a, 1]:
+                        ring[b, a] = 1
+                        levels[b, a, 0], levels[b, a, 1] = high, low
+    for n in range(1, REACH):
+        for y in range(height):
+            for x in range(width):
+                if ring[y, x] != n:
+                    continue
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        if ring[v, u] == 0:
+                            ring[v, u] = n + 1
+    return ring, levels
+
+
+@kernel
+def _survey(
+    start: int, stop: int, image: Any, colors: Any, ring: Any, levels: Any,
+    inside: Any, depth: Any, slope: Any, color: Any, texture: Any,
+) -> None:  # fmt: skip
+    """Rows start..stop: both surfaces, their mean colours, and how far inside of the near one a pixel lies."""
+    height, width = image.shape
+    m = np.zeros((2, 9), np.float64)  # per side: weight, x, y, d, xx, yy, xy, xd, yd
+    s = np.zeros((2, 7), np.float64)  # per side: weight, colour, its square
+    level = np.zeros(2, np.float32)
+    for y in range(start, stop):
+        for x in range(width):
+            if ring[y, x] == 0:
+                continue
+            high, low, closest = np.float32(0), np.float32(0), 1000
+            for v in range(max(y - REACH, 0), min(y + REACH + 1, height)):
+                for u in range(max(x - REACH, 0), min(x + REACH + 1, width)):
+                    away = (v - y) ** 2 + (u - x) ** 2
+                    if ring[v, u] == 1 and away < closest:
+                        high, low, closest = levels[v, u, 0], levels[v, u, 1], away
+            middle = np.float32(0.5) * (high + low)
+            near = image[y, x] > middle
+            level[0], level[1] = high, low
+            level[0 if near else 1] = image[y, x]
+            m[:], s[:] = 0.0, 0.0
+            blurred, total = 0.0, 0.0
+            for v in range(max(y - WINDOW, 0), min(y + WINDOW + 1, height)):
+                for u in range(max(x - WINDOW, 0), min(x + WINDOW + 1, width)):
+                    d = image[v, u]
+                    dx, dy = u - x, v - y
+                    side = 0 if d > middle else 1
+                    if abs(dx) <= REACH and abs(dy) <= REACH:
+                        w = np.exp(-np.float32(dx * dx + dy * dy) / (2 * BLUR * BLUR))
+                        total += w
+                        blurred += w * (1 - side)
+                    if d > high + (high - middle) or d < low - (middle - low):
+                        continue
+                    w = np.exp(-np.float32(dx * dx + dy * dy) / (FALL * FALL))
+                    r = ring[v, u]
+                    if abs(d - level[side]) < np.float32(EDGE) * 2 * d:
+                        wd = w * STEADY[r]
+                        m[side, 0] += wd
+                        m[side, 1] += wd * dx
+                        m[side, 2] += wd * dy
+                        m[side, 3] += wd * d
+                        m[side, 4] += wd * dx * dx
+                        m[side, 5] += wd * dy * dy
+                        m[side, 6] += wd * dx * dy
+                        m[side, 7] += wd * dx * d
+                        m[side, 8] += wd * dy * d
+                    wc = w * PURE[r]
+                    s[side, 0] += wc
+                    for c in range(3):
+                        s[side, 1 + c] += wc * colors[v, u, c]
+                        s[side, 4 + c] += wc * colors[v, u, c] * colors[v, u, c]
+            part = min(max(blurred / total, 0.02), 0.98)
+            far_in = np.float32(BLUR * np.log(part / (1 - part)) / 1.702)
+            inside[y, x] = max(far_in, SURE) if near else min(far_in, -SURE)
+            for side in range(2):
+                # What the map says is kept, but for near rims, which are ragged.
+                if (side == 0) != near or (near and ring[y, x] <= RIM):
+                    at, across, down = _plane(m[side], level[side])
+                    depth[side, y, x] = at
+                    slope[side, y, x, 0], slope[side, y, x, 1] = across, down
+                variance = 0.0
+                for c in range(3):
+                    if s[side, 0] > 0:
+                        mean = s[side, 1 + c] / s[side, 0]
+                        color[side, y, x, c] = mean
+                        variance += max(s[side, 4 + c] / s[side, 0] - mean * mean, 0.0)
+                texture[side, y, x] = variance
+
+
+@kernel
+def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: Any, texture: Any, alpha: Any) -> None:
+    """Rows start..stop: the outline shifted across its direction to where the photo has it, and what it covers."""
+    height, width = ring.shape
+    shifts = 2 * STEPS + 1
+    costs = np.zeros(len(RAMPS) * shifts)
+    for y in range(start, stop):
+        for x in range(width):
+            if ring[y, x] == 0:
+                continue
+            for k in range(len(costs)):
+                costs[k] = SHIFT_COST * (k % shifts - STEPS) ** 2
+            for v in range(max(y - AROUND, 0), min(y + AROUND + 1, height)):
+                for u in range(max(x - AROUND, 0), min(x + AROUND + 1, width)):
+                    if ring[v, u] == 0:
+                        continue
+                    apart, along = 0.0, 0.0
+                    for c in range(3):
+                        difference = color[0, v, u, c] - color[1, v, u, c]
+                        apart += difference * difference
+                        along += difference * (colors[v, u, c] - color[1, v, u, c])
+                    weight = apart / (VARIED * (texture[0, v, u] + texture[1, v, u]) + NOISE)
+                    share = along / max(apart, 1e-9)
+                    for k in range(len(costs)):
+                        a = 0.5 + (inside[v, u] + (k % shifts - STEPS) * STEP) / RAMPS[k // shifts]
+                        off = min(max(a, 0.0), 1.0) - share
+                        costs[k] += weight * min(off * off, OUTLIER)
+            best = np.argmin(costs)
+            shift = float(best % shifts - STEPS)
+            if 0 < best % shifts < shifts - 1:  # the lowest point of a parabola
+                bend = costs[best - 1] - 2 * costs[best] + costs[best + 1]
+                if bend > 0:
+                    shift += 0.5 * (costs[best - 1] - costs[best + 1]) / bend
+            alpha[y, x] = min(max(0.5 + (inside[y, x] + shift * STEP) / RAMPS[best // shifts], 0.0), 1.0)
+
+
+@kernel
+def _unmix(colors: Any, ring: Any, alpha: Any, color: Any, texture: Any) -> None:
+    """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains."""
+    height, width = ring.shape
+    rests = np.zeros(3, np.float32)
+    for y in range(height):
+        for x in range(width):
+            if ring[y, x] == 0:
+                continue
+            a = alpha[y, x]
+            whole = a * a * a + (1 - a) * (1 - a) * (1 - a)
+            for side in range(2):
+                part = a if side == 0 else 1 - a
+                limit = np.float32(1) if part > 0.9 else MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
+                for c in range(3):
+                    if side == 0:
+                        rest = colors[y, x, c] - (a * color[0, y, x, c] + (1 - a) * color[1, y, x, c])
+                        rests[c] = rest
+                    change = min(max(rests[c] * part * part / whole, -limit), limit)
+                    color[side, y, x, c] = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
+
+
+@kernel
+def _plane(m: Any, level: Any) -> Any:
+    """Inverse depth and slope of the plane of weighted moments; the mean where there is too little to see a slope."""
+    if m[0] < 1e-6:
+        return np.float32(level), np.float32(0), np.float32(0)
+    mx, my, md = m[1] / m[0], m[2] / m[0], m[3] / m[0]
+    cxx, cyy, cxy = m[4] / m[0] - mx * mx + 0.3, m[5] / m[0] - my * my + 0.3, m[6] / m[0] - mx * my
+    cxd, cyd = m[7] / m[0] - mx * md, m[8] / m[0] - my * md
+    determinant = cxx * cyy - cxy * cxy
+    across, down = (cxd * cyy - cyd * cxy) / determinant, (cyd * cxx - cxd * cxy) / determinant
+    limit = STEEPEST * md
+    across, down = min(max(across, -limit), limit), min(max(down, -limit), limit)
+    return np.float32(max(md - across * mx - down * my, 0.5 * md)), np.float32(across), np.float32(down)
