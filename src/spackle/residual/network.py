@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
-from spackle.device import Precision, pick_dtype
+from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.network_file import fill_network, read_tensors
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
 from spackle.residual.hole_features import Cues
@@ -186,7 +186,7 @@ def predict_deltas(
         features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
         own = torch.zeros_like(chosen[there])
         own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
-        with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+        with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
             found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
         field[there][own] = found.float()
     return field

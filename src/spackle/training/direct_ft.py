@@ -27,7 +27,7 @@ from spackle.digest import weights_digest
 from spackle.downloads import check_recorded, installed
 from spackle.errors import InputError
 from spackle.formats import atomic_path
-from spackle.render import Renderer
+from spackle.render import Renderer, place_of
 from spackle.training.data import short_digest
 from spackle.training.method import (
     PICTURED,
@@ -104,14 +104,15 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
     with enough_memory(*advice):
-        gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera))
+        place = place_of(renderer)
+        gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera), place)
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     return ViewBatch(
         rgb=torch.stack([rendering.rgb for rendering in drawn]),
         alpha=torch.stack([rendering.alpha for rendering in drawn]),
-        base_rgb=torch.stack([view.rendering.rgb for view in views]),
-        target=torch.stack([view.target for view in views]),
-        hole=torch.stack([view.mask for view in views]),
+        base_rgb=torch.stack([view.rendering.rgb for view in views]).to(place),
+        target=torch.stack([view.target for view in views]).to(place),
+        hole=torch.stack([view.mask for view in views]).to(place),
     )
 
 
@@ -149,7 +150,7 @@ class DirectFt(ViewMethod):
             widest = int(np.argmax(self.photos.files.samples[place][1].holes))
             views = self.photos.views(place, (0, widest))
             done = render_photo(network, self.base, views, self.objective.renderer)
-            rows += [torch.cat(row, dim=1) for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
+            rows += [torch.cat(row, dim=1).cpu() for row in zip(done.base_rgb, done.rgb, done.target, strict=True)]
         shown = [_reduced(row, len(self.columns.split(","))) for row in rows]
         across = max(row.shape[1] for row in shown)
         return torch.cat([pad(row, (0, 0, 0, across - row.shape[1])) for row in shown])

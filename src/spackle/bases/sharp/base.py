@@ -245,14 +245,14 @@ class TunableSharp:
         with own_arithmetic(device):
             return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
-    def gaussians(self, decoder: nn.Module, seen: Seen) -> Gaussians:
-        """Gaussians in SHARP's normalised space, on the processor, with gradients to a `GaussianDecoder`."""
+    def gaussians(self, decoder: nn.Module, seen: Seen, place: torch.device | str = "cpu") -> Gaussians:
+        """Gaussians in SHARP's normalised space, at a place, with gradients to a `GaussianDecoder`."""
         device = seen.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
             with autocast:
                 deltas = decoder(seen.picture, seen.maps)
-            return compose(seen.start, deltas).to("cpu")
+            return compose(seen.start, deltas).to(place)
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
