@@ -269,8 +269,9 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
     completers = [Completer(scene, camera, drawer, shipped_network()) for drawer in (gpu, CpuRenderer())]
     found = [completer.complete_view(view) for completer in completers]
     one, other = (CpuRenderer().render([scene, aux], view) for aux in found)
+    apart = float((one.rgb - other.rgb).abs().mean())
     yield (
-        f"{len(found[0]):,} and {len(found[1]):,} Gaussians; mean difference {float((one.rgb - other.rgb).abs().mean()):.1e}; "
+        f"{len(found[0]):,} and {len(found[1]):,} Gaussians; mean difference {apart:.1e}; "
         f"holes {hole_area_ratio(one.alpha):.3%} and {hole_area_ratio(other.alpha):.3%}"
     )
     there, guard = completers[0].there, completers[0].photo_guard()
