@@ -134,6 +134,7 @@ def test_every_command_has_a_help() -> None:
 def test_an_input_is_an_argument_or_follows_i(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     refuses(run("predict", pair[0], "-i", pair[1], "-o", tmp_path / "out"), pair[1])
     refuses(run("render", "-o", tmp_path / "out"), "SCENE.ply")
+    refuses(run("predict"), "PHOTO")
     for words in (("--sharp", "windws=1"), ("--sharp", "windows=many"), ("--sharp", "compile")):
         refuses(run("predict", pair[0], "-o", tmp_path / "out", *words), "--sharp")
     assert not (tmp_path / "out").exists()

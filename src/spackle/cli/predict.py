@@ -32,7 +32,9 @@ def predict(
         Path | None, typer.Argument(metavar="PHOTO", help="A photo, a clip, or a folder of photos.", show_default=False)
     ] = None,
     given: InputOption = None,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
+    ] = Path("out"),
     base: Annotated[
         str,
         typer.Option(
