@@ -1,12 +1,13 @@
 """The lite base's depth beside two guesses that need no photo, on measured depth, as a Markdown table.
 
     python research/lite/benchmark.py --stereo FOLDER --rgbd FOLDER --unit 0.001 [--last 0.2] [--weights FILE] \
-        [--pictures PNG]
+        [--pictures PNG] [--standing PHOTOS]
 
 Each --stereo is a folder of scenes, each with a scene.json, or of the format of ETH3D and Middlebury 2014 (calib.txt).
 Each --rgbd is a folder of NAME.color.jpg and NAME.depth.png, with its --unit in metres; --last takes the last share of
 its frames, those that `lite.yaml` does not learn from. Every guess gets the scale and shift that fit best
-(`depth_loss.py`). The last line is the time for a photo of 640×480, median of 9.
+(`depth_loss.py`). --standing makes 40 streets with standing things, their surfaces cut from PHOTOS, and judges within
+the things (`standing.py`). The last line is the time for a photo of 640×480, median of 9.
 """
 
 from __future__ import annotations
@@ -17,20 +18,25 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
 from depth_loss import DepthScore, score_depth, vertical_ramp
 from frames import JUDGED_SIDE, Frame, Measured, of_camera, of_scenes, reduced
 from method import colored, ends, sheet
+from standing import StandingScore, labelled_scene, score_standing
+from synthetic_scenes import PhotoDraw
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import LiteBase
 from spackle.evaluation.datasets.stereo import pair_of_2014
 from spackle.formats import save_png
-from spackle.image import load_photo
+from spackle.image import PHOTO_SUFFIXES, load_photo
+from spackle.training.data import find_files
 from spackle.training.recipe import RgbdFolder
 
 GUESSES = ("constant", "ramp", "lite")
+STREETS, STREETS_SEED = 40, 202
 
 
 def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]]:
@@ -61,6 +67,23 @@ def score(frame: Frame, guess: Tensor) -> DepthScore:
     return score_depth(guess, 1 / frame.inverse_depth.where(frame.valid, 1.0), frame.valid)
 
 
+def standing(base: LiteBase, photos: Path) -> str:
+    """A line on made streets with standing things."""
+    draw = PhotoDraw(find_files(photos, "--standing", PHOTO_SUFFIXES, "photos"), print)
+    scores: dict[str, list[StandingScore]] = {guess: [] for guess in GUESSES[1:]}
+    for number in range(STREETS):
+        frame, owner = labelled_scene(np.random.default_rng([STREETS_SEED, number]), draw, 320, 448)
+        each = guesses(base, frame)
+        for guess, found in scores.items():
+            found.append(score_standing(each[guess], frame, owner))
+    cells = []
+    for guess, found in scores.items():
+        things = sum(one.things for one in found)
+        within, off = (sum(getattr(s, n) * s.things for s in found) / things for n in ("within", "abs_rel"))
+        cells.append(f"{guess} {within:.4f} (AbsRel {off:.3f})")
+    return f"{STREETS} made streets, {things} standing things, error within: {', '.join(cells)}"
+
+
 def seconds(base: LiteBase, runs: int = 9) -> float:
     """For a photo of 640×480, from its pixels to the inverse depth."""
     photo, times = torch.rand(480, 640, 3), []
@@ -79,6 +102,7 @@ def main() -> None:
     parser.add_argument("--last", type=float, default=0.2)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--standing", type=Path)
     arguments = parser.parse_args()
     base = LiteBase.load(arguments.weights)
 
@@ -104,6 +128,8 @@ def main() -> None:
             *(f"{d:.1%}" for d in deltas),
         ]
         print(f"| {name} | {len(frames)} | {' | '.join(cells)} |", flush=True)
+    if arguments.standing:
+        print(f"\n{standing(base, arguments.standing)}", flush=True)
     print(f"\n640×480: {seconds(base):.3f} s on {torch.get_num_threads()} threads")
     if arguments.pictures:
         save_png(sheet(rows, 320), arguments.pictures)

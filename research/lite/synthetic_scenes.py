@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from frames import Frame, Rng
-from ray_tracer import Floats, trace
+from ray_tracer import Floats, Solid, trace
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from scene_kinds import Scene, heap, room, sheets, shelf, still_life, street, table, yard
@@ -45,7 +45,23 @@ def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[
         height: in pixels.
         width: likewise.
     """
-    build = KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0]
+    picture = drawn(rng, photos, height, width, KINDS[int(rng.choice(len(KINDS), p=[share for _, share in KINDS]))][0])
+    return picture.rgb, picture.inverse_depth
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A scene, drawn, and what it was drawn from."""
+
+    rgb: Tensor  # [H, W, 3] sRGB
+    inverse_depth: Tensor  # [H, W] in 1/m
+    solids: list[Solid]
+    skins: Floats  # [T, S, S, 4] their textures
+    rays: Floats  # [N, 3], `SAMPLES`² a pixel
+
+
+def drawn(rng: Rng, photos: Photos, height: int, width: int, build: Callable[[Rng], Scene]) -> Picture:
+    """A scene of a kind, see `synthetic_scene`."""
     skins = textures(rng, photos)
     solids, pitch = build(rng)
     focal = width * rng.uniform(0.7, 1.5)
@@ -58,7 +74,7 @@ def synthetic_scene(rng: Rng, photos: Photos, height: int, width: int) -> tuple[
     rgb = _exposed(rng, torch.from_numpy(colors))
     rgb = avg_pool2d(rgb.reshape(*fine, 3).permute(2, 0, 1)[None], SAMPLES)[0]
     inverse = torch.from_numpy(1.0 / distances).reshape(fine)[::SAMPLES, ::SAMPLES]  # one of them: no in-between
-    return rgb.permute(1, 2, 0).contiguous(), inverse.contiguous()
+    return Picture(rgb.permute(1, 2, 0).contiguous(), inverse.contiguous(), solids, skins, rays)
 
 
 def _exposed(rng: Rng, rgb: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from lite_data import f32, photo
 from photos import write_photo
 from ray_tracer import SHEET, Solid
 from scene_kinds import Scene
+from standing import SMALLEST, labelled_scene, score_standing
 from synthetic_scenes import SyntheticScenes, synthetic_scene
 from textures import FIRST_SHAPE, PEAK, RING, SIDE, WHOLE, textures
 
@@ -66,6 +67,26 @@ def test_every_kind_of_scene_has_things_before_others(kind: Kind, monkeypatch: p
     steps = [float((depth.diff(dim=1).abs() > 0.1 * depth[:, 1:]).float().mean()) for depth in found]
     assert sum(steps) / len(steps) > 0.003
     assert all(torch.isfinite(depth).all() and float(depth.max()) < 1 / 0.049 for depth in found)
+
+
+def test_each_pixel_of_a_street_knows_whose_it_is_and_the_score_asks_for_true_shapes() -> None:
+    frame, owner = labelled_scene(np.random.default_rng(4), photo, 64, 96)
+    true = frame.inverse_depth
+    assert (owner.shape, owner.dtype) == ((64, 96), torch.int64)
+    assert int((owner > 0).sum()) > 100
+    perfect = score_standing(3 * true + 0.2, frame, owner)
+    assert perfect.things == sum(
+        float(((owner == n) & (true > 0.01)).float().mean()) > SMALLEST for n in range(1, int(owner.max()) + 1)
+    )
+    assert perfect.within < 1e-6
+    assert perfect.abs_rel < 1e-6
+    # A thing at another depth keeps its shape; one that leans loses it by the logarithm of how far.
+    near = owner == int(owner[owner > 0].mode().values)
+    moved = score_standing(torch.where(near, 1.3 * true, true), frame, owner)
+    rows = torch.arange(64)[:, None].expand(64, 96)
+    leaning = score_standing(torch.where(near, true * torch.exp(0.02 * rows), true), frame, owner)
+    assert moved.within < 0.5 * leaning.within
+    assert moved.abs_rel > 0.01
 
 
 def test_the_kinds_of_scenes_have_shares() -> None:
