@@ -102,8 +102,10 @@ def plain_layers(inverse: Image, slope: Image, colors: Image) -> S.Layers:
             for q in around(ring.shape, *p, S.AROUND):
                 if ring[q]:
                     apart = mean[0][q] - mean[1][q]
-                    share = apart @ (colors[q] - mean[1][q]) / max(apart @ apart, 1e-9)
-                    weight = apart @ apart / (S.VARIED * texture[:, q[0], q[1]].sum() + S.NOISE)
+                    own = colors[q] - mean[1][q]
+                    share = apart @ own / max(apart @ apart, 1e-9)
+                    beside = S.ASTRAY * max(own @ own - share * (apart @ own), 0)
+                    weight = apart @ apart / (S.VARIED * (texture[:, q[0], q[1]].sum() + beside) + S.NOISE)
                     off = np.clip(0.5 + (inside[q] + shift * S.STEP) / ramp, 0, 1) - share
                     costs[ramp, shift] += weight * min(off**2, S.OUTLIER)
         ramp, best = min(costs, key=costs.__getitem__)
@@ -117,9 +119,11 @@ def plain_layers(inverse: Image, slope: Image, colors: Image) -> S.Layers:
         shares = np.array([alpha[p], 1 - alpha[p]])
         rest = colors[p] - shares @ mean[:, p[0], p[1]]
         for side, share in enumerate(shares):
-            limit = 1 if share > 0.9 else S.MARGIN + S.TEXTURE * math.sqrt(texture[side][p])
+            limit = 1 if share > S.SOLE else S.MARGIN + S.TEXTURE * math.sqrt(texture[side][p])
             change = np.clip(rest * share**2 / (shares**3).sum(), -limit, limit)
             mean[side][p] = np.clip(mean[side][p] + change, 0, 1)
+        if ((colors[p] - shares @ mean[:, p[0], p[1]]) ** 2).sum() > S.UNEXPLAINED:
+            alpha[p] = inside[p] > 0
     return S.Layers(ring, alpha, depth, slopes, mean)
 
 

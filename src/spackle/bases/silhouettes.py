@@ -20,6 +20,8 @@ FALL = np.float32(3.0)  # pixels at which a sample's weight has fallen to 1/e
 PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
 STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round things fall off towards their rims
 RIM = 2  # rings of the near surface that are put on its plane
+SOLE = np.float32(0.9)  # a surface that has more of a pixel takes any colour
+UNEXPLAINED = np.float32(0.002)  # squared difference from the photo that says that a pixel is no mixture
 STEEPEST = np.float32(0.01)  # slope of such a plane, relative to the inverse depth
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
 SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
@@ -28,6 +30,7 @@ STEPS, STEP = 6, 0.33  # shifts that are tried to each side, and their size in p
 SHIFT_COST = 0.02  # of a shift by one step, in variances of the colours
 RAMPS = np.array([1.75, 0.8])  # pixels from nothing to all of a surface across an outline, as lenses blur it
 VARIED = 2.0  # a colour is known to this many times the variance of those that it is a mean of
+ASTRAY = 4.0  # and to so many times what it has that no mixture would
 NOISE = 4e-4  # and this much more
 OUTLIER = 0.5  # most that one pixel's share may be off, squared
 MARGIN, TEXTURE = np.float32(0.02), np.float32(1.0)  # a hidden colour leaves the mean so far: plus this many deviations
@@ -65,7 +68,7 @@ def find_layers(inverse_depth: Floats, slope: Floats, colors: Floats) -> Layers:
     run_chunks(lambda a, b: _survey(a, b, inverse_depth, colors, ring, levels, *found), height, GRAIN)
     looks = (colors, ring, inside[0], color, texture)
     run_chunks(lambda a, b: _match(a, b, *looks, alpha[0]), height, GRAIN)
-    _unmix(colors, ring, alpha[0], color, texture)
+    _unmix(colors, ring, inside[0], alpha[0], color, texture)
     return Layers(ring, alpha[0], depth, slopes, color)
 
 
@@ -195,13 +198,15 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
                 for u in range(max(x - AROUND, 0), min(x + AROUND + 1, width)):
                     if ring[v, u] == 0:
                         continue
-                    apart, along = 0.0, 0.0
+                    apart, along, away = 0.0, 0.0, 0.0
                     for c in range(3):
-                        difference = color[0, v, u, c] - color[1, v, u, c]
+                        difference, own = color[0, v, u, c] - color[1, v, u, c], colors[v, u, c] - color[1, v, u, c]
                         apart += difference * difference
-                        along += difference * (colors[v, u, c] - color[1, v, u, c])
-                    weight = apart / (VARIED * (texture[0, v, u] + texture[1, v, u]) + NOISE)
+                        along += difference * own
+                        away += own * own
                     share = along / max(apart, 1e-9)
+                    beside = max(away - share * along, 0.0)  # no mixture of the two has that
+                    weight = apart / (VARIED * (texture[0, v, u] + texture[1, v, u] + ASTRAY * beside) + NOISE)
                     for k in range(len(costs)):
                         a = 0.5 + (inside[v, u] + (k % shifts - STEPS) * STEP) / RAMPS[k // shifts]
                         off = min(max(a, 0.0), 1.0) - share
@@ -216,25 +221,33 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 
 
 @kernel
-def _unmix(colors: Any, ring: Any, alpha: Any, color: Any, texture: Any) -> None:
-    """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains."""
+def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
+    """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains.
+
+    A pixel that no such mixture explains, as the shaded edge of a round thing, is all of the surface that it lies in.
+    """
     height, width = ring.shape
-    rests = np.zeros(3, np.float32)
+    rest = np.zeros(3, np.float32)
     for y in range(height):
         for x in range(width):
             if ring[y, x] == 0:
                 continue
-            a = alpha[y, x]
+            a, left = alpha[y, x], np.float32(0)
             whole = a * a * a + (1 - a) * (1 - a) * (1 - a)
-            for side in range(2):
-                part = a if side == 0 else 1 - a
-                limit = np.float32(1) if part > 0.9 else MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
-                for c in range(3):
-                    if side == 0:
-                        rest = colors[y, x, c] - (a * color[0, y, x, c] + (1 - a) * color[1, y, x, c])
-                        rests[c] = rest
-                    change = min(max(rests[c] * part * part / whole, -limit), limit)
-                    color[side, y, x, c] = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
+            for c in range(3):
+                rest[c] = colors[y, x, c] - (a * color[0, y, x, c] + (1 - a) * color[1, y, x, c])
+            for c in range(3):
+                missing = rest[c]
+                for side in range(2):
+                    part = a if side == 0 else 1 - a
+                    limit = np.float32(1) if part > SOLE else MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
+                    change = min(max(rest[c] * part * part / whole, -limit), limit)
+                    moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
+                    missing -= part * (moved - color[side, y, x, c])
+                    color[side, y, x, c] = moved
+                left += missing * missing
+            if left > UNEXPLAINED:
+                alpha[y, x] = 1 if inside[y, x] > 0 else 0
 
 
 @kernel
