@@ -56,6 +56,8 @@ def serving(work: Complete = complete, limits: Limits = QUICK, **options: Any) -
 def ask(server: ViewerServer, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
     """A well-formed request."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
+    if method == "POST":  # as every browser does
+        headers = {"Origin": f"http://127.0.0.1:{server.port}", **headers}
     with contextlib.closing(connection):
         connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
         answer = connection.getresponse()

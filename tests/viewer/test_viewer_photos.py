@@ -63,7 +63,8 @@ def test_a_photo_becomes_the_scene_that_is_shown_one_at_a_time(photo: bytes) -> 
         assert ask(server, "/scenes/1/base.bin").body == photo
         assert not uploads_of(server)
         # What follows the declared length is not read; a name is nothing but text.
-        start = f"POST /photos?name=%3Cb%3E%26.png HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(photo)}\r\n\r\n"
+        start = "POST /photos?name=%3Cb%3E%26.png HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n"
+        start += f"Content-Length: {len(photo)}\r\n\r\n"
         assert raw(server, start.encode() + photo + b"\x00 and more\r\n\r\n").split()[1] == b"202"
         assert events(server, "/jobs/2")[-1] == {"ready": "/scenes/2.json"}
         assert ask(server, "/scenes/2/base.bin").body == photo
@@ -82,7 +83,7 @@ def test_a_kind_that_is_not_named_is_refused(photo: bytes) -> None:
 
 
 def test_a_photo_has_a_length_within_limits(photo: bytes) -> None:
-    start = "POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\n"
+    start = "POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n"
     with serving() as server:
         for headers, status in {
             "Transfer-Encoding: chunked\r\n": 411,
@@ -103,7 +104,8 @@ def test_a_photo_has_a_length_within_limits(photo: bytes) -> None:
 
 
 def test_a_client_may_ask_before_it_sends_and_learns_why_it_is_refused_while_it_sends(photo: bytes) -> None:
-    head = f"Host: localhost\r\nContent-Length: {len(photo)}\r\nExpect: 100-continue\r\nConnection: close\r\n\r\n"
+    head = f"Host: localhost\r\nOrigin: http://localhost\r\nContent-Length: {len(photo)}\r\nExpect: 100-continue\r\n"
+    head += "Connection: close\r\n\r\n"
     with serving() as server:
         with dial(server, f"POST /photos?name=a.png HTTP/1.1\r\n{head}".encode()) as connection:
             assert connection.recv(1000) == b"HTTP/1.1 100 Continue\r\n\r\n"
@@ -118,7 +120,8 @@ def test_a_client_may_ask_before_it_sends_and_learns_why_it_is_refused_while_it_
 
 @pytest.mark.parametrize("how", ["silent", "dripping", "gone", "half closed"])
 def test_a_slow_or_vanishing_client_leaves_the_place_to_others(photo: bytes, how: str) -> None:
-    start = f"POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(photo)}\r\n\r\n"
+    start = "POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n"
+    start += f"Content-Length: {len(photo)}\r\n\r\n"
     with serving() as server, dial(server, start.encode() + photo[:50]) as connection:
         eventually(lambda: uploads_of(server))
         assert send(server, photo).status == 409

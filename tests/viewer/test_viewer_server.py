@@ -197,6 +197,64 @@ def test_connections_are_counted_and_a_client_that_never_reads_is_left() -> None
         eventually(lambda: len(ask(server, "/scenes/1/base.bin").body) == len(content))
 
 
+def test_idle_connections_make_room_for_who_asks() -> None:
+    with (
+        serving(limits=dataclasses.replace(QUICK, request=30, connections=8)) as server,
+        contextlib.ExitStack() as stack,
+    ):
+        idle = [stack.enter_context(dial(server, b"GET / HT")) for _ in range(40)]
+        start = time.monotonic()
+        assert [ask(server).status for _ in range(5)] == [200] * 5
+        assert time.monotonic() - start < 3
+        assert answer_of(idle[0]) == b""
+
+
+def test_an_upload_that_trickles_leaves_its_place(photo: bytes) -> None:
+    limits = dataclasses.replace(QUICK, upload=60, rate=100_000)
+    head = b"POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n"
+    head += b"Content-Length: 90000\r\n\r\n"
+    with serving(limits=limits) as server, dial(server, head) as slow:
+        start = time.monotonic()
+        with contextlib.suppress(OSError):
+            while time.monotonic() - start < 10 and send(server, photo).status == 409:
+                slow.sendall(b"a")
+                time.sleep(0.05)
+        assert time.monotonic() - start < 3
+
+
+def test_a_post_without_an_origin_is_refused(server: ViewerServer, photo: bytes) -> None:
+    head = f"POST /photos?name=a.png HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(photo)}\r\n\r\n".encode()
+    assert raw(server, head + photo).split()[1] == b"403"
+
+
+def test_a_token_is_asked_for_on_every_request(photo: bytes) -> None:
+    lines: list[str] = []
+    with serving(token="s3cret", log=lines.append) as server:
+        assert server.url == f"http://127.0.0.1:{server.port}/s3cret/"
+        server.show(a_scene())
+        for path in (
+            "/",
+            "/viewer.js",
+            "/scene.json",
+            "/scenes/1.json",
+            "/jobs/1/events",
+            "/photos",
+            "/s3cre",
+            "/s3crett/",
+        ):
+            for prefix in ("", "/", "/x", "/S3CRET", "/%733cret", "/x/s3cret"):
+                assert ask(server, prefix + path).status == 403
+            assert ask(server, path + "?token=s3cret", Cookie="s3cret", Referer=server.url).status == 403
+        assert send(server, photo).status == 403
+        for path in ("", "/", "/viewer.js", "/scene.json", "/scenes/1.json", "/scenes/1/base.bin"):
+            assert ask(server, f"/s3cret{path}").status == 200
+        job = ask(server, "/s3cret/photos?name=a.png", "POST", photo).json["job"]
+        assert events(server, f"/s3cret{job}")[-1]["ready"] == "/scenes/2.json"
+        assert ask(server, "/s3cret/photos?name=a.png", "POST", photo, Origin="http://evil.example").status == 403
+    assert lines
+    assert "s3cret" not in "".join(lines)
+
+
 def test_closing_tells_the_listeners_ends_the_job_and_removes_the_photo(photo: bytes) -> None:
     reached, lines = threading.Event(), list[str]()
 

@@ -63,7 +63,7 @@ async function show({ description, layers }) {
   const places = description.downloads ?? {};
   const saved = element("download");
   saved.hidden = !Object.keys(places).length;
-  saved.replaceChildren(saved.options[0], ...Object.entries(places).map(([suffix, place]) => new Option(suffix, place)));
+  saved.replaceChildren(saved.options[0], ...Object.entries(places).map(([suffix, place]) => new Option(suffix, source.here(place))));
   if (description.note) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }

@@ -12,18 +12,18 @@ export async function embedded() {
 
 /** What the server shows now: {scene, job, upload}. */
 export async function current() {
-  return (await answer(await fetch("/scene.json", { cache: "no-store" }))).json();
+  return (await answer(await fetch(here("/scene.json"), { cache: "no-store" }))).json();
 }
 
 /** A scene of the server; `onProgress` hears of shares in 0..1. */
 export async function load(url, onProgress = () => {}) {
-  const description = await (await answer(await fetch(url))).json();
+  const description = await (await answer(await fetch(here(url)))).json();
   const folder = url.replace(/\.json$/, "");
   const sizes = description.layers.map((layer) => 20 * layer.count);
   const all = Math.max(1, sizes.reduce((sum, size) => sum + size, 0));
   let read = 0;
   return withBytes(description, async (file) => {
-    const { body } = await answer(await fetch(`${folder}/${file}`));
+    const { body } = await answer(await fetch(here(`${folder}/${file}`)));
     const parts = [];
     for (const reader = body.getReader(); ;) {
       const { done, value } = await reader.read();
@@ -42,14 +42,14 @@ export async function send(photo, { base = "", disparity = "", depth = null } = 
   if (disparity) fields.set("disparity", disparity);
   if (depth?.size) fields.set("depth", `${/\.[^.]*$/.exec(depth.name.toLowerCase())?.[0]}:${depth.size}`);
   const body = depth?.size ? new Blob([photo, depth]) : photo;
-  const response = await fetch(`/photos?${fields}`, { method: "POST", body, headers: { "Content-Type": "application/octet-stream" } });
+  const response = await fetch(here(`/photos?${fields}`), { method: "POST", body, headers: { "Content-Type": "application/octet-stream" } });
   return (await (await answer(response)).json()).job;
 }
 
 /** Watch a job until it ends; the URL of its scene. `onNews` hears of {stage, done, total} and {line}. */
 export function follow(job, onNews) {
   return new Promise((resolve, reject) => {
-    const events = new EventSource(`${job}/events`);
+    const events = new EventSource(here(`${job}/events`));
     let lost = 0;
     events.onmessage = ({ data }) => {
       lost = 0;
@@ -65,6 +65,11 @@ export function follow(job, onNews) {
       reject(new Error("the connection to Spackle was lost: is it still running?"));
     };
   });
+}
+
+/** A path of the server below the page's own address, which may hold a token. */
+export function here(path) {
+  return new URL(`.${path}`, document.baseURI).href;
 }
 
 async function withBytes(description, read) {

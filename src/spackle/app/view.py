@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import functools
 import os
+import secrets
 import socket
 import sys
 import tempfile
@@ -53,6 +54,7 @@ class ViewOptions:
     port: int = 0  # any that is free
     browser: bool = True  # open one
     keep_frame: bool = False  # a uniform frame around a photo is part of it
+    token: bool = True  # only who knows the address gets in
 
     def completer(self, base: BaseSettings) -> PhotoCompleter:
         """Completes photos by a base; InputError for an option that cannot be used."""
@@ -77,7 +79,9 @@ def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
     begin = _first(target, options, uploads, reporter)
     with asked_to_stop(alone=True) as stopped:
         where = {"host": options.host, "port": options.port}
-        server = ViewerServer(page_files(), uploads.complete, **where, log=reporter.detail, bases=uploads.bases)  # type: ignore[arg-type]
+        token = secrets.token_urlsafe(16) if options.token else ""
+        talk = {"log": reporter.detail, "bases": uploads.bases, "token": token}
+        server = ViewerServer(page_files(), uploads.complete, **where, **talk)  # type: ignore[arg-type]
         try:
             server.start()
             begin(server)

@@ -91,6 +91,10 @@ def view(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    token: Annotated[
+        bool,
+        typer.Option("--token/--no-token", help="Put a secret into the page's address, without which nobody gets in."),
+    ] = True,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
@@ -101,7 +105,7 @@ def view(
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
-    options = ViewOptions(settings, disparity, focal_px, fov, host, port, browser, keep_frame)
+    options = ViewOptions(settings, disparity, focal_px, fov, host, port, browser, keep_frame, token)
     reporter = Reporter(verbose, as_json=as_json)
     if view_target(target, options, reporter):
         raise typer.Exit(INTERRUPTED)

@@ -11,6 +11,7 @@ import ipaddress
 import os
 import re
 import socket
+import time
 from collections.abc import Collection, Mapping
 from email.message import Message
 from http import HTTPStatus
@@ -33,10 +34,12 @@ class Limits:
     request: float = 15  # from one answer to the end of the next request's headers
     pause: float = 10  # between two pieces of an upload
     upload: float = 300  # all of an upload
+    rate: float = 20_000  # bytes a second of an upload, at least: one that trickles must not keep the place
     send: float = 20  # for a piece of an answer: a client that never reads must not keep a thread
     heartbeat: float = 10  # of a silent event stream; it is how a listener that has gone shows
     stop: float = 0.5  # for work to end by itself once the server is stopped
-    connections: int = 64  # at a time, a thread each
+    connections: int = 64  # at a time, a thread each; one without a request makes room
+    evict: float = 0.5  # for it to go
     listeners: int = 16  # of all event streams
     upload_bytes: int = 100_000_000
     kept_scenes: int = 2  # what is shown, and what a page may still be loading
@@ -83,11 +86,12 @@ def own_names(host: str, address: str) -> frozenset[str]:
     return frozenset(names)
 
 
-def refusal(headers: Message, names: Collection[str], *, local: bool) -> str | None:
+def refusal(headers: Message, names: Collection[str], *, local: bool, sends: bool = False) -> str | None:
     """Why a request is not for us, or None.
 
     Args:
         headers: of the request.
+        sends: it is a POST, which every browser gives an Origin.
         names: see `own_names`. Numeric addresses need not be among them, for they cannot be rebound; the port may be
             any, for `ssh -L` gives another.
         local: whether the server is for this machine alone; then numeric addresses of others are refused too.
@@ -97,7 +101,8 @@ def refusal(headers: Message, names: Collection[str], *, local: bool) -> str | N
     if match is None or not _is_own(match[1].lower(), names, local):
         return "this server does not go by that Host name"
     ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: by a tunnel
-    if not {origin.strip().lower() for origin in headers.get_all("Origin", [])} <= ours:
+    origins = {origin.strip().lower() for origin in headers.get_all("Origin", [])}
+    if not origins <= ours or (sends and not origins):
         return "asked by a page of another Origin"
     if any(site.strip().lower() not in OWN_SITES for site in headers.get_all("Sec-Fetch-Site", [])):
         return "asked by a page of another site"
@@ -196,22 +201,24 @@ def split_depth(path: Path, promise: Declared) -> Path | None:
     return depth
 
 
-def receive(stream: BufferedIOBase, path: Path, promise: Declared) -> None:
+def receive(stream: BufferedIOBase, path: Path, promise: Declared, limits: Limits = DEFAULT) -> None:
     """Write the promised bytes to a file.
 
     Raises:
         RefusedError: fewer came, or the disk is full.
-        TimeoutError: as the stream does.
+        TimeoutError: as the stream does, or they come more slowly than `limits` allow.
     """
-    left = promise.length
+    left, start = promise.length, time.monotonic()
     try:
         with path.open("xb") as file:
             while left:
-                piece = stream.read(min(PIECE, left))
+                piece = stream.read1(min(PIECE, left))
                 if not piece:
                     raise RefusedError(HTTPStatus.BAD_REQUEST, f"{promise.name}: only a part of it has come")
                 left -= len(piece)
                 file.write(piece)
+                if time.monotonic() - start > limits.pause + (promise.length - left) / limits.rate:
+                    raise TimeoutError("the client is too slow")
     except (TimeoutError, ConnectionError):
         raise
     except OSError as error:

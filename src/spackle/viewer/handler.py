@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hmac
 import io
 import json
 import os
@@ -138,8 +139,13 @@ class Handler(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         limits = self.site.limits
+        self.site.note(self.connection, idle=True)
         self.reader.allow(limits.request, limits.request)
         super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        self.site.note(self.connection, idle=False)
+        return super().parse_request()
 
     def handle_expect_100(self) -> bool:
         return True  # said only once the upload is going to be taken
@@ -213,7 +219,12 @@ class Handler(BaseHTTPRequestHandler):
             return HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "this server speaks HTTP/1.1"
         if self.headers.defects:  # the parser stops at a broken line
             return HTTPStatus.BAD_REQUEST, "a line of the headers makes no sense"
-        line = refusal(self.headers, self.site.names, local=self.site.local)
+        line = refusal(self.headers, self.site.names, local=self.site.local, sends=self.command == "POST")
+        if not line and self.site.token:
+            _, token, path = f"{self.path}//".split("/", 2)
+            if not hmac.compare_digest(token.encode(), self.site.token.encode()):
+                line = "this page has an address of its own, which `spackle view` says"
+            self.path = f"/{path[:-2]}"
         return (HTTPStatus.FORBIDDEN, line) if line else None
 
     def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
@@ -253,7 +264,8 @@ class Handler(BaseHTTPRequestHandler):
         return "spackle"  # strangers learn no versions
 
     def log_message(self, format: str, *args: Any) -> None:
-        self.site.log(f"{self.address_string()} {format % args!a}")
+        line = f"{self.address_string()} {format % args!a}"
+        self.site.log(line.replace(self.site.token, "…") if self.site.token else line)
 
 
 class Listener(ThreadingHTTPServer):
@@ -276,13 +288,15 @@ class Listener(ThreadingHTTPServer):
         log: Callable[[str], None],
         take: Callable[[io.BufferedIOBase, Declared], int],
         bases: Sequence[str] = (),
+        token: str = "",
     ) -> None:
+        self.token = token  # the first part of every path, where there is one
         self.routes, self.worker = Routes(pages, limits, bases), Worker(log, limits.kept_jobs)
         self.limits, self.log, self.take = limits, log, take
         self.listeners = threading.BoundedSemaphore(limits.listeners)
         self._places = threading.BoundedSemaphore(limits.connections)
         self._lock = threading.Lock()
-        self._open: set[socket.socket] = set()
+        self._open: dict[socket.socket, bool] = {}  # whether a connection waits for a request, in their order
         self.address_family, place = _address(host, port)
         try:
             super().__init__(place, Handler)
@@ -300,14 +314,14 @@ class Listener(ThreadingHTTPServer):
         TCPServer.server_bind(self)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._places.acquire(blocking=False):
+        if not self._places.acquire(blocking=False) and not self._take_from_idle():
             request.setblocking(False)
             with contextlib.suppress(OSError):
                 request.send(FULL)
             self.shutdown_request(request)
             return
         with self._lock:
-            self._open.add(request)
+            self._open[request] = True
         try:
             super().process_request(request, client_address)
         except BaseException:
@@ -334,9 +348,26 @@ class Listener(ThreadingHTTPServer):
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
 
+    def note(self, request: socket.socket, *, idle: bool) -> None:
+        """Whether a connection waits for its next request."""
+        with self._lock:
+            if request in self._open:
+                self._open[request] = idle
+
+    def _take_from_idle(self) -> bool:
+        """The place of the connection that has waited longest without a request; False where all are at work."""
+        with self._lock:
+            oldest = next((connection for connection, idle in self._open.items() if idle), None)
+            if oldest is None:
+                return False
+            self._open[oldest] = False
+        with contextlib.suppress(OSError):
+            oldest.shutdown(socket.SHUT_RDWR)
+        return self._places.acquire(timeout=self.limits.evict)
+
     def _forget(self, request: socket.socket) -> None:
         with self._lock:
-            self._open.discard(request)
+            self._open.pop(request, None)
         self._places.release()
 
 

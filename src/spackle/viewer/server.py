@@ -36,6 +36,7 @@ class ViewerServer:
         limits: what a client may take.
         log: gets a line for each request.
         bases: that the page offers for photos.
+        token: a secret part of the page's address, checked on every request; "" answers everybody on this machine.
 
     Raises:
         InputError: nothing can listen there.
@@ -51,8 +52,9 @@ class ViewerServer:
         limits: Limits = DEFAULT,
         log: Callable[[str], None] = lambda line: None,
         bases: Sequence[str] = (),
+        token: str = "",
     ) -> None:
-        self._http = Listener(host, port, pages, limits, log, self._take, bases)
+        self._http = Listener(host, port, pages, limits, log, self._take, bases, token)
         self._worker = self._http.worker
         self.uploads = tempfile.TemporaryDirectory(prefix="spackle-view-")
         self._complete, self._limits = complete, limits
@@ -76,7 +78,8 @@ class ViewerServer:
 
     def url_at(self, address: str) -> str:
         """For a browser that reaches this machine by that address."""
-        return f"http://{f'[{address}]' if ':' in address else address}:{self.port}/"
+        root = f"http://{f'[{address}]' if ':' in address else address}:{self.port}/"
+        return root + (f"{self._http.token}/" if self._http.token else "")
 
     def show(self, scene: PageScene) -> str:
         """Make a scene the one that the page shows; the path of its description."""
@@ -130,7 +133,7 @@ class ViewerServer:
                 raise InputError(line) from error
 
         try:
-            receive(stream, path, promise)
+            receive(stream, path, promise, self._limits)
             if depth := split_depth(path, promise):
                 choices["depth"] = depth
             check_photo(path, promise.name)
