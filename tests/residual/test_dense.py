@@ -123,7 +123,8 @@ def test_a_view_and_a_path_are_completed_where_the_renderer_is(
     assert abs(len(found) - len(expected)) <= 0.02 * len(expected)
     drawn, best = (CpuRenderer().render([completer.base, aux], camera) for aux in (found, expected))
     assert float((drawn.rgb - best.rgb).abs().mean()) < 0.005
-    assert float((view.rgb - drawn.rgb).abs().mean()) < 1e-4
+    # Two blobs of opacity 0.99 leave the light at which renderers stop: rounding says whether the second counts.
+    assert float((view.rgb - drawn.rgb).abs().mean()) < 1e-3
     assert float(drawn.alpha.min()) > 0.5
     far_device.waits.clear()
     there.there.completed_view(camera, [there.photo_guard()])
