@@ -40,6 +40,8 @@ def fill_network(network: Network, tensors: Mapping[str, Tensor], path: str | os
     wrong += sorted(expected.keys() ^ tensors.keys())
     if wrong:
         raise InputError(f"{what} weights {path} are of another network: {len(wrong)} tensors differ, e.g. {wrong[0]}")
+    if endless := [name for name in expected if not bool(torch.isfinite(tensors[name]).all())]:
+        raise InputError(f"{what} weights {path} hold numbers that are not finite, e.g. in {endless[0]}: take others")
     network.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
     return network.eval().requires_grad_(False)

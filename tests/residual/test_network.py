@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 from holes import CPU, box_view, features_of, random_network
+from safetensors.torch import save_file
 from scenes import box_before_wall
 from torch import Tensor
 
 from spackle.camera_path import DepthRange, extremes
+from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.residual import ResidualNet
 from spackle.residual.compose import DELTA_CHANNELS, compose
-from spackle.residual.network import IN_CHANNELS, network_input
+from spackle.residual.network import IN_CHANNELS, load_residual, network_input
 
 
 def test_the_network_has_the_papers_size() -> None:
@@ -68,3 +71,12 @@ def test_a_rendered_loss_trains_the_network_and_leaves_the_base_alone() -> None:
         assert bool(parameter.grad.isfinite().all()), name
         assert bool((parameter.grad != 0).any()), name
     assert all(t.grad is None for t in base.tensors)
+
+
+def test_weights_that_are_no_numbers_are_named_and_not_the_cameras(tmp_path: Path) -> None:
+    tensors = ResidualNet().state_dict()
+    name = next(iter(tensors))
+    tensors[name] = torch.full_like(tensors[name], torch.nan)
+    save_file(tensors, tmp_path / "bad.safetensors")
+    with pytest.raises(InputError, match=f"bad.safetensors hold numbers that are not finite, e.g. in {name}"):
+        load_residual(tmp_path / "bad.safetensors")

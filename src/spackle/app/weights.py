@@ -8,6 +8,7 @@ import os
 import shutil
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import torch
 from rich.console import Console
@@ -122,7 +123,9 @@ def list_weights(reporter: Reporter, console: Console) -> None:
 
 
 def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> DownloadRecord:
-    noticed = False
+    noticed, parts = False, urlsplit(url)
+    if parts.scheme == "http" and parts.hostname not in ("localhost", "127.0.0.1", "::1"):
+        reporter.log(f"{known.name}: warning: http:// is not encrypted: others on the way can change the file")
     with reporter.transfer(known.name) as step:
 
         def advance(done: int, total: int) -> None:

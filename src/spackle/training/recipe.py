@@ -22,7 +22,7 @@ from spackle.image import check_file
 from spackle.residual.hole_features import CELL
 
 PACKAGED = Path(__file__).parent / "recipes"
-MAX_BYTES = 1 << 16
+MAX_BYTES, MAX_DEPTH = 1 << 16, 20
 POSITIVE = 1e-12
 LEAST_SIDE = 36  # pixels that the feature networks need
 # What may differ when a run goes on: how long it is, how often it looks up, and where its files lie.
@@ -262,8 +262,12 @@ def _parse(text: str, file: str) -> Any:
     except ImportError as error:
         raise InputError("recipes are YAML, which needs a package: pip install 'spackle-nvs[train]'") from error
     try:
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise InputError(f"{file}: aliases (*) are not read, because few of them make endless values: write it out")
+        depth = 0
+        for token in yaml.scan(text):
+            depth += type(token).__name__.endswith(("SequenceStartToken", "MappingStartToken"))
+            depth -= type(token).__name__.endswith(("SequenceEndToken", "MappingEndToken", "BlockEndToken"))
+            if isinstance(token, yaml.AliasToken) or depth > MAX_DEPTH:
+                raise InputError(f"{file}: aliases (*) and values deeper than {MAX_DEPTH} are not read: write it out")
         return yaml.safe_load(text)
     except InputError:
         raise
