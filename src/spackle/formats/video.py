@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import av
 import numpy as np
@@ -115,7 +114,7 @@ class VideoWriter:
         self._shape: tuple[int, ...] = ()
         self._stack = contextlib.ExitStack()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> VideoWriter:
         self._temporary = self._stack.enter_context(atomic_path(self.path))
         return self
 
