@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import TypeVar
 
 import av
 import numpy as np
@@ -81,6 +82,9 @@ def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = Non
     return kind
 
 
+W = TypeVar("W", bound="VideoWriter")
+
+
 class VideoWriter:
     """Writes frames to a video, which appears when the `with` block ends well.
 
@@ -114,7 +118,7 @@ class VideoWriter:
         self._shape: tuple[int, ...] = ()
         self._stack = contextlib.ExitStack()
 
-    def __enter__(self) -> VideoWriter:
+    def __enter__(self: W) -> W:
         self._temporary = self._stack.enter_context(atomic_path(self.path))
         return self
 
