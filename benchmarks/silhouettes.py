@@ -17,7 +17,8 @@ compared with the ray-traced truth, where the photo shows what is there or hides
   colour is nearer to the things' than to the wall's there.
 - spike: share of the wall's pixels, at least 2 from any thing, that show a depth nearer than the middle between them.
 
-Both are per mille. -o FOLDER gets pictures: completed view above, truth below.
+Both are per mille of the pixels that the base covers; "filled" ones are of its holes, and the seeds' doing. -o FOLDER
+gets pictures: completed view above, truth below.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from spackle import Camera, get_renderer, hole_mask
+from spackle import Camera, Rendering, get_renderer, hole_mask
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
@@ -241,17 +242,20 @@ def measure_made(name: str, times: int, output: Path | None) -> dict[str, float]
         for number, camera in enumerate(views):
             new, before, view = scene.see(camera), RENDERER.render(base.gaussians, camera), whole.render(camera)
             band = hole_psnr(before.rgb, new.rgb, bands(before.alpha)[0])
-            found.append([band, *artefacts(truth, scene.camera, new, camera, view.rgb, view.depth)])
+            hole = hole_mask(before.alpha)
+            parts = (artefacts(truth, scene.camera, new, camera, view, part) for part in (~hole, hole))
+            found.append([band, *(number for part in parts for number in part)])
             if output:
                 save(torch.cat([view.rgb, new.rgb]), output / f"{name}-{disparity}-{number}.png")
-    band, ghosts, strip, spikes, wall = np.array(found).T
-    shares = {"ghost": 1000 * ghosts.sum() / strip.sum(), "spike": 1000 * spikes.sum() / wall.sum()}
-    return {"band": band.mean()} | shares | numbers
+    band, *counts = np.array(found).T
+    shares = [1000 * part.sum() / whole.sum() for part, whole in zip(counts[::2], counts[1::2], strict=True)]
+    names = ("ghost", "spike", "ghost filled", "spike filled")
+    return {"band": band.mean()} | dict(zip(names, shares, strict=True)) | numbers
 
 
-def artefacts(photo: Truth, own: Camera, truth: Truth, camera: Camera, rgb: Tensor, depth: Tensor) -> list[float]:
-    """Numbers of ghost pixels and of the strip where they can be, of spike pixels and of the wall's."""
-    wall = truth.cover == 0
+def artefacts(photo: Truth, own: Camera, truth: Truth, camera: Camera, view: Rendering, part: Tensor) -> list[float]:
+    """Numbers of ghost pixels and of the strip where they can be, of spike pixels and of the wall's; in a part."""
+    rgb, wall = view.rgb, (truth.cover == 0) & part
     uv, _ = own.project(camera.unproject(camera.pixel_centers(), truth.behind))
     grid = (uv / torch.tensor([WIDTH, HEIGHT]) * 2 - 1)[None].float()
     rim = dilate(photo.cover[None] > 0, 2 * RIM_PX + 1)[None].float()
@@ -261,7 +265,7 @@ def artefacts(photo: Truth, own: Camera, truth: Truth, camera: Camera, rgb: Tens
     ghost = strip & ((rgb - color).abs().sum(-1) < (rgb - linear_to_srgb(truth.wall)).abs().sum(-1))
     clear = wall & ~dilate(truth.cover[None] > 0, 2 * CLEAR_PX + 1)[0]
     nearest = 1 / truth.depth[truth.cover > 0.99].quantile(0.98)
-    spike = clear & (1 / depth.clamp_min(1e-6) > (nearest + 1 / truth.behind) / 2)
+    spike = clear & (1 / view.depth.clamp_min(1e-6) > (nearest + 1 / truth.behind) / 2)
     return [float(part.sum()) for part in (ghost, strip, spike, clear)]
 
 
