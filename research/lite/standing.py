@@ -205,7 +205,7 @@ def score_standing(inverse_depth: Tensor, frame: Frame, owner: Tensor) -> Standi
     found[near] = align(v[near], t).clamp_min(t.min() / FARTHEST_FACTOR)
     error = (true / found).log()
     within, off = [], []
-    for number in owner.unique().tolist():
+    for number in torch.unique(owner).tolist():
         inside = (owner == number) & near
         if number and float(inside.double().mean()) > SMALLEST:
             own = error[inside]

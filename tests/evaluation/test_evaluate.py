@@ -233,7 +233,7 @@ def test_each_method_starts_from_the_same_base() -> None:
         assert (per_view[index].aux or 0) < 0.5 * whole
         assert torch.equal(network[index].rgb, per_view[index].rgb)  # without weights both are the seeds
         assert not torch.equal(network[index].rgb, spackle[index].rgb)  # which get texture
-        assert torch.equal(network[index].alpha, spackle[index].alpha)
+        assert (network[index].aux or 0) < (spackle[index].aux or 0) <= 6 * (network[index].aux or 0)  # in pixels
     assert scene[0].aux == scene[1].aux  # one set for both
 
 

@@ -9,6 +9,7 @@ import json
 import math
 import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from mixture import DepthBatch, Mixture
 from PIL import Image
 from recipe import LiteRecipe
 from train import main
-from training_runs import assert_same_weights, killed_at, one_thread_at_a_time, run_two, started, state
+from training_runs import assert_same_weights, run_two, started, state
 from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite import LiteNet, load_networks
@@ -45,7 +46,21 @@ encoder: random
 """
 
 
-one_thread = pytest.fixture(scope="module", autouse=True)(one_thread_at_a_time)
+KILLED_AT_3 = """
+import os
+from spackle.training.trainer import Trainer
+step = Trainer.step
+Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 3 else step(self, number)
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums in one order: what is compared here are bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +204,7 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    process = started(arguments(place, tmp_path / "out"), killed_at(3), ENTRY)
+    process = started(arguments(place, tmp_path / "out"), KILLED_AT_3 + ENTRY)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 2
@@ -213,7 +228,7 @@ def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple
 
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
     options = ["optim.steps=2", "run.validate_every=2"]
-    run_two(arguments(place, tmp_path / "two", *options), entry=ENTRY)
+    run_two(arguments(place, tmp_path / "two", *options), ENTRY)
     assert train(place, tmp_path / "one", *options).code == 0
     one, two = (state(tmp_path / name) for name in ("one", "two"))
     assert two.progress.history[0] == pytest.approx(one.progress.history[0], rel=1e-3)
@@ -238,11 +253,11 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["data.validation_stereo={place}/pairs"], "data.validation_stereo has scenes of data.stereo in it, such as"),
         (["data.size=[64, 80]"], "data.size [64, 80]: both sides must be multiples of 32"),
         (["data.scales=[]"], "data.scales is empty: give one number at least, such as [1]"),
-        (["data.scales=[0]"], "data.scales.0 cannot be '0'; it takes a number from 0.1 to 2"),
+        (["data.scales=[0]"], "data.scales.0 cannot be 0; it takes a number from 0.1 to 2"),
         (["network=lite1"], "network cannot be 'lite1'; it takes lite0, lite2"),
         (["data.photo=x"], "data.photo is unknown; there are photos, rgbd, stereo, made"),
         (["loss.features=none"], "loss.features is unknown; there are factor, line, steps"),
-        (["optim.frozen=8"], "optim.frozen cannot be '8'; it takes a whole number from 0 to 7"),
+        (["optim.frozen=8"], "optim.frozen cannot be 8; it takes a whole number from 0 to 7"),
         (["optim.min_lr=0.1"], "optim.min_lr 0.1 is above optim.lr 0.001"),
         (["optim.batch=0"], "optim.batch"),
         (["encoder={place}/recipe.yaml"], "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder="),
