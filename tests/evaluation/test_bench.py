@@ -141,7 +141,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def bench_of(root: Path, output: Path, *more: object) -> Run:
-    return run("bench", "--dataset", "middlebury", "--root", root, "--base", "rgbd", "-o", output, *more)
+    return run("bench", root, "--dataset", "middlebury", "--base", "rgbd", "-o", output, *more)
 
 
 def read(output: Path) -> dict[str, Any]:
@@ -375,7 +375,7 @@ def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, ki
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "--dataset and --root missing: give --dataset NAME --root DIR, or --suite"),
+        ((), "FOLDER or --dataset missing: give FOLDER --dataset NAME, or --suite"),
         (("--suite", "--dataset", "middlebury"), "--dataset is not for --suite"),
         (("--dataset", "middlebury", "--root", ".", "--only", "limits"), "--only is for --suite alone"),
         (("--suite", "--only", "rendrer"), "did you mean renderer?"),
@@ -386,7 +386,9 @@ def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, ki
         (("--suite", "--residual", "gone.safetensors"), "--residual gone.safetensors: no such file"),
         (("--suite", "--sharp", "windows=7"), "--sharp is of SHARP, which is not timed"),
         (("--suite", "--base", "sharp", "--sharp", "windows=0"), "--sharp windows must be between 1 and 35, got 0"),
-        (("--suite", "words"), "a word of no option"),
+        (("--suite", "words"), "words: a folder is not for --suite"),
+        (("one", "two", "--dataset", "middlebury"), "two: a word of no option"),
+        (("one", "--dataset", "middlebury", "--root", "two"), "one: a word of no option"),
         (("--dataset", "middlebury", "--base", "rgbd", "--root", "gone"), "gone: no such folder"),
     ],
 )

@@ -280,7 +280,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def evaluate(root: Path, output: Path, *more: object) -> Run:
-    return run("evaluate", "--dataset", "middlebury", "--root", root, "--base", "rgbd", "-o", output, *more)
+    return run("evaluate", root, "--dataset", "middlebury", "--base", "rgbd", "-o", output, *more)
 
 
 def read(output: Path) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def test_the_command_writes_it_and_tables_write_the_same(tmp_path: Path, monkeyp
     root, out, bench = (tmp_path / name for name in ("data", "out", "bench"))
     for seed, name in enumerate(("<script>alert(1)<", "Door")):
         write_boxes(root / name, seed)
-    words = ("--dataset", "middlebury", "--root", root, "--base", "rgbd", "--protocol", "near-view", "-o", out)
+    words = (root, "--dataset", "middlebury", "--base", "rgbd", "--protocol", "near-view", "-o", out)
     choices = ("evaluate", *words, "--methods", "base,seeds", "--metrics", "psnr")
     done = run(*choices)
     assert done.code == 0, done.err

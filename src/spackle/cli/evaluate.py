@@ -15,11 +15,12 @@ from spackle.cli.options import (
     PrecisionOption,
     SharpOption,
     VerboseOption,
+    given_input,
     sharp_speed,
 )
 from spackle.errors import InputError
 
-# Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_with_words`.
+# Of `--disparity 0.3 0.4 0.5` only the first number belongs to the option, see `_sorted_words`.
 EXTRA_WORDS = {"allow_extra_args": True}
 NUMBER = re.compile(r"[\d.,]+")
 UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
@@ -29,9 +30,10 @@ Limit = Annotated[int | None, typer.Option(help="So many images, spread over the
 _DATASET = typer.Option(
     metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
 )
-_ROOT = typer.Option(metavar="DIR", help="Where the dataset was unpacked.")
-Dataset = Annotated[str, _DATASET]
-Root = Annotated[Path, _ROOT]
+Folder = Annotated[
+    Path | None, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.", show_default=False)
+]
+Root = Annotated[Path | None, typer.Option("--root", hidden=True)]  # as the folder was given once
 BaseName = Annotated[str, typer.Option(help="sharp, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
@@ -50,8 +52,9 @@ Html = Annotated[bool, typer.Option("--html", help="Write report.html there too:
 
 def evaluate(
     context: typer.Context,
-    dataset: Dataset,
-    root: Root,
+    dataset: Annotated[str, _DATASET],
+    folder: Folder = None,
+    root: Root = None,
     protocol: Annotated[str, typer.Option(help="large-view (wide moves) or near-view (second photos).")] = "large-view",
     methods: Annotated[
         str,
@@ -92,12 +95,13 @@ def evaluate(
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
 
+    source, numbers = _sorted_words(context, folder, root, disparity)
     options = EvaluateOptions(
         dataset=dataset,
-        root=root,
+        root=given_input("FOLDER", source, root),
         protocol=protocol,
         methods=split_words(methods),
-        disparities=parse_disparities(_with_words(context, disparity)),
+        disparities=parse_disparities(numbers),
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
         base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
         residual=residual,
@@ -112,8 +116,8 @@ def evaluate(
             f"--disparity {disparity}: --protocol near-view looks from where the true second photos were taken: "
             "leave one of them out"
         )
-    folder = output or Path(f"evaluation-{dataset}-{protocol}")
-    if run(options, folder, Reporter(verbose, as_json=as_json), html) == "stopped":
+    results = output or Path(f"evaluation-{dataset}-{protocol}")
+    if run(options, results, Reporter(verbose, as_json=as_json), html) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 
@@ -132,7 +136,8 @@ def tables(
 def bench(
     context: typer.Context,
     dataset: Annotated[str | None, _DATASET] = None,
-    root: Annotated[Path | None, _ROOT] = None,
+    folder: Folder = None,
+    root: Root = None,
     suite: Annotated[
         bool, typer.Option("--suite", help="Time every stage on this machine instead, without a dataset.")
     ] = False,
@@ -170,10 +175,11 @@ def bench(
     from spackle.scene import ResidualChoice
 
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
-    _check_choice(suite, given)
-    disparities = parse_disparities(_with_words(context, disparity))
+    source, numbers = _sorted_words(context, folder, root, disparity)
+    _check_choice(suite, given, source or root)
+    disparities = parse_disparities(numbers)
     bases = BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp))
-    if dataset is None or root is None:
+    if dataset is None:
         asked = SuiteOptions(
             only=split_words(only or ""),
             runs=runs,
@@ -187,7 +193,7 @@ def bench(
     else:
         options = EvaluateOptions(
             dataset,
-            root,
+            given_input("FOLDER", source, root),
             methods=("spackle",),
             disparities=disparities,
             metrics=(),
@@ -200,12 +206,14 @@ def bench(
         raise typer.Exit(INTERRUPTED)
 
 
-def _check_choice(suite: bool, given: set[str]) -> None:
+def _check_choice(suite: bool, given: set[str], folder: Path | None) -> None:
     """InputError where the options `given`, by their long names, ask for no dataset and no suite, or for both."""
     of_dataset = ("--dataset", "--root", "--limit", "--disparity")
     of_suite = ("--only", "--side")
-    if not suite and (missing := [name for name in of_dataset[:2] if name not in given]):
-        raise InputError(f"{' and '.join(missing)} missing: give --dataset NAME --root DIR, or --suite")
+    if not suite and ("--dataset" not in given or folder is None):
+        raise InputError("FOLDER or --dataset missing: give FOLDER --dataset NAME, or --suite")
+    if suite and folder is not None and "--root" not in given:
+        raise InputError(f"{folder}: a folder is not for --suite: leave one of them out")
     for name in of_dataset if suite else of_suite:
         if name in given:
             raise InputError(f"{name} is {'not for --suite' if suite else 'for --suite alone'}: leave one of them out")
@@ -219,13 +227,18 @@ def _given(context: typer.Context) -> set[str]:
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
-def _with_words(context: typer.Context, disparity: str) -> str:
-    """The disparities, with numbers that follow as words of their own; InputError for a word that belongs nowhere."""
-    words = context.args
-    if not words:
-        return disparity
+def _sorted_words(
+    context: typer.Context, folder: Path | None, root: Path | None, disparity: str
+) -> tuple[Path | None, str]:
+    """The folder, and the disparities with numbers that follow as words; InputError for a word that belongs nowhere."""
+    words = [*([] if folder is None else [str(folder)]), *context.args]
     source = context.get_parameter_source("disparity")
-    strange = [word for word in words if not NUMBER.fullmatch(word)]
-    if strange or source is None or source.name != "COMMANDLINE":
-        raise InputError(f"{(strange or words)[0]}: a word of no option: lists are given with commas: --methods A,B")
-    return ",".join((disparity, *words))
+    listed = source is not None and source.name == "COMMANDLINE"
+    others = [word for word in words if not (listed and NUMBER.fullmatch(word))]
+    if not others and root is None:
+        others = words[:1]  # a folder may be named by a number
+    if len(others) > (root is None):
+        raise InputError(f"{others[-1]}: a word of no option: lists are given with commas: --methods A,B")
+    for word in others:
+        words.remove(word)
+    return Path(others[0]) if others else None, ",".join((disparity, *words))

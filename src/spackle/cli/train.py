@@ -16,7 +16,7 @@ def train(
         typer.Option(
             "--recipe",
             metavar="RECIPE",
-            help="What to learn from, and how: cpu, paper, reverse_view, direct_ft, or a YAML file.",
+            help="What to learn from, and how: quick, cpu, paper, reverse_view, direct_ft, or a YAML file.",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a run in it goes on.")],
