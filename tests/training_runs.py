@@ -6,9 +6,10 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pytest
 import torch
 from torch import nn
 
@@ -16,6 +17,15 @@ from spackle.training.checkpoint import Checkpoint, load_checkpoint
 from spackle.training.method import Method
 from spackle.training.recipe import Recipe
 from spackle.training.trainer import Callbacks, Trainer
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums in one order: what is compared in a module that imports this are bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def state(folder: Path) -> Checkpoint:
@@ -40,6 +50,16 @@ def started(arguments: Sequence[str], code: str, **environment: str) -> subproce
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def killed_at(number: int) -> str:
+    """What kills a run before a step, counted from 0; for `started`."""
+    return f"""
+import os
+from spackle.training.trainer import Trainer
+step = Trainer.step
+Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
+"""
 
 
 def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) -> tuple[Trainer, list[float]]:

@@ -41,9 +41,9 @@ def test_the_demo_leaves_a_scene_and_fills_the_hole_better_than_2d_inpainting(tm
     # The scores.
     psnr, ssim = report["right_camera"]["psnr"], report["right_camera"]["ssim"]
     hole = {name: score["in_hole"] for name, score in psnr.items()}
-    assert max(hole[INPAINTING], hole["base"]) < min(hole[SPACKLE], hole[TRAINED])
-    assert hole[SPACKLE] >= 16.3
-    assert min(ssim[SPACKLE], ssim[TRAINED]) > ssim[INPAINTING] + 0.03  # sharp texture gains none over smooth seeds
+    assert max(hole[INPAINTING], hole["base"]) + 1 < min(hole[SPACKLE], hole[TRAINED])
+    assert min(hole[SPACKLE], hole[TRAINED]) >= 17
+    assert min(ssim[SPACKLE], ssim[TRAINED]) > ssim[INPAINTING] + 0.05  # sharp texture gains none over smooth seeds
     assert psnr["base"]["outside"] - psnr[SPACKLE]["outside"] <= 0.1
     assert psnr["base"]["outside"] - psnr[TRAINED]["outside"] <= 0.05
     before, after = (report["hole_area_ratio"][key] for key in ("before", "after"))

@@ -18,7 +18,7 @@ from PIL import Image
 from safetensors.torch import save_file
 from sharp_weights import MICRO
 from torch import Tensor
-from training_runs import run_two, state, trained
+from training_runs import one_thread, run_two, state, trained
 
 from spackle.bases.sharp.base import TunableSharp
 from spackle.bases.sharp.checkpoint import PARTS, Owner, deterministic_weights, expected_shapes
@@ -30,6 +30,7 @@ from spackle.training.method import Objective
 from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
 
 pytest.importorskip("yaml")
+__all__ = ["one_thread"]  # a fixture
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -50,13 +51,10 @@ layers.CONFIGS["tiny"] = dataclasses.replace(layers.TINY, window=128)
 
 @pytest.fixture(scope="module", autouse=True)
 def small() -> Iterator[None]:
-    """SHARP from 512² pixels, which a checkpoint's width cannot tell from the tiny one; and sums in one order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """SHARP from 512² pixels, which a checkpoint's width cannot tell from the tiny one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(CONFIGS, "tiny", MICRO)
         yield
-    torch.set_num_threads(before)
 
 
 def opaque_weights() -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ import resource
 import shutil
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -22,7 +22,7 @@ from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from torch import nn
-from training_runs import assert_same_weights, run_two, started, state, trained
+from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state, trained
 
 from spackle.downloads import hold
 from spackle.errors import InputError
@@ -37,7 +37,7 @@ from spackle.training.sample import Sample, load_sample, save_sample
 from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
-__all__ = ["far_device"]  # a fixture
+__all__ = ["far_device", "one_thread"]  # fixtures
 
 RECIPE = """
 data: {photos: %s, views: 5, validation_views: 2, crops: 2, cells: 16}
@@ -45,21 +45,6 @@ loss: {features: none}
 optim: {steps: 6, batch: 2, warmup: 2, lr: 1.0e-3, ema: 0.9, precision: fp32}
 run: {validate_every: 6, save_every: 3, log_every: 1}
 """
-KILLED = """
-import os
-from spackle.training.trainer import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 4 else step(self, number)
-"""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in one order: what is compared here are bits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +105,7 @@ def test_curves_are_in_the_logs(whole: tuple[Path, Run]) -> None:
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    process = started(arguments(place, tmp_path / "out"), KILLED)
+    process = started(arguments(place, tmp_path / "out"), killed_at(4))
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 3
@@ -135,7 +120,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_the_run_goes_on_from_there(
 ) -> None:
     step = Trainer.step
 
-    def interrupted(self: Trainer, number: int) -> dict[str, float]:
+    def interrupted(self: Trainer, number: int) -> list[dict[str, float]]:
         if number == 1:
             signal.raise_signal(signal.SIGINT)
         return step(self, number)
@@ -289,18 +274,24 @@ def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
     assert all(p.grad is not None for p in network.parameters())
 
 
-def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path) -> None:
-    save_sample(sample_of(box_before_wall(width=96, height=80).base()), tmp_path / "0.safetensors")
-    files = SampleFiles([tmp_path / "0.safetensors"], [tmp_path / "0.safetensors"], "one")
+def one_sample(
+    folder: Path, method: type[ResidualMethod], steps: int, log_every: int, validate_every: int
+) -> tuple[Recipe, ResidualMethod]:
+    """A recipe and a method that learn from one sample, seen again and again."""
+    save_sample(sample_of(box_before_wall(width=96, height=80).base()), folder / "0.safetensors")
+    files = SampleFiles([folder / "0.safetensors"], [folder / "0.safetensors"], "one")
     recipe = Recipe(
         loss=LossRecipe(features="none"),
-        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=12, batch=1, ema=0.5),
-        run=RunRecipe(log_every=1, validate_every=6, save_every=100),
+        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=steps, batch=1, ema=0.5),
+        run=RunRecipe(log_every=log_every, validate_every=validate_every, save_every=100),
     )
     objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
     torch.manual_seed(0)
-    method = ResidualMethod(files, objective, recipe.optim.batch)
-    trainer, found = trained(recipe, method, ResidualNet(), tmp_path)
+    return recipe, method(files, objective, recipe.optim.batch)
+
+
+def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path) -> None:
+    trainer, found = trained(*one_sample(tmp_path, ResidualMethod, 12, 1, 6), ResidualNet(), tmp_path)
     assert len(found) == 12
     assert found[-1] < 0.5 * found[0]
     first, last = trainer.progress.history
@@ -336,15 +327,6 @@ def test_a_step_on_a_gpu_waits_for_it_once_and_gives_what_the_processor_gives(
 def test_numbers_read_late_are_those_read_at_once_and_nothing_is_learned_from_a_bad_one(
     tmp_path: Path, bad: int | None
 ) -> None:
-    save_sample(sample_of(box_before_wall(width=96, height=80).base()), tmp_path / "0.safetensors")
-    files = SampleFiles([tmp_path / "0.safetensors"], [tmp_path / "0.safetensors"], "one")
-    recipe = Recipe(
-        loss=LossRecipe(features="none"),
-        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=7, batch=1, ema=0.5),
-        run=RunRecipe(log_every=5, validate_every=7, save_every=100),
-    )
-    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
-
     class Broken(ResidualMethod):
         def loss(
             self, network: nn.Module, step: int, items: Sequence[int]
@@ -354,12 +336,12 @@ def test_numbers_read_late_are_those_read_at_once_and_nothing_is_learned_from_a_
 
     found: list[tuple[list[dict[str, float]], dict[str, torch.Tensor], Trainer]] = []
     for late in (False, True):
-        torch.manual_seed(0)
-        network, logged, folder = ResidualNet(), list[dict[str, float]](), tmp_path / str(late)
+        folder = tmp_path / str(late)
         folder.mkdir()
+        recipe, method = one_sample(folder, Broken, 7, 5, 7)
+        network, logged = ResidualNet(), list[dict[str, float]]()
         callbacks = Callbacks(lambda _, n, to=logged: to.append(n), lambda *_: None, lambda _: None, lambda: False)  # type: ignore[misc]
         optimizer = torch.optim.AdamW(network.parameters(), recipe.optim.lr, weight_decay=0.01, fused=True)
-        method = Broken(files, objective, recipe.optim.batch)
         trainer = Trainer(recipe, method, network, torch.device("cpu"), folder, callbacks, optimizer=optimizer)
         trainer.late = late
         with contextlib.nullcontext() if bad is None else pytest.raises(InputError, match="step 3 gave numbers"):

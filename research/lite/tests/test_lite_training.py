@@ -9,7 +9,6 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from mixture import DepthBatch, Mixture
 from PIL import Image
 from recipe import LiteRecipe
 from train import main
-from training_runs import assert_same_weights, run_two, started, state
+from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state
 from weights import EVEN, balanced, save_networks, start_decoder
 
 from spackle.bases.lite import LiteNet, load_networks
@@ -29,6 +28,7 @@ from spackle.training.recipe import load_recipe
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
 
 pytest.importorskip("yaml")
+__all__ = ["one_thread"]  # a fixture
 
 LITE = Path(__file__).parent.parent
 ENTRY = f"sys.path.insert(0, {str(LITE)!r})\nfrom train import main\nsys.exit(main())"
@@ -44,23 +44,6 @@ optim: {steps: 10, batch: 2, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
 run: {validate_every: 10, save_every: 2, log_every: 1}
 encoder: random
 """
-
-
-KILLED_AT_3 = """
-import os
-from spackle.training.trainer import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == 3 else step(self, number)
-"""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in one order: what is compared here are bits."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +187,7 @@ def test_the_loss_falls_on_pictures_that_are_seen_again_and_again(
 def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     place: Path, whole: tuple[Path, Run], tmp_path: Path
 ) -> None:
-    process = started(arguments(place, tmp_path / "out"), KILLED_AT_3 + ENTRY)
+    process = started(arguments(place, tmp_path / "out"), killed_at(3) + ENTRY)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert state(tmp_path / "out").progress.step == 2
