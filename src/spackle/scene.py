@@ -171,9 +171,9 @@ class Scene:
         reach = self.disparity if disparity is None else disparity
         save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base), disparity=reach)
 
-    def page(self, name: str) -> PageScene:
-        """The scene for the page of `spackle view`, under a name."""
-        return page_scene(name, self.base, self.aux, self.camera, self.disparity)
+    def page(self, name: str, note: str = "") -> PageScene:
+        """The scene for the page of `spackle view`, under a name, with a note as `page_scene` has it."""
+        return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write a file for other viewers: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html, a page of its own.

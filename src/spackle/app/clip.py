@@ -200,7 +200,7 @@ class _Run:
             "residual": {"weights": self._setting.residual.weights},
             "aux": {"gaussians": round(_mean([note["aux"] for note in notes]))},  # the mean over the frames
             "views": path.trajectory,
-            "disparity": prediction.disparity if path.disparity is None else path.disparity,
+            "disparity": path.far(prediction.disparity),
             "disparity_source": disparity_source(path, choice),
             "hole_area_ratio": {"before": _mean(before), "after": _mean(after), "worst_after": max(after)},
             # In units of 1/255; None where no frame has the figure.

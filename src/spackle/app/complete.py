@@ -56,8 +56,7 @@ class CompletedPhoto:
     prediction: BasePrediction
     choice: Choice
     views: PlannedViews
-    disparity: float | None  # how far the path goes; None for given views and keyframes
-    scene: Scene
+    scene: Scene  # its disparity is None for given views and keyframes
     saved_view: str | None  # in view mode: the view that `scene.aux` belongs to
 
 
@@ -85,14 +84,15 @@ class PhotoCompleter:
         photo = resize_photo(photo)
         disparity = None
         if self.given_views is None and self.keyframes is None:
-            disparity = prediction.disparity if self.path.disparity is None else self.path.disparity
+            disparity = self.path.far(prediction.disparity)
         self._say_base(photo, prediction, choice, disparity, reporter)
         views = self._plan(photo.path, prediction)
         with reporter.stage("complete", seconds) as step:
             scene, saved_view = self._fill(prediction, views, step)
             if not scene.aux.finite:
                 raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
-        return CompletedPhoto(photo, prediction, choice, views, disparity, scene, saved_view)
+        scene = dataclasses.replace(scene, disparity=disparity)
+        return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
 
     def _say_base(
         self, photo: Photo, prediction: BasePrediction, choice: Choice, disparity: float | None, reporter: Reporter
@@ -130,7 +130,7 @@ class PhotoCompleter:
 
     def _checked(self, gaussians: Gaussians, camera: Camera, disparity: float) -> dict[str, Camera]:
         """The views whose holes are reported, by their names."""
-        depths, far = DepthRange.of(gaussians), disparity if self.path.disparity is None else self.path.disparity
+        depths, far = DepthRange.of(gaussians), self.path.far(disparity)
         if self.keyframes is None:
             return dict(zip((f"{-far:g}", f"+{far:g}"), extremes(camera, far, depths), strict=True))
         keys = self.keyframes.key_cameras(camera, depths)

@@ -20,7 +20,9 @@ from spackle.progress import Reporter
 from spackle.scene import Scene
 from spackle.viewer import PageScene, single_html
 
-PAGE: dict[str, Writer] = {".html": lambda scene, path: write_whole(path, single_html(page_of(scene)))}
+PAGE: dict[str, Writer] = {
+    ".html": lambda scene, path: write_whole(path, single_html(page_of(Scene.of_file(scene), scene.path)))
+}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -74,15 +76,15 @@ def _say(reporter: Reporter, scene: SceneFile, output: Path, before: int, second
     reporter.result({**result, "drawn_nearer": far})
 
 
-def page_of(scene: SceneFile, focal_px: float | None = None, fov: float | None = None) -> PageScene:
-    """A loaded scene for the page, with a usual lens along z if none is stored; InputError if it cannot be seen."""
-    name = name_of(scene.path)
+def page_of(scene: Scene, path: Path) -> PageScene:
+    """The scene of a file for the page; InputError, naming the file, if it cannot be seen."""
+    name = name_of(path)
     try:
-        return Scene.of_file(scene, focal_px, fov).page(name)
+        return scene.page(name)
     except InputError as error:
-        raise InputError(f"{scene.path}: {str(error).removeprefix(f'{name}: ')}") from error
+        raise InputError(f"{path}: {str(error).removeprefix(f'{name}: ')}") from error
     except ValueError as error:
-        raise InputError(f"{scene.path}: cannot be looked at: {error}: give the lens with --fov") from error
+        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error
 
 
 def name_of(path: Path) -> str:

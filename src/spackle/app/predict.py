@@ -122,7 +122,7 @@ def predict_one(
         new = folders.enter_context(whole_set(folder, REPORT))
         with reporter.stage("write", seconds):
             for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
-                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=done.disparity)
+                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
         video = None
         if options.render:
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
@@ -230,7 +230,7 @@ def make_report(
         "merged": base + aux,
         "mode": completer.mode,
         "views": given.name if given else path.trajectory,
-        "disparity": done.disparity,
+        "disparity": done.scene.disparity,
         "disparity_source": None if given else disparity_source(path, choice),
         "video": video,
         "hole_area_ratio": holes,

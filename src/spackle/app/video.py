@@ -121,6 +121,10 @@ class PathOptions:
         views = None if self.cameras is None else load_cameras(self.cameras)
         return views, None if self.path is None else load_path(self.path)
 
+    def far(self, default: float) -> float:
+        """How far the camera goes: as a person says, or by default."""
+        return default if self.disparity is None else self.disparity
+
     def fly(
         self, gaussians: Gaussians, camera: Camera, keyframes: KeyframePath | None, disparity: float = USUAL_DISPARITY
     ) -> list[Camera]:
@@ -131,8 +135,7 @@ class PathOptions:
         """
         if keyframes is None:
             looped, count = self.video.plays != 1, self.frames or PATH_FRAMES
-            far = disparity if self.disparity is None else self.disparity
-            return scene_path(gaussians, camera, self.trajectory, far, count, looped)
+            return scene_path(gaussians, camera, self.trajectory, self.far(disparity), count, looped)
         count = self.frames or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")

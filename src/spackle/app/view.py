@@ -24,12 +24,11 @@ from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, ROUGH, BaseSettings
 from spackle.downloads import installed
 from spackle.errors import InputError, check_name
-from spackle.formats.scene_files import SceneFile
 from spackle.image import Photo, check_file, load_photo
 from spackle.progress import Reporter, Step
 from spackle.scene import ResidualChoice, Scene
 from spackle.signals import asked_to_stop
-from spackle.viewer import PageScene, page_files, page_scene
+from spackle.viewer import PageScene, page_files
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell
 
@@ -103,10 +102,9 @@ def _first(
         if depth is not None:
             raise InputError(f"--depth {depth}: {target.name} is a scene already: leave the option out")
         with reporter.stage("load", seconds):
-            file = SceneFile.load(target)
-            page = page_of(file, options.focal_px, options.fov)
-            scene = with_downloads(page, Scene.of_file(file, options.focal_px, options.fov))
-        return lambda server: server.show(scene)
+            scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
+            page = with_downloads(page_of(scene, target), scene)
+        return lambda server: server.show(page)
     completer = options.completer(options.base)
     if depth is None:
         uploads.completer = completer  # it holds the network
@@ -126,10 +124,9 @@ def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller
     seconds: dict[str, float] = {}
     try:
         done = completer.complete(photo, teller, seconds)
-        scene, note = done.scene, ROUGH if done.choice.base == LiteBase.name else ""
+        note = ROUGH if done.choice.base == LiteBase.name else ""
         with teller.stage("page", seconds):
-            page = page_scene(name, scene.base, scene.aux, scene.camera, done.disparity, note)
-            return with_downloads(page, dataclasses.replace(scene, disparity=done.disparity))
+            return with_downloads(done.scene.page(name, note), done.scene)
     except InputError as error:
         Reporter.log(teller, f"error: {error}")  # the page is told as the job ends
         raise
