@@ -34,11 +34,12 @@ ALLOWED: dict[str, set[str]] = {
     "residual": {"values", "render", "inpaint"},
     "viewer": {"values", "formats"},
     "scene": {*BELOW_SCENE, "viewer"},
-    "dataset": BELOW_DATASET,
+    "workers": {"values", "shared"},
+    "dataset": {*BELOW_DATASET, "workers"},
     "training": {*BELOW_DATASET, "dataset"},
     "evaluation": {*BELOW_DATASET, "dataset", "training"},
-    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer"},
-    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app"},
+    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "workers"},
+    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app", "workers"},
 }
 
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.

@@ -26,7 +26,7 @@ from sharp_weights import write_tiny
 
 from spackle.dataset import ViewDataset
 from spackle.dataset import build as building
-from spackle.dataset.maker import Job, Made, Maker, _results
+from spackle.dataset.maker import Made, Maker, PhotoJob
 from spackle.dataset.photos import choose, find_photos
 from spackle.dataset.shards import load_manifest
 from spackle.downloads import hold
@@ -35,6 +35,7 @@ from spackle.render import get_renderer
 from spackle.training.data import Supply
 from spackle.training.recipe import DataRecipe
 from spackle.training.sources import PseudoViews
+from spackle.workers.local import results_of
 
 # The same bytes, however --------------------------------------------------------------------------
 
@@ -94,7 +95,7 @@ def dying(*arguments):
     with open({str(note)!r}, "w") as file:
         subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
     die()
-build._Build._note = dying"""
+build._Build._keep = dying"""
     process = dying_build(tmp_path / "script.py", patch, place, out, "--workers", 2, *more)
     assert process.wait() == -signal.SIGKILL
     # Ray's own agents take a minute.
@@ -119,7 +120,7 @@ def test_a_worker_that_dies_is_a_line() -> None:
     dead: Future[Made] = Future()
     dead.set_exception(BrokenProcessPool("gone"))
     with pytest.raises(InputError, match="a worker process died"):
-        list(_results([dead]))
+        list(results_of([dead]))
 
 
 def test_ctrl_c_ends_after_the_photo_at_work(
@@ -127,7 +128,7 @@ def test_ctrl_c_ends_after_the_photo_at_work(
 ) -> None:
     make = Maker.make
 
-    def interrupted(self: Maker, job: Job) -> Made:
+    def interrupted(self: Maker, job: PhotoJob) -> Made:
         signal.raise_signal(signal.SIGINT)
         return make(self, job)
 

@@ -7,7 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from command import Run, names_in
 from dataset_builds import build, content, refused
 
 from spackle.bases.open import BaseSettings
-from spackle.dataset import ray as on_ray
-from spackle.dataset.maker import IN_HAND, Job, Made
+from spackle.dataset.maker import Made, Maker, PhotoJob
 from spackle.dataset.options import DatasetOptions
-from spackle.dataset.ray import RemoteMaker, WorkerPool
 from spackle.dataset.views import ViewChoices
+from spackle.workers import ray as on_ray
+from spackle.workers.local import IN_HAND
+from spackle.workers.ray import RemoteWorker, WorkerPool
 
 ray = pytest.importorskip("ray")
 
@@ -41,7 +42,7 @@ def address() -> Iterator[str]:
         process.communicate()
 
 
-def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteMaker]:
+def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteWorker]:
     """Workers of which the first few are killed when they have made this photo, or as they begin."""
 
     def turn() -> None:
@@ -50,15 +51,15 @@ def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteM
             (notes / str(turns)).touch()
             os.kill(os.getpid(), signal.SIGKILL)
 
-    class Dying(RemoteMaker):
+    class Dying(RemoteWorker):
         def begin(self, expected: Any) -> None:
             if where == "begin":
                 turn()
             super().begin(expected)
 
-        def make(self, job: Job, seen: Sequence[str]) -> tuple[Made, bytes | None]:
-            answer = super().make(job, seen)
-            if where == "make" and job[0] == at:
+        def make(self, job: PhotoJob, seen: object) -> Made:
+            answer: Made = super().make(job, seen)
+            if where == "make" and job.index == at:
                 turn()
             return answer
 
@@ -78,9 +79,9 @@ def test_a_local_cluster_makes_the_same_bytes_and_ends(
 ) -> None:
     before, hand_out, counts = signal.getsignal(signal.SIGTERM), WorkerPool._hand_out, list[int]()
 
-    def noting(pool: WorkerPool) -> None:
+    def noting(pool: Any) -> None:
         hand_out(pool)
-        counts.extend(len(worker.photos) for worker in pool.workers)
+        counts.extend(len(worker.jobs) for worker in pool.workers)
 
     monkeypatch.setattr(WorkerPool, "_hand_out", noting)
     done = on("local", place, tmp_path / "out")
@@ -94,7 +95,7 @@ def test_a_local_cluster_makes_the_same_bytes_and_ends(
 def test_photos_of_a_killed_worker_are_made_again_by_another(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(on_ray, "RemoteMaker", dying(2, 1, tmp_path / "notes"))
+    monkeypatch.setattr(on_ray, "RemoteWorker", dying(2, 1, tmp_path / "notes"))
     done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (0, "", 3), done.err
     assert f"{place}/photos/3.png: at this photo a worker died, and another takes its place" in done.lines[0]
@@ -110,7 +111,7 @@ def test_what_kills_every_worker_ends_the_build_which_goes_on_later(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, line: str
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(on_ray, "RemoteMaker", dying(2, 99, tmp_path / "notes", where))
+        patch.setattr(on_ray, "RemoteWorker", dying(2, 99, tmp_path / "notes", where))
         done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (2, "", 4)
     assert f"{line} for the 4th time" in done.lines[-1]
@@ -138,14 +139,14 @@ def test_an_address_where_nobody_answers_and_a_cluster_without_room_are_a_line(
 @pytest.mark.parametrize(
     ("name", "instead", "line"),
     [
-        ("what_is_seen", ["another", "photo"], "0.png: node {node} does not find this photo or its depth map"),
-        ("configuration", {"spackle": "0.0"}, 'would make another dataset (base: null -> {{"name'),
+        ("inputs", ["another", "photo"], "0.png: node {node} does not find this photo or its depth map"),
+        ("setup", {"spackle": "0.0"}, 'would give other results (base: null -> {{"name'),
     ],
 )
 def test_a_node_that_is_not_like_the_others_is_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, instead: Any, line: str
 ) -> None:
-    monkeypatch.setattr(on_ray, name, lambda *arguments: instead)
+    monkeypatch.setattr(Maker, name, instead if name == "setup" else lambda *arguments: instead)
     refused(on(address, place, tmp_path / "out"), line.format(node=socket.gethostname()))
     assert names_in(tmp_path / "out" / "parts") == set()
 
@@ -156,7 +157,7 @@ def test_a_worker_takes_a_gpu_only_where_a_network_uses_one() -> None:
     ) -> int:
         options = DatasetOptions(BaseSettings(base, device=device), ViewChoices(), inpainter=inpainter)
         without = {"Alive": True, "Resources": {"CPU": 4.0}}
-        return on_ray.gpus_of(options, [without, {"Alive": alive, "Resources": {"CPU": 4.0, "GPU": here}}])
+        return on_ray.gpus_of(options.processes, [without, {"Alive": alive, "Resources": {"CPU": 4.0, "GPU": here}}])
 
     assert (gpus("sharp"), gpus("rgbd", inpainter="propainter")) == (1, 1)
     assert (gpus("rgbd"), gpus("sharp", "cpu"), gpus("sharp", here=0.0), gpus("sharp", alive=False)) == (0, 0, 0, 0)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.filesize import decimal
 
-from spackle.dataset.maker import PARTS, Made, Maker, Seconds, at_work, key_of, part_file
+from spackle.dataset.maker import PARTS, Made, Maker, PhotoJob, Seconds, key_of, part_file
 from spackle.dataset.options import MAX_PHOTOS, DatasetOptions, configuration
 from spackle.dataset.photos import PhotoFile, choose, find_photos
-from spackle.dataset.ray import at_work_on_ray, cluster
-from spackle.dataset.shards import NAME, Manifest, differences, load_manifest, shard_name, write_shard
+from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
+from spackle.digest import differences
 from spackle.errors import InputError
+from spackle.formats import atomic_path
 from spackle.output_folder import make_folder, remove_half_written, results_folder
 from spackle.progress import Reporter, counted, timed
 from spackle.signals import asked_to_stop
+from spackle.workers import at_work, cluster
 
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
 NAMED = 5  # missing files that the log names
@@ -28,10 +31,10 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     InputError for options, photos or folders that cannot be used, and for another dataset in `output`.
     """
     options.check()
-    completion = Maker.of(options, output).completion  # fails before long work
+    completion = Maker.of(options).completion  # fails before long work
     if completion.notice:
         reporter.log(completion.notice)
-    with cluster(options) as ray:
+    with cluster(options.processes) as ray:
         photos = _photos(source, options, reporter)
         config = configuration(options, photos, completion)
         with results_folder(output, (NAME,), alone=True):
@@ -79,15 +82,15 @@ class _Build:
         self.problems: dict[int, str] = {}  # of photos that give no sample
         self.seconds: Seconds = dict.fromkeys(STAGES, 0.0)
         self.jobs = [
-            (index, photo)
+            PhotoJob(index, photo)
             for index, photo in enumerate(photos)
             if index // size not in self.shards and not part_file(output, index).is_file()
         ]
         self.waiting: dict[int, set[int]] = {  # photos that a shard lacks
             index // size: set() for index in range(len(photos)) if index // size not in self.shards
         }
-        for index, _ in self.jobs:
-            self.waiting[index // size].add(index)
+        for job in self.jobs:
+            self.waiting[job.index // size].add(job.index)
 
     def run(self, ray: Any) -> str:
         """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
@@ -98,11 +101,10 @@ class _Build:
             if not self.jobs:
                 return self._finish(0.0)
             total: Seconds = {}
-            work = (self.options, self.output, self.jobs)
-            workers = at_work(*work) if ray is None else at_work_on_ray(ray, *work, self.reporter.log)
-            with timed("wall", total), workers as results:
+            makers = self.options.processes, partial(Maker.of, self.options)
+            with timed("wall", total), at_work(ray, *makers, self.jobs, self.reporter.log) as results:
                 for done, result in enumerate(results, ready + 1):
-                    self._note(result)
+                    self._keep(result)
                     self._write_ready()
                     step(done, len(self.photos))
                     if stop():
@@ -112,8 +114,14 @@ class _Build:
             return "stopped"
         return self._finish(total["wall"])
 
-    def _note(self, result: Made) -> None:
-        """Count a photo as done, and log why it gave no sample."""
+    def _keep(self, result: Made) -> None:
+        """Write a photo's sample where it waits for its shard, or log why there is none."""
+        if result.sample is not None:
+            with (
+                timed("write", self.seconds),
+                atomic_path(part_file(self.output, result.index)) as temporary,
+            ):
+                temporary.write_bytes(result.sample)
         self.waiting[result.index // self.options.shard_size].discard(result.index)
         for stage, time in result.seconds.items():
             self.seconds[stage] += time

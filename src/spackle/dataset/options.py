@@ -17,10 +17,10 @@ from spackle.dataset.views import ViewChoices
 from spackle.digest import digest_of, fingerprint, weights_digest
 from spackle.errors import InputError, check_name
 from spackle.inpaint import INPAINTERS
+from spackle.workers import Workers
 
 MAX_VIEWS = 100  # two digits name a view
 MAX_PHOTOS = 1_000_000  # six digits name a photo
-MAX_THREADS = 1024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +42,11 @@ class DatasetOptions:
     @property
     def paints_by_network(self) -> bool:
         return self.inpainter in INPAINTERS and INPAINTERS[self.inpainter].network
+
+    @property
+    def processes(self) -> Workers:
+        network = self.base.kind.network or self.paints_by_network
+        return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
 
     def check(self) -> None:
         """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
@@ -68,12 +73,11 @@ class DatasetOptions:
             ("--views", self.choices.views, 2, MAX_VIEWS),
             ("--seed", self.choices.seed, 0, 2**31 - 1),
             ("--sample", 1 if self.sample is None else self.sample, 1, MAX_PHOTOS),
-            ("--workers", self.workers, 1, MAX_THREADS),
-            ("--threads", self.threads, 1, MAX_THREADS),
             ("--shard-size", self.shard_size, 1, MAX_PHOTOS),
         ):
             if not least <= value <= most:
                 raise InputError(f"{name} must be between {least} and {most}, got {value}")
+        self.processes.check()
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
         """A photo's depth map in --depth, below the photo's subfolder; None without --depth; InputError if missing."""

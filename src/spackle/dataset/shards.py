@@ -155,23 +155,6 @@ def load_manifest(location: str | os.PathLike[str]) -> Manifest:
     return manifest
 
 
-def differences(old: Mapping[str, Any], new: Mapping[str, Any], where: str = "") -> list[str]:
-    """What two configurations disagree on, as "key: old -> new"."""
-
-    def short(value: object) -> str:
-        text = json.dumps(value)
-        return text if len(text) <= 40 else text[:12] + "…"
-
-    found: list[str] = []
-    for key in sorted({*old, *new}):
-        a, b = old.get(key), new.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            found += differences(a, b, f"{where}{key}.")
-        elif a != b:
-            found.append(f"{where}{key}: {short(a)} -> {short(b)}")
-    return found
-
-
 def _shard(content: Mapping[str, Any]) -> ShardEntry:
     samples = [SampleEntry(**{**sample, "holes": tuple(sample["holes"])}) for sample in content["samples"]]
     return ShardEntry(**{**content, "samples": tuple(samples), "passed_over": tuple(content["passed_over"])})

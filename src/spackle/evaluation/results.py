@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spackle.dataset.shards import differences
+from spackle.digest import differences
 from spackle.errors import InputError
 from spackle.formats import atomic_path
 from spackle.output_folder import make_folder, remove_half_written
