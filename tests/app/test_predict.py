@@ -90,10 +90,8 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path, plain: tuple[Path, 
         assert (again / name).read_bytes() == (plain[0] / name).read_bytes()
     first, second = report_of(plain[0]), report_of(again)
     for report in (first, second):
-        del report["seconds"], report["files"]["video.mp4"]  # x264's mbtree reads memory that nobody has written
+        del report["seconds"]
     assert first == second
-    for one, other in zip(*(decode(folder / "video.mp4") for folder in (plain[0], again)), strict=True):
-        assert np.abs(one.to_ndarray(format="rgb24").astype(int) - other.to_ndarray(format="rgb24")).mean() < 0.5
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:

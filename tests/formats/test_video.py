@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 from collections.abc import Iterator
@@ -56,6 +57,25 @@ def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
     content = path.read_bytes()
     assert 0 < content.index(index) < content.index(b"mdat" if codec == "h264" else CLUSTER)
     assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="fills new memory by glibc")
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "a.webp"])
+def test_the_same_frames_give_the_same_bytes_whatever_memory_held(tmp_path: Path, name: str) -> None:
+    wall = torch.rand(1, 3, 12, 16, generator=torch.Generator().manual_seed(0))
+    wall = torch.nn.functional.interpolate(wall, size=(96, 128), mode="bilinear")[0].permute(1, 2, 0)
+    views = [wall[k : k + 48, 2 * k : 2 * k + 64].clone() for k in range(20)]
+    for view in views:
+        view[16:32, 16:40] = 0.3  # what stands before the wall
+    perturb, found = -6, set()
+    for byte in (1, 85, 254):
+        ctypes.CDLL(None).mallopt(perturb, byte)
+        try:
+            save_video(views, tmp_path / name)
+        finally:
+            ctypes.CDLL(None).mallopt(perturb, 0)
+        found.add((tmp_path / name).read_bytes())
+    assert len(found) == 1
 
 
 @pytest.mark.parametrize("color", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.2, 0.6, 0.4)])
