@@ -234,6 +234,7 @@ def test_each_method_starts_from_the_same_base() -> None:
         assert torch.equal(network[index].rgb, per_view[index].rgb)  # without weights both are the seeds
         assert not torch.equal(network[index].rgb, spackle[index].rgb)  # which get texture
         assert (network[index].aux or 0) < (spackle[index].aux or 0) <= 6 * (network[index].aux or 0)  # in pixels
+        torch.testing.assert_close(network[index].alpha, spackle[index].alpha, rtol=0, atol=0.06)
     assert scene[0].aux == scene[1].aux  # one set for both
 
 
