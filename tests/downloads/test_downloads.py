@@ -27,7 +27,16 @@ import pytest
 from command import Run, run
 from sites import Site, serve
 
-from spackle.downloads import WEIGHTS, DownloadRecord, check_recorded, download, installed, transfer, weights_folder
+from spackle.downloads import (
+    WEIGHTS,
+    DownloadRecord,
+    check_recorded,
+    download,
+    installed,
+    known_weights,
+    transfer,
+    weights_folder,
+)
 from spackle.errors import InputError
 from spackle.progress import Reporter
 
@@ -484,12 +493,30 @@ def test_get_in_one_line_where_it_fails(site: Site, weights: Path) -> None:
     assert not weights.exists()
 
 
-def test_get_refuses_another_file_than_the_published_one(site: Site, weights: Path) -> None:
-    result = weights_command("get", "lama", "--url", site.url)
+@pytest.mark.parametrize("name", ["lama", "features"])
+def test_get_refuses_another_file_than_the_published_one(site: Site, weights: Path, name: str) -> None:
+    result, published = weights_command("get", name, "--url", site.url), known_weights(name).published
     assert result.code == 2
-    assert all(part in result.err.splitlines()[-1] for part in (site.url, "e3aa4aaa15225a33ec84f9f4bc47e500"))
-    assert "Apache" in result.err
+    assert published is not None
+    assert all(part in result.err.splitlines()[-1] for part in (site.url, published))
     assert not weights.exists() or os.listdir(weights) == []
+
+
+@pytest.mark.parametrize("kind", ["md5", "sha256"])
+def test_a_file_with_its_published_digest_is_taken(site: Site, target: Path, kind: str) -> None:
+    digits = hashlib.new(kind, CONTENT).hexdigest()
+    for published in (f"{kind}:{digits}", f"{kind}:{digits[:8]}"):
+        is_whole(target, site, download(site.url, target, published=published))
+
+
+def test_get_warns_of_an_address_that_is_not_encrypted(
+    site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "not encrypted" not in weights_command("get", "sharp", "--url", site.url).err  # it is this machine
+    monkeypatch.setenv("http_proxy", site.url)
+    result = weights_command("get", "sharp", "--force", "--url", "http://mirror.example/w.pt")
+    assert result.code == 0, result.err
+    assert "warning: http:// is not encrypted" in result.err
 
 
 def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

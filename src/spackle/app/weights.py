@@ -137,7 +137,7 @@ def _download(known: KnownWeights, url: str, path: Path, reporter: Reporter) -> 
             step(done, total)
 
         try:
-            return download(url, path, advance, known.md5)
+            return download(url, path, advance, known.published)
         except KeyboardInterrupt:
             if noticed:
                 reporter.log(f"{known.name}: what has come is kept; the same command goes on from there")

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from spackle.downloads.transfer import Progress, check_url, digest, read_json, receive, version_file, write_json
+from spackle.downloads.transfer import BLOCK, Progress, check_url, digest, read_json, receive, version_file, write_json
 from spackle.errors import InputError
 
 AGAIN = "run `spackle weights get` again"
@@ -44,14 +44,14 @@ def weights_folder() -> Path:
 
 
 def download(
-    url: str, path: str | os.PathLike[str], progress: Progress | None = None, md5: str | None = None
+    url: str, path: str | os.PathLike[str], progress: Progress | None = None, published: str | None = None
 ) -> DownloadRecord:
     """Fetch `url` (http or https, without a password) to `path` in a folder that exists, and write its record.
 
     A file that is there is replaced at the end; until then what has come lies in NAME.part. After a break, a kill or
     Ctrl-C the next call asks for the rest only, unless the remote file has changed or the server cannot do that.
-    `progress` gets the bytes done, those of earlier calls among them, and their number; `md5` is the file's where it
-    is known.
+    `progress` gets the bytes done, those of earlier calls among them, and their number; `published` is a digest as in
+    `KnownWeights`.
 
     Raises:
         InputError: the file cannot be had or not be written, is another one, or another process is at it.
@@ -64,10 +64,10 @@ def download(
     try:
         with hold(_beside(target, ".lock")):
             record = DownloadRecord(url, *receive(url, part, progress or (lambda done, total: None)))
-            if md5 is not None and hashlib.md5(part.read_bytes(), usedforsecurity=False).hexdigest() != md5:
+            if published is not None and not _has_digest(part, published):
                 part.unlink()
                 version_file(part).unlink()
-                raise InputError(f"{url}: what came has not the MD5 {md5}, so it is another file: take another address")
+                raise InputError(f"{url}: what came has not the digest {published}: take another address")
             # The record first: a kill in between leaves a file that its record refuses, not one without.
             write_json(dataclasses.asdict(record), _beside(target, ".json"))
             os.replace(part, target)
@@ -113,6 +113,16 @@ def check_recorded(path: str | os.PathLike[str]) -> DownloadRecord | None:
     return record
 
 
+def _has_digest(path: Path, published: str) -> bool:
+    """Whether a file has a digest, given as sha256:HEX or md5:HEX, of which HEX may be the beginning."""
+    kind, _, digits = published.partition(":")
+    found = hashlib.new(kind, usedforsecurity=kind != "md5")
+    with open(path, "rb") as file:
+        while block := file.read(BLOCK):
+            found.update(block)
+    return found.hexdigest().startswith(digits)
+
+
 def _real(path: str | os.PathLike[str]) -> Path:
     """The file itself, links followed: beside it lie its record and its part."""
     try:
@@ -135,7 +145,7 @@ class KnownWeights:
     licence: str  # in a few words
     notice: tuple[str, ...]  # lines that a person sees before the download
     named_by: str  # the option that names a copy elsewhere
-    md5: str | None = None  # where it was published with the file
+    published: str | None = None  # sha256:HEX or md5:HEX, or the beginning, where it was published with the file
     hub: HubFiles | None = None  # where it comes from the hub, with files that belong to it
 
 
@@ -177,7 +187,7 @@ WEIGHTS = {
             "https://github.com/advimman/lama/blob/main/LICENSE",
         ),
         named_by="--inpainter-weights names it to dataset build",
-        md5="e3aa4aaa15225a33ec84f9f4bc47e500",
+        published="md5:e3aa4aaa15225a33ec84f9f4bc47e500",
     ),
     "features": KnownWeights(
         name="features",
@@ -189,6 +199,7 @@ WEIGHTS = {
             "https://github.com/pytorch/vision/blob/main/LICENSE",
         ),
         named_by="loss.features_path names it to train",
+        published="sha256:0676ba61",  # torchvision's file names end with its beginning
     ),
     "depth": KnownWeights(
         name="depth",
