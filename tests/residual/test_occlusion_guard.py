@@ -21,11 +21,13 @@ from spackle.residual import hole_mask
 from spackle.residual.occlusion_guard import (
     CLEARANCE,
     MAX_REACH_PX,
+    PIT,
     REACH,
     STEPS,
     WINDOW_PX,
     OcclusionGuard,
     push_behind,
+    without_pits,
 )
 
 PROPERTY = settings(deadline=None, max_examples=40)
@@ -114,3 +116,39 @@ def test_without_guards_or_gaussians_or_in_front_of_the_camera_nothing_is_pushed
     assert len(push_behind(Gaussians.empty(), eye, [guard])) == 0
     behind = dataclasses.replace(random_aux(1, 0), means=torch.tensor([[0.1, 0.2, -3.0]]))
     assert same_bits(push_behind(behind, eye, [guard]), behind)
+
+
+def plain_closing(depth: Tensor, cells: Tensor, reach: int) -> Tensor:
+    """Of each chosen cell the least of the greatest depths around the cells around it, one at a time."""
+
+    def around(y: int, x: int) -> list[tuple[int, int]]:
+        rows, columns = range(y - reach, y + reach + 1), range(x - reach, x + reach + 1)
+        places = [(v, u) for v in rows for u in columns if 0 <= v < cells.shape[0] and 0 <= u < cells.shape[1]]
+        return [place for place in places if cells[place]]
+
+    farthest = {tuple(at): max(depth[p] for p in around(*at)) for at in cells.nonzero().tolist()}
+    return torch.stack([min(farthest[p] for p in around(*at)) for at in cells.nonzero().tolist()])
+
+
+@PROPERTY
+@given(SEEDS, st.floats(0.2, 1))
+def test_pits_are_closed_as_a_plain_loop_closes_them(seed: int, share: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    depth, cells = 1 + torch.rand(9, 75, generator=generator), torch.rand(9, 75, generator=generator) < share
+    cells[0, 0] = True
+    found = without_pits(depth[cells], cells)
+    assert torch.equal(found, plain_closing(depth, cells, round(75 * PIT)))
+    assert (found >= depth[cells]).all()
+
+
+def test_a_slant_and_a_wide_step_are_no_pits_but_a_speck_is() -> None:
+    cells = torch.ones(60, 100, dtype=torch.bool)
+    slant = 2 + 0.01 * torch.arange(100.0).expand(60, 100) + 0.02 * torch.arange(60.0)[:, None]
+    slant[:, 50:] += 3
+    speck = slant.clone()
+    speck[28:31, 20:23] = 1.0
+    inner = torch.zeros_like(cells)
+    inner[3:-3, 3:-3] = True  # at its border an image has no neighbours that would be nearer still
+    for image in (slant, speck):
+        found = without_pits(image[cells], cells)[inner[cells]]
+        torch.testing.assert_close(found, slant[inner], atol=0 if image is slant else 0.1, rtol=1e-6)

@@ -22,7 +22,7 @@ from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, in_cells
 from spackle.residual.network import ResidualNet, predict_deltas
-from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
+from spackle.residual.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
 from spackle.residual.rim_underlay import rim_underlay
 from spackle.residual.seeds import BEHIND, FINE_SPREAD_PX, Rim, Seeds, fitting_patches, make_seeds
 from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture, sharpened
@@ -161,10 +161,9 @@ class Completer:
         added = [self._nothing]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = (self._seeds_alone if turn else self)._propose(rendering, camera, underlay)
+            new = (self._seeds_alone if turn else self)._propose(rendering, camera, guards, underlay)
             if not len(new):
                 break
-            new = push_behind(new, camera.position, guards)
             added.append(new)
             tiles = touched_tiles(new, camera, self.renderer)  # the others keep what they show
             rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
@@ -187,49 +186,49 @@ class Completer:
             return self
         return dataclasses.replace(self, texture=EXEMPLAR)
 
-    def _propose(self, rendering: Rendering, camera: Camera, underlay: bool) -> Gaussians:
+    def _propose(
+        self, rendering: Rendering, camera: Camera, guards: Sequence[OcclusionGuard], underlay: bool
+    ) -> Gaussians:
         """Masked selection (eq. 7): a Gaussian for each masked cell of a rendering, with a texture one for each pixel.
 
-        With `underlay` also those beneath the rims.
+        With `underlay` also those beneath the rims. All of them behind what the guards show.
         """
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
             return self._nothing
-        seeds = make_seeds(cues, camera, self.photo_camera)
-        chosen = seeds.select(cues.mask)
+        seeds, eye = make_seeds(cues, camera, self.photo_camera), camera.position
+        chosen, deltas, picture = seeds.select(cues.mask), None, None
         if self.network is None and self.texture is None:
-            new = compose(chosen, None, camera)
+            cells = compose(chosen, None, camera)
         else:
             patches = fitting_patches(cues, seeds)
-            rim, deltas = Rim.of(cues, seeds, camera, self.photo_camera, patches), None
+            rim = Rim.of(cues, seeds, camera, self.photo_camera, patches)
             if self.network is not None:
                 deltas = predict_deltas(self.network, cues, seeds, rim, self.precision)[cues.mask]
-            new = compose(chosen, deltas, camera)
+            cells = compose(chosen, deltas, camera)
             if self.texture is not None:
                 structure = cues.rgb.clone()
-                structure[cues.mask] = linear_to_srgb(new.colors)
+                structure[cues.mask] = linear_to_srgb(cells.colors)
                 picture = self.texture.colors(structure, rendering, cues, seeds, rim, patches)
-                colors = (in_cells(image)[cues.mask] for image in (picture, sharpened(picture)))
-                new = Gaussians.cat(_in_pixels(chosen, deltas, camera, *colors))
-        return Gaussians.cat([new, rim_underlay(cues, seeds, camera)]) if underlay else new
+        away, depths, parts = free_factors(cells, eye, guards), camera.to_camera(cells.means)[:, 2], []
+        away = torch.where(away > 0, without_pits(depths * away, cues.mask) / depths, 0)
+        if picture is not None:
+            wanted, blobs = (in_cells(image)[cues.mask] for image in (picture, sharpened(picture)))
+            rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
+            index = rough.nonzero()[:, 0]
+            pixels = _pixels(chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index])
+            parts.append(moved_away(pixels, eye, away[index].repeat_interleave(CELL**2)))
+            # As a lifted photo has them: behind the pixels' Gaussians one for each cell.
+            cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
+            away = away / (1 - BEHIND)
+        parts.append(moved_away(cells, eye, away))
+        if underlay:
+            parts.append(push_behind(rim_underlay(cues, seeds, camera), eye, guards))
+        return Gaussians.cat(parts)
 
 
-def _in_pixels(
-    chosen: Seeds, deltas: Tensor | None, camera: Camera, wanted: Tensor, blobs: Tensor
-) -> tuple[Gaussians, Gaussians]:
-    """Gaussians for the pixels of the chosen cells, and behind them one for each cell, as a lifted photo has them.
-
-    Args:
-        chosen: flat seeds [n] of cells.
-        deltas: [n, 14], or None.
-        camera: the view.
-        wanted: [n, 2, 2, 3] sRGB that the pixels are to show.
-        blobs: the same of the pixels' Gaussians, which overlap.
-    """
-    back = dataclasses.replace(chosen, inverse_depth=(1 - BEHIND) * chosen.inverse_depth)
+def _pixels(chosen: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:
+    """Gaussians [4n] for the pixels of chosen cells: flat seeds [n], deltas [n, 14], or None, and sRGB [n, 2, 2, 3]."""
     own = None if deltas is None else deltas.repeat_interleave(CELL**2, 0)
-    shown, colors = (srgb_to_linear(image.flatten(1, 2).clamp(0, 1)) for image in (wanted, blobs))
-    cells = dataclasses.replace(compose(back, deltas, camera), colors=shown.mean(1))
-    pixels = dataclasses.replace(compose(chosen.for_pixels(), own, camera, FINE_SPREAD_PX), colors=colors.flatten(0, 1))
-    rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
-    return pixels.select(rough.repeat_interleave(CELL**2)), cells
+    pixels = compose(chosen.for_pixels(), own, camera, FINE_SPREAD_PX)
+    return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))

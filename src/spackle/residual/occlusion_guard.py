@@ -27,6 +27,7 @@ REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
 MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
 CLEARANCE = 0.002  # relative distance behind the surface that counts as behind
 GRAIN, ROWS = 1024, 64  # Gaussians, and rows of a guard, that a thread takes at a time
+PIT = 0.027  # of a view's width: a nearer patch that is less than twice as wide is a pit
 STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
 
@@ -77,10 +78,25 @@ def _widest(start: int, stop: int, depth: Any, alpha: Any, threshold: Any, wide:
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
-    """Slide Gaussians away from the eye that wants them until no guard is blocked.
+    """Slide each Gaussian away from the eye that wants it until no guard is blocked: see `free_factors`."""
+    return moved_away(aux, eye, free_factors(aux, eye, guards))
 
-    Scaling about the eye moves and grows a Gaussian without changing how that eye sees it. Far enough
-    out everything is behind everything, so a place is found for nearly all; the rest is dropped.
+
+def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
+    """N Gaussians scaled about the eye [3] by factors [N], without those of factor 0.
+
+    This moves and grows a Gaussian without changing how that eye sees it.
+    """
+    eye, factor = beside(eye, aux.means), factors[:, None]
+    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
+    free = factors > 0
+    return moved if bool(free.all()) else moved.select(free)
+
+
+def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
+    """Factors [N] ≥ 1 by which Gaussians have to move away from an eye until no guard is blocked.
+
+    Far enough out everything is behind everything, so a place is found for nearly all; 0 is of those that have none.
 
     Args:
         aux: N Gaussians in the world's frame.
@@ -88,17 +104,33 @@ def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -
         guards: the views to protect.
     """
     if not len(aux) or not guards:
-        return aux
+        return torch.ones_like(aux.opacities)
     eye = beside(eye, aux.means)
     if dense.on_gpu(aux.means):
         shown_by = [(guard.camera, guard.depth) for guard in guards]
-        factor = dense.free_factors(eye, aux, shown_by, STEPS, WINDOW_PX, REACH, MAX_REACH_PX, CLEARANCE)
+        factors = dense.free_factors(eye, aux, shown_by, STEPS, WINDOW_PX, REACH, MAX_REACH_PX, CLEARANCE)
     else:
-        factor = _factors(aux, eye, guards)
-    factor = factor.to(aux.means)[:, None]
-    moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
-    free = factor[:, 0] > 0
-    return moved if bool(free.all()) else moved.select(free)
+        factors = _factors(aux, eye, guards)
+    return factors.to(aux.means)
+
+
+def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
+    """Depths [n] of a view's chosen cells ([h, w] bool), none of them nearer than most cells of its neighbourhood.
+
+    A morphological closing. Each for itself, neighbours of one surface would be moved to different depths, and their
+    colours would scatter in every other view.
+    """
+    reach = max(1, round(PIT * cells.shape[1]))
+    grid = depths.new_zeros(cells.shape)
+    grid[cells] = depths
+    farthest = _greatest(grid, reach)
+    return -_greatest(torch.where(cells, -farthest, -torch.inf), reach)[cells]
+
+
+def _greatest(image: Tensor, reach: int) -> Tensor:
+    """Of [h, w] the greatest in the square around each."""
+    along = max_pool2d(image[None], (1, 2 * reach + 1), stride=1, padding=(0, reach))
+    return max_pool2d(along, (2 * reach + 1, 1), stride=1, padding=(reach, 0))[0]
 
 
 def _factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
