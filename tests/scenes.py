@@ -15,6 +15,7 @@ from torch import Tensor
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
@@ -32,8 +33,8 @@ class Scene:
     def depth_map(self) -> DepthMap:
         return DepthMap(self.depth, self.depth > 0, None, None, "depth", Path("synthetic.npy"))
 
-    def lift(self) -> BasePrediction:
-        return lift(self.rgb, self.depth_map, self.camera)
+    def lift(self, levels: int = LEVELS) -> BasePrediction:
+        return lift(self.rgb, self.depth_map, self.camera, levels)
 
     def base(self) -> Gaussians:
         return self.lift().gaussians

@@ -137,6 +137,7 @@ TWINS = {
     "bases/blending.py": "test_silhouettes.py",
     "bases/cleanup.py": "test_cleanup.py",
     "bases/edges.py": "test_cleanup.py",
+    "bases/quadtree.py": "test_quadtree.py",
     "bases/sharp/unproject.py": "test_sharp_unproject.py",
     "bases/silhouettes.py": "test_silhouettes.py",
     "bases/sky.py": "test_sky.py",

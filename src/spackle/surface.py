@@ -32,7 +32,7 @@ def surface_gaussians(
 ) -> Gaussians:
     """One Gaussian for each sample of a surface, aligned with it.
 
-    Seen from `camera` each is a round blob of `spread` pixels; from elsewhere it foreshortens as the
+    Seen from `camera` each is a blob of `spread` pixels; from elsewhere it foreshortens as the
     surface does, so that a plane stays closed from every side.
 
     Args:
@@ -40,7 +40,7 @@ def surface_gaussians(
         uv: [N, 2] pixel positions.
         inverse_depth: [N] 1/z.
         slope: [N, 2] derivative of the inverse depth by pixel x and y.
-        spread: [N] or one number, standard deviation in pixels of `camera`.
+        spread: [N], [N, 2] along pixel x and y, or one number: standard deviation in pixels of `camera`.
         colors: [N, 3] linear RGB.
         opacities: [N].
     """
@@ -51,8 +51,8 @@ def surface_gaussians(
     dz = -(z**2)[:, None] * slope
     across = dz[:, :1] * ray + pad(z[:, None] * (1 / fx), (0, 2))
     down = dz[:, 1:] * ray + pad(z[:, None] * (1 / fy), (1, 1))
-    rotation, lengths = _principal_axes(across, down)
-    scales = lengths * (spread.to(uv).reshape(-1, 1) if isinstance(spread, Tensor) else spread)
+    widths = spread.to(uv)[..., None].flatten(1) if isinstance(spread, Tensor) else uv.new_full((1, 1), spread)
+    rotation, scales = _principal_axes(across * widths[:, :1], down * widths[:, -1:])
     scales = torch.cat([scales, THICKNESS * scales.amin(dim=-1, keepdim=True)], dim=-1)
     local_to_world = beside(camera.world_to_camera, uv)[:3, :3].T
     means = camera.unproject(uv, z)

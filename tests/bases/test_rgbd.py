@@ -26,6 +26,7 @@ from torch.nn.functional import max_pool2d
 from spackle.bases.cleanup import COLOR_COST, MEDIAN, NEAR_COST, fill_missing
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import RgbdBase, lift
+from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
@@ -71,8 +72,8 @@ def on_plane(scene: Scene, camera: Camera) -> Tensor:
 
 def test_one_gaussian_for_each_pixel_then_the_rest_of_mixed_ones_then_one_behind_each_cell() -> None:
     scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
-    base, pixels = scene.base(), scene.depth.numel()
-    assert pixels * 9 // 8 < len(base) <= pixels * 5 // 4
+    base, pixels = scene.lift(levels=0).gaussians, scene.depth.numel()
+    assert pixels * 5 // 4 < len(base) <= pixels * 3 // 2
     front, others = base.select(slice(0, pixels)), base.select(slice(pixels, None))
     uv, z = scene.camera.project(front.means)
     torch.testing.assert_close(uv, scene.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
@@ -100,8 +101,8 @@ def test_from_the_photos_eye_the_photo_is_whole_and_its_depth_right(scene: Scene
 @pytest.mark.parametrize("size", [(63, 47), (5, 3), (3, 2), (2, 2), (64, 1), (1, 64), (1, 1)])
 def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
     scene = wall(4.0, *size)
+    assert len(scene.lift(levels=0).gaussians) == size[0] * size[1] + (size[0] // 2) * (size[1] // 2)
     base = scene.base()
-    assert len(base) == size[0] * size[1] + (size[0] // 2) * (size[1] // 2)
     view = CPU.render(base, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     if min(size) > 1:  # else there is no backing
@@ -113,11 +114,11 @@ def test_missing_depth_is_filled_from_behind_and_reported() -> None:
     scene = box_before_wall()
     strip = torch.zeros_like(scene.depth, dtype=torch.bool)
     strip[24:48, 28:32] = True  # the wall's last columns before the box
-    found = dataclasses.replace(scene, depth=torch.where(strip, 0.0, scene.depth)).lift()
+    found = dataclasses.replace(scene, depth=torch.where(strip, 0.0, scene.depth)).lift(levels=0)
     assert found.notes["depth_filled"] == pytest.approx(24 * 4 / (72 * 96), abs=1e-4)
     z = found.gaussians.means[: 72 * 96, 2].reshape(72, 96)
     elsewhere = eroded(~strip, 1)  # the pixels beside it may count as mixed ones
-    assert torch.equal(z[elsewhere], scene.base().means[: 72 * 96, 2].reshape(72, 96)[elsewhere])
+    assert torch.equal(z[elsewhere], scene.lift(levels=0).gaussians.means[: 72 * 96, 2].reshape(72, 96)[elsewhere])
     assert float(z[strip].min()) > 5.99  # the wall's depth is 6, the box's 2
     assert wall().lift().notes["depth_filled"] == 0
 
@@ -172,14 +173,17 @@ def test_the_lens_is_the_calibrations_where_there_is_one_and_else_the_photos() -
     found = RgbdBase(half).predict(photo)
     assert found.camera.K.tolist() == [[140, 0, 30], [0, 140, 25], [0, 0, 1]]
     assert (found.camera.width, found.camera.height) == (64, 48)
-    uv, _ = found.camera.project(found.gaussians.means[: 64 * 48])
-    torch.testing.assert_close(uv, found.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
+    uv, _ = found.camera.project(found.gaussians.means)
+    assert float((2 * uv - (2 * uv).round()).abs().max()) < 2e-3  # centres of pixels, or their borders
+    torch.testing.assert_close(torch.stack([uv.amin(0), uv.amax(0)]), torch.tensor([[0.5, 0.5], [63.5, 47.5]]))
     # Nothing moves where a frame has been cut off.
     framed = dataclasses.replace(photo, rgb=photo.rgb[6:-4, 2:-10], frame=PhotoFrame(2, 6, 10, 4, "dark"))
     inside = RgbdBase(half).predict(framed)
     assert inside.camera.K.tolist() == [[140, 0, 28], [0, 140, 19], [0, 0, 1]]
-    means = found.gaussians.means[: 64 * 48].reshape(48, 64, 3)[6:-4, 2:-10]
-    torch.testing.assert_close(inside.gaussians.means[: 52 * 38], means.reshape(-1, 3), rtol=1e-4, atol=1e-4)
+    uv, _ = found.camera.project(inside.gaussians.means)
+    torch.testing.assert_close(torch.stack([uv.amin(0), uv.amax(0)]), torch.tensor([[2.5, 6.5], [53.5, 43.5]]))
+    views = [CPU.render(base.gaussians, found.camera).rgb[6:-4, 2:-10] for base in (found, inside)]
+    assert psnr(*views) > 40
 
 
 @pytest.mark.parametrize("disparity", [0.1, 0.2, 0.5])
@@ -188,7 +192,7 @@ def test_what_a_box_uncovers_is_a_hole_and_what_was_seen_is_none(disparity: floa
     near, far = 2.0, 6.0
     scene = box_before_wall(near, far)
     base = scene.base()
-    camera = extremes(scene.camera, disparity, DepthRange.of(base))[side]
+    camera = extremes(scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians))[side]
     box = box_mask(96, 72)
 
     def looked_up(points: Tensor) -> Tensor:
@@ -227,8 +231,8 @@ def test_rounded_disparities_leave_no_stairs() -> None:
     quantum = 0.005
     stored = (1 / scene.depth / quantum).round() * quantum
     depth = DepthMap(1 / stored, stored > 0, None, quantum, "disparity", Path("disp.png"))
-    base = lift(scene.rgb, depth, scene.camera).gaussians
-    z = base.means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
+    pixels, base = (lift(scene.rgb, depth, scene.camera, levels).gaussians for levels in (0, LEVELS))
+    z = pixels.means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
     error, before = (1 / z - 1 / scene.depth).square().mean(), (stored - 1 / scene.depth).square().mean()
     assert float(error) < 0.25 * float(before)
     for camera in extremes(scene.camera, 0.3, DepthRange.of(base)):

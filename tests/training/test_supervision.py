@@ -119,7 +119,7 @@ def hidden(scene: Scene, viewer: Camera) -> Tensor:
 
 
 def reverse(scene: Scene, viewer: Camera) -> Sample:
-    return reverse_view(scene.lift(), scene.rgb, viewer, CPU)
+    return reverse_view(scene.lift(levels=0), scene.rgb, viewer, CPU)
 
 
 EYES = [(0.35, 0.0, 0.0), (-0.35, 0.0, 0.0), (0.0, 0.3, 0.0), (0.25, -0.2, 0.15), (-0.2, 0.2, -0.3)]

@@ -1,11 +1,13 @@
-"""What Gaussians of half a pixel have to be like, so that together they blend to what the photo shows."""
+"""What Gaussians have to be like, so that together they blend to what the photo shows."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from spackle._numba import kernel
 from spackle.bases.edges import Floats
@@ -17,8 +19,9 @@ OPACITY = np.float32(0.99)
 SPREAD_PX = 0.5  # standard deviation
 WEIGHTS = np.exp(-0.5 / SPREAD_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
 ROUNDS = 6
-UNTOUCHED = 3  # rings around a step whose colours stay
-GRAIN = 64
+FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the renderer's: alphas that it skips, light at which it stops
+REACH = np.float32(3.33)  # standard deviations at which an alpha becomes faint
+BAND = 128  # rows that a thread takes at a time
 
 
 def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
@@ -48,42 +51,60 @@ def _thin(alpha: Any, ring: Any, result: Any) -> None:
             result[y, x] = min(max(1 - (1 - alpha[y, x]) / passes, np.float32(0)), np.float32(1))
 
 
-def blended_colors(colors: Floats, inverse_depth: Floats, ring: NDArray[np.uint8]) -> Floats:
-    """Linear RGB [H, W, 3] of one Gaussian a pixel, sharpened by what the blobs will blur.
+class Mixture:
+    """What the photo's camera sees of Gaussians: spots, which mix to a picture as the renderer mixes them."""
 
-    The photo's camera sees each pixel through the Gaussians of its neighbours that are nearer. What this changes is
-    taken off in advance, but for the rings beside depth steps and the photo's border.
-    """
-    result = colors.copy()
-    run_chunks(lambda a, b: _sharpen(a, b, colors, inverse_depth, ring, result), len(colors), GRAIN)
-    return result
+    def __init__(self, uv: Tensor, inverse_depth: Tensor, spread: Tensor, opacity: Tensor, height: int, width: int):
+        """Sort spots by depth.
+
+        Args:
+            uv: [N, 2] centres in pixels.
+            inverse_depth: [N].
+            spread: [N, 2] standard deviations in pixels, along x and y.
+            opacity: [N].
+            height: of the picture.
+            width: of the picture.
+        """
+        self.order = inverse_depth.argsort(descending=True, stable=True)
+        self.spots = torch.cat([uv, spread, opacity[:, None]], dim=-1)[self.order].numpy()
+        self.shape = (height, width, 3)
+
+    def picture(self, colors: Tensor) -> Tensor:
+        """[H, W, 3] of the spots' colours [N, 3], linear RGB."""
+        image, sorted_colors = np.zeros(self.shape, np.float32), colors[self.order].numpy()
+        run_chunks(lambda a, b: _mix(a, b, self.spots, sorted_colors, image), len(image), BAND)
+        return torch.from_numpy(image)
 
 
 @kernel
-def _sharpen(start: int, stop: int, colors: Any, inverse_depth: Any, ring: Any, result: Any) -> None:
-    """Rows start..stop."""
-    height, width = inverse_depth.shape
-    order, depth = np.empty(9, np.int64), np.empty(9, np.float32)
-    for y in range(start, stop):
-        for x in range(width):
-            if 0 < ring[y, x] < UNTOUCHED or y == 0 or x == 0 or y == height - 1 or x == width - 1:
-                continue
-            count = 0
-            for k in range(9):
-                v, u = y + k // 3 - 1, x + k % 3 - 1
-                at = count
-                while at > 0 and depth[at - 1] < inverse_depth[v, u]:  # nearest first
-                    depth[at], order[at] = depth[at - 1], order[at - 1]
-                    at -= 1
-                depth[at], order[at] = inverse_depth[v, u], k
-                count += 1
-            for c in range(3):
-                light, passes = np.float32(0), np.float32(1)
-                for n in range(count):
-                    k = order[n]
-                    share = passes * OPACITY * WEIGHTS[k]
-                    light += share * colors[y + k // 3 - 1, x + k % 3 - 1, c]
-                    passes -= share
-                light += passes * colors[y, x, c]  # the backing's
-                sharp = 2 * colors[y, x, c] - light
-                result[y, x, c] = min(max(sharp, np.float32(0)), np.float32(1))
+def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
+    """Rows start..stop, nearest first."""
+    width = image.shape[1]
+    half = np.float32(0.5)
+    passes = np.ones((stop - start, width), np.float32)
+    across = np.empty(width, np.float32)
+    for n in range(len(spots)):
+        u, v, spread_x, spread_y, opacity = spots[n]
+        top = max(int(np.ceil(v - REACH * spread_y - half)), start)
+        bottom = min(int(np.floor(v + REACH * spread_y - half)) + 1, stop)
+        if top >= bottom:
+            continue
+        left = max(int(np.ceil(u - REACH * spread_x - half)), 0)
+        right = min(int(np.floor(u + REACH * spread_x - half)) + 1, width)
+        for x in range(left, right):
+            away = (x + half - u) / spread_x
+            across[x] = np.exp(-half * away * away)
+        for y in range(top, bottom):
+            away = (y + half - v) / spread_y
+            down = opacity * np.exp(-half * away * away)
+            for x in range(left, right):
+                alpha, light = down * across[x], passes[y - start, x]
+                if alpha < FAINT:
+                    continue
+                after = light * (1 - alpha)
+                if after <= STOP:
+                    passes[y - start, x] = 0
+                    continue
+                passes[y - start, x] = after
+                for c in range(3):
+                    image[y, x, c] += alpha * light * colors[n, c]

@@ -16,6 +16,7 @@ from spackle.bases.cleanup import (
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import find_edges, sample, settle
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.quadtree import LEVELS
 from spackle.bases.sky import push_sky
 from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
@@ -50,13 +51,14 @@ class RgbdBase:
         return dataclasses.replace(prediction, notes=notes, lens_source="" if own is None else self.lens_source)
 
 
-def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
-    """A photo and its depth to Gaussians, first one for each pixel in row-major order, see `layered_gaussians`.
+def lift(rgb: Tensor, depth: DepthMap, camera: Camera, levels: int = LEVELS) -> BasePrediction:
+    """A photo and its depth to Gaussians, see `layered_gaussians`.
 
     Args:
         rgb: [H, W, 3] sRGB in 0..1.
         depth: any size of the same aspect ratio.
         camera: the photo's, at the world's origin.
+        levels: of tiles that share a Gaussian; 0 for one a pixel.
 
     Raises:
         InputError: not one pixel has a depth.
@@ -72,7 +74,7 @@ def lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> BasePrediction:
         raise InputError(f"{depth.path}: no depth is left at {camera.width}×{camera.height}: give a denser map")
     inverse_depth = fill_missing(inverse_depth, rgb, known)
     inverse_depth = attach_flying_pixels(inverse_depth)
-    gaussians = layered_gaussians(inverse_depth, srgb_to_linear(rgb), camera)
+    gaussians = layered_gaussians(inverse_depth, srgb_to_linear(rgb), camera, levels)
     notes: dict[str, float | int | str] = {"depth_filled": round(missing, 4)}
     if sky:
         notes["sky"] = round(sky, 4)

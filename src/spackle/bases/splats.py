@@ -1,49 +1,105 @@
-"""Gaussians of a photo whose every pixel has a depth: one for each, two at silhouettes, and a coarse backing."""
+"""Gaussians of a photo whose every pixel has a depth: one for each or for a tile, two at silhouettes, and a backing."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from spackle.bases.blending import OPACITY, SPREAD_PX, blended_colors, blended_opacities
+from spackle.bases.blending import OPACITY, SPREAD_PX, Mixture, blended_opacities
+from spackle.bases.quadtree import LEVELS, Quadtree, Tiles
 from spackle.bases.silhouettes import Layers, find_layers
 from spackle.camera import Camera
+from spackle.color import linear_to_srgb
 from spackle.gaussians import Gaussians
-from spackle.surface import EDGE, surface_gaussians, surface_slope
+from spackle.surface import surface_gaussians, surface_slope
 
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
-# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels, closes it from behind:
+# close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
-BACKING_SPREAD_PX = 1.1
+TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
+BACKING_SPREAD = 0.55  # of the backing's for 2×2 pixels
+LARGE_BACKING_SPREAD = 0.65  # and of its larger ones, which keep away from depth steps
 BACKING_GAP = 0.005  # the backing's distance behind the front, relative
-BACKING_SLOPE_GAP = 4.0  # and this many pixels further along a slanted surface, so that none pokes through
+BACKING_SLOPE_GAP = 2.0  # and so many of its sides further along a slanted surface, so that none pokes through
 MAX_BACKING_GAP = 0.2
-FLAT = 0.005  # most relative bend of the inverse depth over 4×4 pixels that one Gaussian of the backing stands for
+WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
+LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
+STEEPEST = 0.06  # change of the inverse depth across a tile
+STEEPEST_BACKING = 0.01  # and across one of the backing, which stands the farther behind the steeper it is
+SHOWN = 0.02  # of a difference in the backing is lost
 LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+MOST = 1.5  # Gaussians a pixel
+FITS = 2  # corrections of the colours
+UNTOUCHED = 1  # rings beside a step whose colours stay: corrected ones show from beside
 
 
-def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera) -> Gaussians:
-    """At most 1.25 Gaussians a pixel, first one for each in row-major order, in what it shows most of.
+def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
+    """At most 1.5 Gaussians a pixel: first those of single pixels in row-major order, in what each shows most of.
 
-    Where a pixel beside a depth step shows both surfaces, a second one stands for the rest; from the photo's camera
-    they mix to what the photo shows. The backing follows.
+    Tiles of up to 8×8 pixels follow, where the picture and the depth allow them; then, where a pixel beside a depth
+    step shows both surfaces, the Gaussians that stand for the rest; then the backing. From the photo's camera they mix
+    to what the photo shows.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
         colors: [H, W, 3] linear RGB.
         camera: the photo's.
+        levels: of tiles; 0 for a Gaussian a pixel and a backing one for 2×2.
     """
     slope = surface_slope(inverse_depth)
     layers = find_layers(*(image.contiguous().numpy() for image in (inverse_depth, slope, colors)))
+    ring = torch.from_numpy(layers.ring)
+    tree = Quadtree(linear_to_srgb(colors), inverse_depth, slope, _inner(ring == 0), levels, STEEPEST)
+    worth = min(max(WORTH * tree.detail(), LEAST_WORTH), MOST_WORTH)
+    single, tiles = tree.cut(worth)
+    surface = _Surface(inverse_depth, slope, colors, torch.full_like(inverse_depth, float(OPACITY)))
+    front = [surface.samples(part, TILE_SPREAD) for part in tiles]
     for least in LEAST_MIXED:
         pixels = _split(layers, least, colors)
-        backing, spare = _backing(pixels, camera)
-        if spare >= 0:
+        rest = pixels.rest.pixels(pixels.mixed, camera)
+        parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
+        samples = _Samples.cat(parts)
+        if len(samples.uv) <= MOST * single.numel():
             break
-    every = torch.ones_like(pixels.mixed)
-    return Gaussians.cat([pixels.most.gaussians(every, camera), pixels.rest.gaussians(pixels.mixed, camera), backing])
+    settled = single & ((ring == 0) | (ring > UNTOUCHED))
+    fitted = _fitted(samples, colors, single, settled[single], tiles)
+    return surface_gaussians(camera, *(getattr(fitted, f.name) for f in dataclasses.fields(fitted)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Samples:
+    """What Gaussians are made of, in the order of `surface_gaussians`."""
+
+    uv: Tensor  # [N, 2] pixels
+    depth: Tensor  # [N] inverse
+    slope: Tensor  # [N, 2]
+    spread: Tensor  # [N, 2] pixels
+    color: Tensor  # [N, 3] linear RGB
+    opacity: Tensor  # [N]
+
+    @staticmethod
+    def cat(parts: Sequence[_Samples]) -> _Samples:
+        """All of them, in order."""
+        return _Samples(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(_Samples)))
+
+
+def _fitted(samples: _Samples, colors: Tensor, single: Tensor, settled: Tensor, tiles: Sequence[Tiles]) -> _Samples:
+    """Correct the colours of single pixels and of tiles by what their mixture shows there instead of `colors`.
+
+    The photo's camera sees each pixel through the Gaussians around that are nearer. `settled` [single pixels] are
+    corrected.
+    """
+    fitted = samples.color.clone()
+    mixture = Mixture(samples.uv, samples.depth, samples.spread, samples.opacity, *single.shape)
+    for _ in range(FITS):
+        missing = colors - mixture.picture(fitted)
+        pixels = missing[single] * settled[:, None]
+        change = torch.cat([pixels, *(part.means(missing) for part in tiles)])
+        fitted[: len(change)] = (fitted[: len(change)] + change).clamp(0, 1)
+    return dataclasses.replace(samples, color=fitted)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,11 +117,18 @@ class _Surface:
         shaped = ((where if a.ndim == 2 else where[..., None], a, b) for a, b in pairs)
         return _Surface(*(torch.where(*images) for images in shaped))
 
-    def gaussians(self, where: Tensor, camera: Camera) -> Gaussians:
+    def pixels(self, where: Tensor, camera: Camera) -> _Samples:
         """One for each of some pixels [H, W], in row-major order."""
         uv = camera.pixel_centers()[where]
         depth, slope, color, opacity = self.depth[where], self.slope[where], self.color[where], self.opacity[where]
-        return surface_gaussians(camera, uv, depth, slope, SPREAD_PX, color, opacity)
+        return _Samples(uv, depth, slope, torch.full_like(uv, SPREAD_PX), color, opacity)
+
+    def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
+        """An opaque one for each tile, of so many of its sides; the surface has a cell for so many pixels a side."""
+        depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
+        opacity = torch.full_like(depth, float(OPACITY))
+        sides = torch.tensor([tiles.width, tiles.height]) * (spread * pixels)
+        return _Samples(tiles.centers() * pixels, depth, slope, sides.expand(len(depth), 2), color, opacity)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,56 +153,50 @@ def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
         depth, slope, own = (torch.from_numpy(a[side]) for a in (layers.depth, layers.slope, layers.color))
         surfaces.append(_Surface(depth, slope, torch.where(mixed[..., None], own, colors), opaque))
     most, rest = surfaces[1].instead(near, surfaces[0]), surfaces[0].instead(near, surfaces[1])
-    sharp = blended_colors(most.color.numpy(), most.depth.numpy(), layers.ring)
-    return _Pixels(dataclasses.replace(most, color=torch.from_numpy(sharp)), rest, mixed, near, ring > 0)
+    return _Pixels(most, rest, mixed, near, ring > 0)
 
 
-def _backing(pixels: _Pixels, camera: Camera) -> tuple[Gaussians, int]:
-    """One wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface; and how many to spare.
+def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
+    """A wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface; one for more in flat places.
 
-    None is where only the rest of mixed pixels lies behind. What mixed pixels cost is saved where it shows least: in
-    the flattest places one for 4×4 pixels stands for four.
+    None is where only the rest of mixed pixels lies behind.
     """
     behind = pixels.mixed & pixels.near
     deepest = pixels.most.instead(behind, pixels.rest)
     cells = _cells(deepest.depth)
     if not cells.numel():  # one pixel high or wide
-        return Gaussians.empty(), -int(pixels.mixed.sum())
+        return []
     far, pick = cells.min(dim=-1)
     slope = _cells(deepest.slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
     # The cell's centre lies half a pixel from the farthest pixel's.
     offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
     at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
-    gap = BACKING_GAP + BACKING_SLOPE_GAP * slope.abs().sum(-1) / at_center
-    recede = (1.0 - gap.clamp_max(MAX_BACKING_GAP))[..., None]
     # Its colour is the mean of the pixels on that surface.
     same = (cells - far[..., None] < 0.02 * far[..., None]).to(far)
     color = (_cells(deepest.color) * same[..., None]).sum(2) / same.sum(2)[..., None]
     wanted = ~_cells(behind).any(-1) | _cells(pixels.edge & ~pixels.near).any(-1)
-    spare = int((~wanted).sum()) - int(pixels.mixed.sum())
-    flat = _flattest(at_center, wanted & ~_cells(pixels.edge).any(-1), -(spare // 3))
-    block = flat.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    wanted[: block.shape[0], : block.shape[1]] &= ~block
-    fields = (camera.pixel_centers(stride=2), at_center[..., None] * recede, slope * recede, color)
-    uv, depth, slope, color = (torch.cat([field[wanted], _cells(field).mean(2)[flat]]) for field in fields)
-    spread = torch.full_like(depth[:, 0], BACKING_SPREAD_PX)
-    spread[int(wanted.sum()) :] *= 2
-    opacity = torch.full_like(spread, float(OPACITY))
-    return surface_gaussians(camera, uv, depth[:, 0], slope, spread, color, opacity), spare + 3 * int(flat.sum())
+    flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
+    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
+    single, tiles = tree.cut(worth / SHOWN)
+    surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
+    small = Tiles(1, 1, *(single & wanted).nonzero(as_tuple=True))
+    parts = [(small, BACKING_SPREAD), *((part, LARGE_BACKING_SPREAD) for part in tiles)]
+    return [_receded(surface.samples(part, spread, pixels=2), part) for part, spread in parts]
 
 
-def _flattest(inverse_depth: Tensor, free: Tensor, count: int) -> Tensor:
-    """[h/2, w/2] bool: the 2×2 cells of [h, w] that lie best in one plane, up to a count, where all are free."""
-    cells = _cells(inverse_depth)
-    chosen = torch.zeros(cells.shape[:2], dtype=torch.bool)
-    if count > 0 and cells.numel():
-        bend = (cells[..., 0] + cells[..., 3] - cells[..., 1] - cells[..., 2]).abs() / cells.mean(-1)
-        rise = (cells.amax(-1) - cells.amin(-1)) / cells.mean(-1)
-        fit = (bend < FLAT) & (rise < EDGE) & _cells(free).all(-1)
-        cost = torch.where(fit, bend + rise, torch.inf).flatten()
-        best = cost.topk(min(count, int(fit.sum())), largest=False).indices
-        chosen.view(-1)[best] = True
-    return chosen
+def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
+    """The backing behind the front; `tiles` are of cells."""
+    reach = 2 * BACKING_SLOPE_GAP * torch.tensor([tiles.width, tiles.height])
+    gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
+    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
+    return dataclasses.replace(samples, depth=samples.depth * recede, slope=samples.slope * recede[:, None])
+
+
+def _inner(free: Tensor) -> Tensor:
+    """[H, W] bool without the picture's border, beyond which the Gaussians of tiles would reach."""
+    inner = torch.zeros_like(free)
+    inner[1:-1, 1:-1] = free[1:-1, 1:-1]
+    return inner
 
 
 def _cells(image: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
     The virtual camera plays the part of the photo's, and the photo that of the novel view.
 
     Args:
-        prediction: what `lift` makes of a photo: a Gaussian a pixel, the rest of mixed pixels, the backing.
+        prediction: what `lift` makes of a photo without tiles: a Gaussian a pixel, the rest of mixed ones, the backing.
         photo: [H, W, 3] sRGB at the camera's size.
         viewer: the virtual camera.
         renderer: draws the views.
@@ -212,7 +212,7 @@ def _reverse(
     renderer: Renderer,
 ) -> Sample:
     """`reverse_view` from a random frame of a random path."""
-    prediction = lift(rgb, depth, camera)
+    prediction = lift(rgb, depth, camera, levels=0)  # a tile is seen as a whole, and a hole's outline is not a tile's
     kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
     viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]

@@ -1,0 +1,154 @@
+"""Tiles: what they lose, where they may lie, and that nothing of them shows."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scenes import psnr
+from torch import Tensor
+
+from spackle.bases.quadtree import BEND, LEVELS, Quadtree, Tiles
+from spackle.bases.splats import STEEPEST, layered_gaussians
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, extremes
+from spackle.color import srgb_to_linear
+from spackle.render import CpuRenderer
+
+CPU = CpuRenderer()
+
+
+def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A picture with detail in places, a plane with a bump, and some pixels that are not free."""
+    torch.manual_seed(1)
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    picture = (0.3 + 0.01 * x)[..., None] + 0.2 * torch.rand(height, width, 3) * (x + y > 36)[..., None]
+    inverse = 0.4 + 0.001 * x + 0.002 * y
+    inverse[20, 6] *= 1 + 2 * float(BEND)
+    free = torch.ones(height, width, dtype=torch.bool)
+    free[3, 30] = free[26] = False
+    return picture, inverse, torch.tensor([0.001, 0.002]).expand(height, width, 2), free
+
+
+def plain_lost(picture: np.ndarray, top: int, left: int, height: int, width: int, limits: tuple[int, int]) -> float:
+    """Of one tile, see `Quadtree`; rows and columns beyond `limits` are in no whole block."""
+    total = 0.0
+
+    def mean(row: int, column: int) -> np.ndarray:
+        row = min(max(row, 0), limits[0] // height - 1) * height
+        column = min(max(column, 0), limits[1] // width - 1) * width
+        return picture[row : row + height, column : column + width].mean((0, 1))
+
+    for y, x in itertools.product(range(height), range(width)):
+        v, u = (y + 0.5) / height - 0.5, (x + 0.5) / width - 0.5
+        expected = sum(
+            (abs(v) if i else 1 - abs(v))
+            * (abs(u) if j else 1 - abs(u))
+            * mean(top // height + i * (1 if v > 0 else -1), left // width + j * (1 if u > 0 else -1))
+            for i, j in itertools.product((0, 1), repeat=2)
+        )
+        total += float(((picture[top + y, left + x] - expected) ** 2).mean())
+    return total
+
+
+def test_what_blocks_lose_is_what_a_plain_sum_says() -> None:
+    picture, inverse, slope, free = ground()
+    tree = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST)
+    pixels, depth = picture.double().numpy(), inverse.double().numpy()
+    blocked = []
+    for level, lost in enumerate(tree.lost, 1):
+        side, (rows, columns) = 2**level, lost.shape[:2]
+        limits = rows * side, columns * side
+        assert (rows, columns) == (27 // side, 38 // side)
+        for row, column in itertools.product(range(rows), range(columns)):
+            top, left, half = row * side, column * side, side // 2
+            around = np.s_[max(top - side, 0) : top + 2 * side, max(left - side, 0) : left + 2 * side]
+            center = depth[top : top + side, left : left + side].mean()
+            y, x = np.indices(depth.shape)[(slice(None), *around)]
+            plane = center + 0.001 * (x - left - half + 0.5) + 0.002 * (y - top - half + 0.5)
+            if not free.numpy()[around].all() or (abs(depth[around] - plane) > float(BEND) * center).any():
+                assert torch.isinf(lost[row, column]).all()
+                blocked.append(level)
+                continue
+            flat = [plain_lost(pixels, top + i, left, half, side, limits) for i in (0, half)]
+            tall = [plain_lost(pixels, top, left + i, side, half, limits) for i in (0, half)]
+            expected = [plain_lost(pixels, top, left, side, side, limits), sum(flat), sum(tall)]
+            np.testing.assert_allclose(lost[row, column], expected, rtol=1e-3, atol=1e-6)
+    assert set(blocked) == {1, 2, 3}
+    assert any(torch.isfinite(lost).any() for lost in tree.lost)
+
+
+@pytest.mark.parametrize("worth", [1e-6, 1e-3, 0.02, 10.0])
+def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> None:
+    picture, inverse, slope, free = ground()
+    tree = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST)
+    single, tiles = tree.cut(worth)
+    covered = single.long()
+    for part in tiles:
+        for row, column in zip(part.rows.tolist(), part.columns.tolist(), strict=True):
+            inside = np.s_[row * part.height : (row + 1) * part.height, column * part.width : (column + 1) * part.width]
+            covered[inside] += 1
+            assert free[inside].all()
+        assert part.means(inverse) == pytest.approx(
+            [float(inverse[int(y) : int(y) + 1, int(x) : int(x) + 1].mean()) for x, y in part.centers()], abs=0.02
+        )
+    assert (covered == 1).all()
+
+    def best(level: int, row: int, column: int) -> float:
+        if level == 0:
+            return worth
+        below = itertools.product((2 * row, 2 * row + 1), (2 * column, 2 * column + 1))
+        whole, flat, tall = tree.lost[level - 1][row, column].tolist()
+        return min(sum(best(level - 1, *at) for at in below), whole + worth, min(flat, tall) + 2 * worth)
+
+    for row, column in itertools.product(range(27 // 8), range(38 // 8)):
+        inside = np.s_[row * 8 : row * 8 + 8, column * 8 : column * 8 + 8]
+        count = int(single[inside].sum())
+        cost = 0.0
+        for part in tiles:
+            mine = (part.rows * part.height // 8 == row) & (part.columns * part.width // 8 == column)
+            count += int(mine.sum())
+            side = max(part.height, part.width)
+            shape = 0 if part.height == part.width else 1 if part.height < part.width else 2
+            lost = tree.lost[side.bit_length() - 2][..., shape]
+            shares = 1 if shape == 0 else 2  # two halves lose together what is noted for them
+            at = part.rows[mine] * part.height // side, part.columns[mine] * part.width // side
+            cost += float(lost[at].sum()) / shares
+        assert cost + worth * count == pytest.approx(best(3, row, column), rel=1e-3)
+
+
+def test_means_of_tiles_are_those_of_their_pixels() -> None:
+    image = torch.rand(9, 11, 2)
+    tiles = Tiles(2, 4, torch.tensor([0, 3]), torch.tensor([1, 0]))
+    torch.testing.assert_close(
+        tiles.means(image), torch.stack([image[:2, 4:8].mean((0, 1)), image[6:8, :4].mean((0, 1))])
+    )
+    assert tiles.centers().tolist() == [[6.0, 1.0], [2.0, 7.0]]
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.3])
+@pytest.mark.parametrize("rise", [0.0, 0.4])
+def test_no_grid_shows_where_tiles_of_several_sizes_meet(slant: float, rise: float) -> None:
+    height, width = 120, 160
+    y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
+    smooth = (0.3 + rise * x)[..., None].expand(height, width, 3)
+    speck = torch.zeros(height, width, dtype=torch.bool)
+    torch.manual_seed(0)
+    for top, left in torch.randint(8, 110, (12, 2)).tolist():
+        speck[top : top + 2, left : left + 3] = True
+    photo = torch.where(speck[..., None], 0.2 + 0.6 * torch.rand(height, width, 3), smooth)
+    camera = Camera.from_focal(140, width, height)
+    base = layered_gaussians(0.3 + slant * y, srgb_to_linear(photo), camera)
+    assert len(base) < (0.5 if slant else 0.35) * height * width
+    own = CPU.render(base, camera)
+    assert psnr(own.rgb, photo) > 42
+    away = torch.nn.functional.max_pool2d(speck[None, None].float(), 7, 1, 3)[0, 0] == 0
+    assert float((own.rgb - photo).abs().amax(-1)[away].max()) < (1.0 if rise == 0 else 1.5) / 255
+    if rise == 0:
+        for view in extremes(camera, 0.3, DepthRange.of(base)):
+            seen = CPU.render(base, view)
+            inner = torch.nn.functional.max_pool2d((seen.alpha < 0.9)[None, None].float(), 9, 1, 4)[0, 0] == 0
+            off = (seen.rgb - 0.3).abs().amax(-1)[inner]
+            assert float(off.quantile(0.9)) < 0.5 / 255
