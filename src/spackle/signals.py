@@ -26,19 +26,19 @@ def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
 
     A second Ctrl-C ends it at once; not so under torchrun, which passes on what the terminal has sent already.
     """
-    asked = threading.Event()
+    asked: list[int] = []  # no Event: its lock would hold up a second signal that comes while it is set, for ever
     if threading.current_thread() is not threading.main_thread():  # signals are not for this one
-        yield asked.is_set
+        yield lambda: False
         return
 
     def note(number: int, frame: object) -> None:
-        asked.set()
+        asked.append(number)
         if alone:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield asked.is_set
+        yield lambda: bool(asked)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

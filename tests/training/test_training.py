@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import json
 import math
+import os
 import resource
 import shutil
 import signal
@@ -163,6 +164,39 @@ def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, whole: tupl
     assert train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite").code == 0
     assert state(out).progress.step == 1
     assert names_in(out / "pictures") == {"0000001.png"}
+    assert not (out / "checkpoint.previous.pt").exists()
+
+
+def test_an_old_run_stays_until_the_one_that_overwrites_it_is_whole(
+    place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def content() -> dict[str, bytes]:
+        files = (path for path in out.rglob("[!.]*") if path.is_file() and ".new" not in path.parts)
+        return {str(path): path.read_bytes() for path in files}
+
+    out = shutil.copytree(whole[0], tmp_path / "out")
+    before, words = content(), ("optim.lr=2e-3", "run.save_every=2", "--overwrite")
+    process = started(arguments(place, out, *words), killed_at(4))
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert content() == before
+    with monkeypatch.context() as patch:  # moved in part, the checkpoint last
+
+        def killed(old: str | os.PathLike[str], new: str | os.PathLike[str]) -> None:
+            if Path(new) == out / "checkpoint.pt":
+                raise KeyboardInterrupt
+            os.rename(old, new)
+
+        patch.setattr("spackle.training.checkpoint.os.replace", killed)
+        assert train(place, out, *words).code == 130
+    assert names_in(out / ".new") == {"checkpoint.pt"}
+    done = train(place, out, *words)
+    assert (done.code, "going on from step 6" in done.err) == (0, True), done.err
+    train(place, tmp_path / "new", *words[:-1])
+    assert_same_weights(out, tmp_path / "new")
+    assert names_in(out) == names_in(tmp_path / "new") - {"checkpoint.previous.pt"}
+    for name in ("best.safetensors", "last.safetensors"):
+        assert (out / name).read_bytes() == (tmp_path / "new" / name).read_bytes()
 
 
 def test_a_run_without_improvement_ends_and_needs_no_tensorboard(

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -105,11 +106,20 @@ def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, diges
     raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
 
 
-def remove_run(folder: Path) -> None:
-    """Delete what an earlier run left, but not its samples."""
-    for name in (NEWEST, PREVIOUS, BEST, LAST, RUN):
-        (folder / name).unlink(missing_ok=True)
-    for name in (PICTURES, LOGS, BAD):
-        for path in sorted((folder / name).glob("*")):
-            if path.is_file():
-                path.unlink()
+def holds_run(folder: Path) -> bool:
+    """Whether a run left something in a folder that another one would replace."""
+    return any((folder / name).exists() for name in (NEWEST, PREVIOUS, BEST, LAST, RUN))
+
+
+def replace_run(folder: Path, new: Path) -> None:
+    """Move a run that has ended from `new` to where an older one was, but not the samples.
+
+    Where it is killed, the checkpoint is still in `new`, and a second call does the rest.
+    """
+    for name in (RUN, PREVIOUS, BAD, LOGS, PICTURES, BEST, LAST, NEWEST):
+        old, own = folder / name, new / name
+        if name in (PREVIOUS, BAD) or own.exists():  # else it was moved before
+            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+        if own.exists():
+            os.replace(own, old)
+    shutil.rmtree(new)

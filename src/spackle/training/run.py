@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from torch import Tensor
 from spackle.device import pick_device
 from spackle.errors import InputError, reason_in_a_line
 from spackle.machine import hardware, versions, without_nan
-from spackle.output_folder import results_folder, write_report
+from spackle.output_folder import NEW, results_folder, write_report
 from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 from spackle.training.checkpoint import (
@@ -29,8 +30,9 @@ from spackle.training.checkpoint import (
     Checkpoint,
     Progress,
     check_same_run,
+    holds_run,
     load_checkpoint,
-    remove_run,
+    replace_run,
 )
 from spackle.training.direct_ft import plan_direct_ft
 from spackle.training.method import Plan, RunContext, Start
@@ -87,7 +89,8 @@ def train(
         make_plan: refuses at once what cannot be used, and does no long work yet.
         output: a folder for all results.
         reporter: the first process speaks through it.
-        overwrite: start anew where `output` holds a run; the samples in it stay.
+        overwrite: start anew where `output` holds a run; the samples in it stay, and so does the old run until the new
+            one, in `output`/.new, has ended.
 
     Returns:
         Why the run ended: "steps", "patience" or "stopped", as `Trainer.run` has it.
@@ -106,17 +109,27 @@ def train(
             reporter = Reporter(console=Console(quiet=True))
         context = RunContext(recipe, output, reporter, ranks, device)
         plan = make_plan(context)
-        found, problem = (None, None) if overwrite else load_checkpoint(output)
+        place = output / NEW if overwrite and holds_run(output) else output
+        found, problem = None, None
+        try:
+            found, problem = load_checkpoint(place)
+            if found:
+                check_same_run(found, plan.method, recipe, plan.digest, output)
+        except InputError:
+            if place == output:
+                raise
+            found = None  # begun by another recipe, or damaged
         if found:
-            check_same_run(found, plan.method, recipe, plan.digest, output)
             if problem:
                 reporter.log(f"{problem}: going on from the one before it")
-            reporter.log(f"{output}: going on from step {found.progress.step}")
+            reporter.log(f"{place}: going on from step {found.progress.step}")
         start = plan.start()
         ranks.wait()  # nobody looks for checkpoints any more
-        if overwrite and ranks.first:
-            remove_run(output)
-        return _run(context, start, found)
+        if place != output and ranks.first:
+            if found is None:
+                shutil.rmtree(place, ignore_errors=True)
+            place.mkdir(exist_ok=True)
+        return _run(context, place, start, found)
 
 
 class Logs:
@@ -151,14 +164,17 @@ class Logs:
         self.write("close")
 
 
-def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) -> str:
-    """The training loop with everything that it talks to: bars, logs, signals and run.json."""
+def _run(context: RunContext[Any], place: Path, start: Start, checkpoint: Checkpoint | None) -> str:
+    """The training loop with everything that it talks to: bars, logs, signals and run.json.
+
+    It writes to `place`, which takes the place of the older run in the output at the end, if it is not that itself.
+    """
     recipe, ranks, log, output = context.recipe, context.ranks, context.reporter.log, context.output
     method, first = start.method, checkpoint.progress.step if checkpoint else 0
     logs = Logs()
     if ranks.first:
         try:
-            logs = Logs(output / LOGS, first)
+            logs = Logs(place / LOGS, first)
         except ImportError:
             log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
     facts = {
@@ -173,7 +189,7 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
     }
 
     def write(progress: Progress, ended: str | None = None) -> None:
-        write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), output / RUN)
+        write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), place / RUN)
 
     def stepped(step: int, numbers: Mapping[str, float]) -> None:
         logs.numbers("train", numbers, step)
@@ -193,11 +209,14 @@ def _run(context: RunContext[Any], start: Start, checkpoint: Checkpoint | None) 
         asked_to_stop(alone=ranks.count == 1) as stop,
     ):
         callbacks = Callbacks(stepped, validated, write, stop)
-        trainer = Trainer(recipe, method, start.network, context.device, output, callbacks, ranks, start.optimizer)
+        trainer = Trainer(recipe, method, start.network, context.device, place, callbacks, ranks, start.optimizer)
         if checkpoint:
             trainer.resume(checkpoint)
         why = trainer.run()
     if ranks.first:
         write(trainer.progress, why)
-        log(f"{_END[why]}, step {trainer.progress.step} -> {output}")
+        if place != output and why != "stopped":
+            replace_run(output, place)
+            place = output
+        log(f"{_END[why]}, step {trainer.progress.step} -> {place}")
     return why

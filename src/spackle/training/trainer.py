@@ -232,8 +232,8 @@ class Trainer:
         """Write a checkpoint and the averaged weights; the first process alone does."""
         if not self.ranks.first or self.on_disk == self.progress.step:
             return
-        save_checkpoint(self.checkpoint(), self.folder)
         self.method.export(self.average, self.folder / LAST)
+        save_checkpoint(self.checkpoint(), self.folder)  # at the end: a run that is killed before it exports again
         self.on_disk = self.progress.step
         self.callbacks.saved(self.progress)
 
