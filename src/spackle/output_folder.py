@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -61,6 +62,23 @@ def _alone_in(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise InputError(f"{folder / LOCK}: cannot write: {error.strerror or error}") from error
         yield
+
+
+def mark(folder: Path) -> str:
+    """Mark a folder that the caller is `alone` in, until then; `check_mark` knows it again on another machine."""
+    word = secrets.token_hex(8)
+    (folder / LOCK).write_text(word)
+    return word
+
+
+def check_mark(folder: Path, word: str) -> None:
+    """InputError where `folder` is not the one that was given this mark."""
+    try:
+        if (folder / LOCK).read_text() == word:
+            return
+    except (OSError, ValueError):
+        pass
+    raise InputError(f"{folder}: not this command's folder for results: it must lie on a disk that all nodes share")
 
 
 @contextlib.contextmanager

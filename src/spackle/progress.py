@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import sys
 import time
@@ -140,3 +141,17 @@ class Reporter:
     def _bars(self, *columns: ProgressColumn) -> Progress:
         description = TextColumn("{task.description:<12}")
         return Progress(description, BarColumn(), *columns, TimeRemainingColumn(), console=self.console, transient=True)
+
+
+class Notes(Reporter):
+    """Keeps what is said, in a process for which another one speaks."""
+
+    def __init__(self, verbose: bool = False) -> None:
+        super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
+        self.said: list[str | Mapping[str, object]] = []
+
+    def result(self, values: Mapping[str, object]) -> None:
+        self.said.append(values)
+
+    def log(self, line: str) -> None:
+        self.said.append(line)

@@ -1,17 +1,14 @@
-"""`spackle predict`: photos to scenes, videos and reports. Read `predict_all`, then `predict_one`."""
+"""A photo to a scene, a video and a report. Read `predict_one`."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import json
-import os
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import spackle
-from spackle.app.clip import check_clip_options, predict_clip
 from spackle.app.complete import (
     CompletedPhoto,
     PhotoCompleter,
@@ -23,14 +20,18 @@ from spackle.app.complete import (
 )
 from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
-from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseError, BaseSettings, OpenedBase
+from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseSettings, OpenedBase
 from spackle.digest import digest_of, fingerprint
 from spackle.downloads import installed
 from spackle.errors import InputError
 from spackle.formats import save_ply
-from spackle.formats.clip import is_clip
-from spackle.image import PHOTO_SUFFIXES, load_photo
-from spackle.output_folder import as_recorded, file_records, results_folder, whole_set, write_report
+from spackle.image import load_photo
+from spackle.output_folder import (
+    file_records,
+    results_folder,
+    whole_set,
+    write_report,
+)
 from spackle.progress import Reporter
 from spackle.scene import Mode, ResidualChoice
 
@@ -51,6 +52,9 @@ class PredictOptions:
     fov: float | None = None
     overwrite: bool = False  # in a folder, do again what is done already
     keep_frame: bool = False  # a uniform frame around a photo is part of it
+    workers: int = 1  # processes that share a folder's photos
+    threads: int | None = None  # of each
+    ray: str | None = None  # the cluster where they are; this machine where None
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -62,43 +66,6 @@ class PredictOptions:
     def lens(self) -> dict[str, float | None]:
         """What a person said of the lens, as `load_photo` takes it."""
         return {"focal_px": self.focal_px, "focal_mm": self.focal_mm, "fov": self.fov}
-
-
-def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
-    """Work through a photo, a clip or a folder of photos; returns the number of photos that failed.
-
-    InputError for an option, a clip or a single photo that cannot be used.
-    """
-    found = find_photos(photos)
-    if is_clip(photos):
-        check_clip_options(options.base, options.path, options.mode, options.render)
-    completer = open_completer(options)
-    if is_clip(photos):
-        with results_folder(output):
-            predict_clip(photos, output / found[0][1], completer, options.lens, reporter)
-        return 0
-    shared = shared_digest(options, completer.base)
-    failed = 0
-    with results_folder(output, alone=os.path.isdir(photos)):
-        for path, name in found:
-            try:
-                request = request_of(path, options.base.depth, shared)
-                earlier = _earlier(output / name)
-                done = earlier.get("request") == request and as_recorded(output / name, REPORT, earlier.get("files"))
-                if done and path != photos and not options.overwrite:
-                    reporter.log(f"{path.name}: done already (--overwrite does it again)")
-                    reporter.result({"folder": output / name, "done_already": True})
-                    continue
-                predict_one(path, output / name, options, completer, reporter, request)
-            except InputError as error:
-                if path == photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
-                    raise
-                failed += 1
-                reporter.log(f"error: {error}")
-                reporter.result({"folder": output / name, "error": str(error)})
-    if failed:
-        reporter.log(f"{failed} of {len(found)} photos failed")
-    return failed
 
 
 def predict_one(
@@ -173,10 +140,16 @@ def shared_digest(options: PredictOptions, base: OpenedBase) -> str:
     for name in ("name", "windows", "compiled"):  # recorded as `base`, or change last bits alone
         del fields[name]
     choices = {name: value for name, value in fields.items() if not isinstance(value, Path)}
-    files = {"calibration": settings.calib, "camera file": path.cameras, "path file": path.path}
+    prints = {kind: fingerprint(file, kind) for kind, file in shared_files(options).items()}
+    return digest_of([choices | own, base.fingerprints, prints])
+
+
+def shared_files(options: PredictOptions) -> dict[str, Path]:
+    """The files that all photos share besides the base's, by what they are."""
+    path, residual = options.path, options.residual
+    files = {"calibration": options.base.calib, "camera file": path.cameras, "path file": path.path}
     files |= {"weights": residual.file, "LaMa": installed("lama") if residual.fill == "lama" else None}
-    prints = [file and fingerprint(file, kind) for kind, file in files.items()]
-    return digest_of([choices | own, base.fingerprints, *prints])
+    return {kind: file for kind, file in files.items() if file is not None}
 
 
 def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
@@ -187,24 +160,6 @@ def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
         files.append(fingerprint(depth, "depth map"))
         files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
     return digest_of([shared, *files])
-
-
-def find_photos(path: Path) -> list[tuple[Path, str]]:
-    """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
-    if not os.path.isdir(path):
-        return [(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
-    try:
-        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
-        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
-    if not photos:
-        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
-    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
-    stems = Counter(photo.stem.casefold() for photo in photos)
-    names = {photo.name.casefold() for photo in photos}
-    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
-    return [(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
 
 
 def make_report(
@@ -250,7 +205,7 @@ def make_report(
 
 def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
     """Warn before rougher results replace those of a network whose weights are damaged or gone."""
-    before, now = _earlier(folder).get("base"), done.choice.base
+    before, now = earlier_report(folder).get("base"), done.choice.base
     better = before.get("name") if isinstance(before, dict) else None
     if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
         file = base.files.get("checkpoint" if better == "sharp" else "depth weights")
@@ -260,7 +215,7 @@ def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, rep
         )
 
 
-def _earlier(folder: Path) -> dict[str, Any]:
+def earlier_report(folder: Path) -> dict[str, Any]:
     """An earlier run's report; empty without a whole one."""
     try:
         report = json.loads((folder / REPORT).read_text(encoding="utf-8"))

@@ -87,6 +87,23 @@ def predict(
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
     keep_frame: KeepFrameOption = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="In a folder: do again what is done already.")] = False,
+    workers: Annotated[
+        int,
+        typer.Option(
+            hidden=True, help="In a folder: photos at once, each in a process that holds the base's network itself."
+        ),
+    ] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            hidden=True,
+            help="Threads of each worker; networks' last bits depend on them.",
+            show_default="the cores, shared evenly; with --ray 2",
+        ),
+    ] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", hidden=True, help="Workers on a Ray cluster, as `dataset build`.")
+    ] = None,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
@@ -94,14 +111,16 @@ def predict(
 
     A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
-    from spackle.app.predict import PredictOptions, predict_all
+    from spackle.app.predict import PredictOptions
+    from spackle.app.predict_all import predict_all
     from spackle.bases.open import BaseSettings
     from spackle.progress import Reporter
     from spackle.scene import ResidualChoice
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
     choice = ResidualChoice(residual, fill, mode)
-    options = PredictOptions(settings, choice, path, render, mode, focal_px, focal_mm, fov, overwrite, keep_frame)
+    lens, many = (focal_px, focal_mm, fov), (workers, threads, ray)
+    options = PredictOptions(settings, choice, path, render, mode, *lens, overwrite, keep_frame, *many)
     if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

@@ -1,0 +1,132 @@
+"""`spackle predict FOLDER --workers N`, here and on Ray: the same files as one by one, whoever dies."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import dataset_builds  # noqa: F401  # sets what a cluster wants
+import pytest
+from clips import moving, write_clip
+from command import SHORT, Run, names_in, predicted, refuses, report_of, run
+from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
+
+from spackle.app.predict_all import Predictor
+from spackle.errors import InputError
+from spackle.output_folder import check_mark, mark, results_folder
+
+FILES = {"base.ply", "scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three photos and their depth, of which one is no photo; what they become one by one."""
+    folder = tmp_path_factory.mktemp("many")
+    for index, name in enumerate("abc"):
+        size = WIDTH + 8 * index, HEIGHT
+        write_photo(folder / "photos" / f"{name}.png", *size)
+        write_depth(folder / "depth" / f"{name}.npy", metres(*size))
+    (folder / "photos" / "b.png").write_text("not a photo")
+    assert predict(folder, folder / "alone").code == 1
+    return folder
+
+
+def predict(place: Path, out: Path, *options: object) -> Run:
+    given = (place / "photos", "--depth", place / "depth", "-o", out, "--threads", 1, "--format", "gif", "--json")
+    return run("predict", *given, *SHORT, *options)
+
+
+def content(out: Path) -> Iterator[Any]:
+    """All files; of a report all but its times, which are in `files`, too."""
+    for folder in sorted(out.iterdir()):
+        assert names_in(folder) == FILES
+        report = report_of(folder)
+        assert report.pop("seconds")["total"] > 0
+        yield folder.name, report, *((folder / name).read_bytes() for name in sorted(FILES - {"report.json"}))
+
+
+def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = predict(place, out, "--workers", 2)
+    assert (done.code, done.lines[-1]) == (1, "1 of 3 photos failed"), done.err
+    assert list(content(out)) == list(content(place / "alone"))
+    results = [json.loads(line) for line in done.out.splitlines()]
+    assert {Path(result["folder"]).name: "b.png" in result.get("error", "") for result in results} == {
+        "a": False,
+        "b": True,
+        "c": False,
+    }
+    # Of each photo all lines, then how far all are.
+    order = [line.split()[4][:-5] for line in done.lines if line.startswith("photos: ")]
+    assert [Path(result["folder"]).name for result in results] == order
+    about = [[f"{name}.png" in line for line in done.lines].index(True) for name in order]
+    assert about == [0, *(i + 1 for i, line in enumerate(done.lines[:-2]) if line.startswith("photos: "))]
+    (out / "c" / "report.json").unlink()
+    times = {name: (out / name / "base.ply").stat().st_mtime_ns for name in "ac"}
+    again = predict(place, out, "--workers", 2)
+    assert [line for line in again.lines if "done already" in line] == [
+        "a.png: done already (--overwrite does it again)"
+    ]
+    assert [(out / name / "base.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [False, True]
+    assert list(content(out)) == list(content(place / "alone"))
+
+
+def test_a_worker_that_is_killed_is_a_line_and_the_same_command_goes_on(place: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def kill() -> None:
+        deadline = time.monotonic() + 240
+        while not list(out.glob("*/.new")) and time.monotonic() < deadline:
+            time.sleep(0.002)
+        multiprocessing.active_children()[0].kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    done = predict(place, out, "--workers", 2)
+    killer.join()
+    assert done.code == 2
+    assert "a worker process died" in done.lines[-1]
+    assert ".lock" not in names_in(out)
+    assert predict(place, out, "--workers", 2).code == 1
+    assert list(content(out)) == list(content(place / "alone"))
+
+
+def test_a_single_photo_needs_no_workers_and_a_clip_takes_none(
+    tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run]
+) -> None:
+    for option in ("--workers", "--threads"):
+        refuses(run("predict", pair[0], "-o", tmp_path / "out", option, 0), option, "between 1 and")
+    for words in (("--workers", 2), ("--ray", "auto")):
+        clip = write_clip(tmp_path / "clip.mp4", moving())
+        refuses(run("predict", clip, "-o", tmp_path / "out", *words), f"{words[0]} {words[1]}: not for a clip")
+    assert not (tmp_path / "out").exists()
+    predicted(*pair, tmp_path / "out", "--workers", 4)
+    assert (tmp_path / "out" / "photo" / "scene.ply").read_bytes() == (plain[0] / "scene.ply").read_bytes()
+
+
+def test_workers_on_ray_give_the_same_files_where_all_nodes_see_them(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray")
+    ray = ("--ray", "local", "--workers", 2)
+    done = predict(place, tmp_path / "out", *ray)
+    assert (done.code, done.lines[-1]) == (1, "1 of 3 photos failed"), done.err
+    assert list(content(tmp_path / "out")) == list(content(place / "alone"))
+    monkeypatch.setattr(Predictor, "setup", {"spackle": "0.0"})  # in this process alone
+    elsewhere = predict(place, tmp_path / "elsewhere", *ray)
+    assert elsewhere.code == 2
+    assert "would give other results" in elsewhere.lines[-1]
+
+
+def test_a_folder_for_results_that_a_node_does_not_see_is_a_line(tmp_path: Path) -> None:
+    with results_folder(tmp_path / "out", alone=True):
+        word = mark(tmp_path / "out")
+        check_mark(tmp_path / "out", word)
+        for folder, given in ((tmp_path / "out", "another"), (tmp_path / "elsewhere", word)):
+            with pytest.raises(InputError, match=f"{folder}: .* on a disk that all nodes share"):
+                check_mark(folder, given)
