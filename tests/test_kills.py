@@ -1,0 +1,104 @@
+"""Commands that are killed ten times at random moments and resumed give what an uninterrupted run gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from dataset_builds import SHORT, write_inputs
+from evaluation_data import write_boxes
+from photos import write_depth, write_photo
+from training_runs import assert_same_weights
+
+Words = list[object]
+TIMES = {"seconds", "total"}
+
+
+def predict(place: Path) -> Words:
+    for name in "abcd":
+        write_photo(place / "photos" / f"{name}.png")
+    return ["predict", place / "photos", "--depth", write_depth(place / "depth.npy"), "--frames", 20, "-o"]
+
+
+def dataset(place: Path) -> Words:
+    write_inputs(place, 6)
+    return ["dataset", "build", "--photos", place / "photos", "--depth", place / "depth", *SHORT, "-o"]
+
+
+def evaluate(place: Path) -> Words:
+    for seed in range(4):
+        write_boxes(place / "scenes" / str(seed), seed)
+    return ["evaluate", place / "scenes", "--dataset", "middlebury", "--base", "rgbd", "-o"]
+
+
+def train(place: Path) -> Words:
+    write_photo(place / "photos" / "a.png", 128, 96)
+    (place / "recipe.yaml").write_text("run: {device: cpu}\n")
+    data = [f"data.photos={place / 'photos'}", "data.views=6", "data.validation_views=2", "data.cells=16"]
+    steps = ["optim.steps=30", "optim.batch=2", "run.save_every=2", "run.validate_every=10", "loss.features=none"]
+    return ["train", "--recipe", place / "recipe.yaml", "data.crops=1", *data, *steps, "-o"]
+
+
+def same_files(one: Path, other: Path) -> None:
+    """All files are equal, but for the times in them."""
+
+    def timeless(content: Any) -> Any:
+        if isinstance(content, dict):
+            return {name: timeless(value) for name, value in content.items() if name not in TIMES}
+        return content
+
+    def files(folder: Path) -> dict[str, Any]:
+        found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+        return {
+            name: timeless(json.loads(path.read_text())) if path.suffix == ".json" else path.read_bytes()
+            for name, path in found.items()
+        }
+
+    mine, yours = files(one), files(other)
+    assert mine.keys() == yours.keys()
+    assert [name for name in mine if mine[name] != yours[name]] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "same"),
+    [(predict, same_files), (dataset, same_files), (evaluate, same_files), (train, assert_same_weights)],
+)
+def test_ten_kills_change_nothing(
+    tmp_path: Path, command: Callable[[Path], Words], same: Callable[[Path, Path], None]
+) -> None:
+    whole, killed, rng, kills = tmp_path / "whole", tmp_path / "killed", random.Random(0), 0
+    words = [sys.executable, "-m", "spackle", *map(str, command(tmp_path))]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # sums in one order
+
+    def started(folder: Path) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([*words, folder], env=environment, stderr=subprocess.DEVNULL)
+
+    start = time.monotonic()
+    assert started(whole).wait() == 0
+    lasts = time.monotonic() - start
+    while kills < 10:
+        process = started(killed)
+        try:
+            ended = process.wait(rng.uniform(0.4, 1) * lasts)  # what is before is imports
+        except subprocess.TimeoutExpired:
+            process.kill()
+            ended = process.wait()
+        if ended == 0:  # done: once more, from the start
+            same(whole, killed)
+            shutil.rmtree(killed)
+        else:
+            assert ended == -signal.SIGKILL
+            kills += 1
+    assert started(killed).wait() == 0
+    same(whole, killed)
