@@ -15,7 +15,6 @@ from torch import Tensor
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
-from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
@@ -33,7 +32,7 @@ class Scene:
     def depth_map(self) -> DepthMap:
         return DepthMap(self.depth, self.depth > 0, None, None, "depth", Path("synthetic.npy"))
 
-    def lift(self, levels: int = LEVELS) -> BasePrediction:
+    def lift(self, levels: int = 0) -> BasePrediction:
         return lift(self.rgb, self.depth_map, self.camera, levels)
 
     def base(self) -> Gaussians:

@@ -49,7 +49,7 @@ def map_of(inverse: Tensor, known: Tensor | None = None) -> DepthMap:
 
 def front(scene: Scene, depth: DepthMap) -> Tensor:
     """[H, W] the inverse depths that a scene's photo is lifted with."""
-    means = lift(scene.rgb, depth, scene.camera).gaussians.means
+    means = lift(scene.rgb, depth, scene.camera, levels=0).gaussians.means
     return 1 / means[: scene.camera.height * scene.camera.width, 2].reshape(scene.camera.height, scene.camera.width)
 
 
@@ -266,7 +266,7 @@ def test_what_is_no_depth_is_filled_and_never_lifted_and_a_map_without_any_refus
     for place, value in enumerate((math.nan, math.inf, 0.0, -1.0)):
         depth[10, 10 + 4 * place] = value
     every = torch.ones(36, 48, dtype=torch.bool)
-    found = lift(scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera)
+    found = lift(scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera, levels=0)
     assert bool(torch.isfinite(found.gaussians.means).all())
     assert found.notes["depth_filled"] == round(4 / (36 * 48), 4)
     with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):

@@ -91,7 +91,7 @@ def test_one_gaussian_for_each_pixel_then_the_rest_of_mixed_ones_then_one_behind
 
 @pytest.mark.parametrize("scene", [wall(), box_before_wall(), slanted_plane(1.5, 6, 0), slanted_plane(1.5, 6, 1)])
 def test_from_the_photos_eye_the_photo_is_whole_and_its_depth_right(scene: Scene) -> None:
-    view = CPU.render(scene.base(), scene.camera)
+    view = CPU.render(scene.lift(LEVELS).gaussians, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     assert psnr(view.rgb, scene.rgb) > 29
     error = (view.depth / scene.depth - 1).abs()
@@ -102,7 +102,7 @@ def test_from_the_photos_eye_the_photo_is_whole_and_its_depth_right(scene: Scene
 def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
     scene = wall(4.0, *size)
     assert len(scene.lift(levels=0).gaussians) == size[0] * size[1] + (size[0] // 2) * (size[1] // 2)
-    base = scene.base()
+    base = scene.lift(LEVELS).gaussians
     view = CPU.render(base, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     if min(size) > 1:  # else there is no backing
@@ -191,7 +191,7 @@ def test_the_lens_is_the_calibrations_where_there_is_one_and_else_the_photos() -
 def test_what_a_box_uncovers_is_a_hole_and_what_was_seen_is_none(disparity: float, side: int) -> None:
     near, far = 2.0, 6.0
     scene = box_before_wall(near, far)
-    base = scene.base()
+    base = scene.lift(LEVELS).gaussians
     camera = extremes(scene.camera, disparity, DepthRange.of(scene.lift(levels=0).gaussians))[side]
     box = box_mask(96, 72)
 
@@ -217,7 +217,7 @@ def test_what_a_box_uncovers_is_a_hole_and_what_was_seen_is_none(disparity: floa
 def test_slanted_ground_has_no_pinholes(axis: int, kind: str) -> None:
     """A floor (axis 0) and a side wall (axis 1) that run from 1.5 m to 6 m, at disparity 0.5."""
     scene = slanted_plane(1.5, 6, axis)
-    base = scene.base()
+    base = scene.lift(LEVELS).gaussians
     for camera in trajectory(kind, scene.camera, 0.5, DepthRange.of(base), frames=9):  # type: ignore[arg-type]
         interior = in_frame(scene.camera, on_plane(scene, camera), margin=8) & (on_plane(scene, camera)[..., 2] > 0)
         view = CPU.render(base, camera)

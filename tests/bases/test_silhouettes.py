@@ -174,7 +174,7 @@ def test_a_mixed_pixel_is_taken_apart_and_put_together_again() -> None:
     near, far = srgb_to_linear(torch.tensor([[0.1, 0.1, 0.4], [0.8, 0.9, 0.5]])).numpy()
     assert np.abs(found.color[0, 30:42, 32] - near).max() < 0.05
     assert np.abs(found.color[1, 30:42, 32] - far).max() < 0.05
-    base = scene.base()
+    base = scene.lift(LEVELS).gaussians
     assert psnr(CPU.render(base, scene.camera).rgb, scene.rgb) > 32
     for view in extremes(scene.camera, 0.3, DepthRange.of(base)):
         seen = CPU.render(base, view)

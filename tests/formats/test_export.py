@@ -337,7 +337,7 @@ def test_too_large_a_scene_is_told_and_an_older_file_stays(
     output = scene.with_suffix(f".{suffix}".replace("gltf", "glb"))
     output.write_bytes(b"older")
     monkeypatch.setattr(f"spackle.formats.{suffix}.{limit}", value)
-    with pytest.raises(InputError, match=rf"{output.name}: 3,839 Gaussians are too many"):
+    with pytest.raises(InputError, match=rf"{output.name}: [0-9,]+ Gaussians are too many"):
         export_scene(scene, [output], told()[0])
     assert output.read_bytes() == b"older"
     assert len(list(scene.parent.iterdir())) == 2
