@@ -32,7 +32,7 @@ PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 WIDEST = 8  # views of a path whose own content stays in front from the first
 PAINTED_VIEWS = 2  # of a scene for which an inpainter paints: the widest ones
-FLAT = 0.005  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
+FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 
 
