@@ -33,7 +33,7 @@ SHOWN = 0.02  # of a difference in the backing is lost
 LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 MOST = 1.5  # Gaussians a pixel
 FITS = 2  # corrections of the colours
-UNTOUCHED = 1  # rings beside a step whose colours stay: corrected ones show from beside
+UNTOUCHED = 1  # rings beside a step whose colours stay, as the border's do: corrected ones show from beside
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
@@ -64,7 +64,7 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
         samples = _Samples.cat(parts)
         if len(samples.uv) <= MOST * single.numel():
             break
-    settled = single & ((ring == 0) | (ring > UNTOUCHED))
+    settled = single & _inner((ring == 0) | (ring > UNTOUCHED))
     fitted = _fitted(samples, colors, single, settled[single], tiles)
     return surface_gaussians(camera, *(getattr(fitted, f.name) for f in dataclasses.fields(fitted)))
 
