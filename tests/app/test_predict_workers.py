@@ -96,12 +96,12 @@ def test_a_worker_that_is_killed_is_a_line_and_the_same_command_goes_on(place: P
     assert list(content(out)) == list(content(place / "alone"))
 
 
-def test_a_single_photo_needs_no_workers_and_a_clip_takes_none(
+def test_a_single_photo_needs_no_workers_and_a_clip_takes_none_nor_texture(
     tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run]
 ) -> None:
     for option in ("--workers", "--threads"):
         refuses(run("predict", pair[0], "-o", tmp_path / "out", option, 0), option, "between 1 and")
-    for words in (("--workers", 2), ("--ray", "auto")):
+    for words in (("--workers", 2), ("--ray", "auto"), ("--fill", "lama"), ("--mode", "view")):
         clip = write_clip(tmp_path / "clip.mp4", moving())
         refuses(run("predict", clip, "-o", tmp_path / "out", *words), f"{words[0]} {words[1]}: not for a clip")
     assert not (tmp_path / "out").exists()

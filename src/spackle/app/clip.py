@@ -41,7 +41,7 @@ from spackle.residual.temporal import (
     sample,
     track,
 )
-from spackle.scene import Mode
+from spackle.scene import ResidualChoice
 
 FILES = ("video.mp4", "report.json")
 # Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
@@ -49,7 +49,7 @@ NAME = "{:06d}"
 FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
 
 
-def check_clip_options(base: BaseSettings, path: PathOptions, mode: Mode, render: bool) -> None:
+def check_clip_options(base: BaseSettings, path: PathOptions, residual: ResidualChoice, render: bool) -> None:
     """InputError for an option that a clip has no use for."""
     for option, file in (("--cameras", path.cameras), ("--path", path.path)):
         if file is not None:
@@ -57,8 +57,10 @@ def check_clip_options(base: BaseSettings, path: PathOptions, mode: Mode, render
                 f"{option} {file}: not for a clip: its camera follows a trajectory, once through the clip; "
                 "leave the option out"
             )
-    if mode != "scene":
-        raise InputError(f"--mode {mode}: not for a clip: each of its frames is one view; leave it out")
+    if residual.mode != "scene":
+        raise InputError(f"--mode {residual.mode}: not for a clip: each of its frames is one view; leave it out")
+    if residual.wanted in ("exemplar", "lama"):
+        raise InputError(f"--fill {residual.wanted}: not for a clip: its texture would flicker; leave it out")
     if not render:
         raise InputError("--no-render: not for a clip: its video is all that there is to write; leave it out")
     if base.depth is not None and not (isinstance(base.depth, Path) and base.depth.is_dir()):

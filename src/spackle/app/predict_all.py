@@ -52,10 +52,12 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     found = find_photos(photos)
     workers = workers_for(options, len(found))
     if is_clip(photos):
-        check_clip_options(options.base, options.path, options.mode, options.render)
+        check_clip_options(options.base, options.path, options.residual, options.render)
         for option, value in (("--workers", options.workers if options.workers > 1 else None), ("--ray", options.ray)):
             if value is not None:
                 raise InputError(f"{option} {value}: not for a clip: each frame needs the one before; leave it out")
+        if options.residual.wanted == "auto":  # and no inpainter is opened
+            options = dataclasses.replace(options, residual=dataclasses.replace(options.residual, wanted="network"))
     completer = open_completer(options)
     if is_clip(photos):
         with results_folder(output):
