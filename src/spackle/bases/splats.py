@@ -33,7 +33,7 @@ SHOWN = 0.02  # of a difference in the backing is lost
 LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 MOST = 1.5  # Gaussians a pixel
 FITS = 2  # corrections of the colours
-UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: corrected ones draw a ghost of the outline from beside
+UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: corrected ones show as ghosts from beside
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
