@@ -90,12 +90,12 @@ def whole_set(folder: Path, last: str) -> Iterator[Path]:
     """
     new = folder / NEW
     try:
-        if os.path.lexists(new):  # of a killed run
-            shutil.rmtree(new)
-        new.mkdir()
-    except OSError as error:
-        raise InputError(f"{new}: cannot write: {error.strerror or error}") from error
-    try:
+        try:
+            if os.path.lexists(new):  # of a killed run
+                shutil.rmtree(new)
+            new.mkdir()
+        except OSError as error:
+            raise InputError(f"{new}: cannot write: {error.strerror or error}") from error
         yield new
         (folder / last).unlink(missing_ok=True)
         files = [file.relative_to(new) for file in sorted(new.rglob("*")) if file.is_file()]

@@ -32,6 +32,7 @@ from spackle.bases import hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import DepthModel, HfBase
 from spackle.bases.hf_models import FARTHEST_M, Window, meaning_of, to_depth_map
+from spackle.bases.lift import lift
 from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.protocol import NEAREST_M
 from spackle.color import srgb_to_linear
@@ -168,6 +169,13 @@ def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
 # What comes out.
 
 
+@pytest.fixture
+def pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each pixel has a Gaussian of its own."""
+    monkeypatch.setattr(hf, "lift", functools.partial(lift, levels=0))
+
+
+@pytest.mark.usefixtures("pixels")
 @pytest.mark.parametrize("name", MODELS)
 def test_each_kind_of_model_gives_gaussians_with_the_photos_colours(name: str, folders: dict[str, Path]) -> None:
     photo, base = photo_of(), load(folders[name])
@@ -378,6 +386,7 @@ def test_an_output_that_is_no_depth_is_one_line_with_photo_and_model(depth: Tens
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("pixels")
 def test_a_few_bad_pixels_are_filled_and_counted(maps: list[DepthMap]) -> None:
     broken = SLOPE.clone()
     broken[0, 10, 20:24] = torch.tensor([math.nan, math.inf, 0.0, -1.0])

@@ -28,6 +28,7 @@ DELTA_CHANNELS = GEOMETRY_CHANNELS + TEXTURE_CHANNELS
 
 # A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain.
 INVERSE_DEPTH_GAIN = 0.1  # in units of the view's median inverse depth
+LEAST_DEPTH = 1e-4  # and least inverse depth, so that no delta makes a distance infinite
 QUAT_GAIN = 0.1
 MIN_SCALE, MAX_SCALE = 0.25, 4.0  # bounds of the scale factor, which is 1, with slope 1, at zero
 COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
@@ -59,8 +60,8 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: floa
 
 def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
     """softplus(softplus⁻¹(base) + delta), both in multiples of `unit`."""
-    relative = (base / unit).clamp_min(1e-4)
-    return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta)
+    relative = (base / unit).clamp_min(LEAST_DEPTH)
+    return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta).clamp_min(LEAST_DEPTH)
 
 
 def color_logit(value: Tensor) -> Tensor:
