@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view as windows
 
-from spackle.blur import blurred
+from spackle.filters import blurred
 from spackle.inpaint import exemplar as room
 from spackle.inpaint.exemplar import RADIUS, SIDE
 

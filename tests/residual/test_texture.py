@@ -11,9 +11,9 @@ from holes import CPU, box_view, features_of
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
 
-from spackle.blur import blurred
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
+from spackle.filters import blurred
 from spackle.inpaint import InpainterOptions
 from spackle.inpaint.protocol import PlainInpainter
 from spackle.residual import Completer, Seeds, hole_mask

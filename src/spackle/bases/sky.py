@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
+from spackle.filters import greatest_around
 
 NEAR_QUANTILE = 0.9  # of the inverse depth: what counts as the scene's near side
 FAR_QUANTILE = 0.05  # and as its far side
@@ -54,9 +54,8 @@ def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> tuple[Tensor,
     horizon = _quantile(inverse_depth, rest, FAR_QUANTILE)
     if not _stands_behind(sky, inverse_depth, known, near, horizon) or _leaks(sky, inverse_depth, rgb, known):
         return nothing
-    size = 2 * CLOSING_PX + 1  # close narrow gaps
-    grown = max_pool2d(sky.float()[None, None], size, stride=1, padding=CLOSING_PX)
-    sky |= (-max_pool2d(-grown, size, stride=1, padding=CLOSING_PX)[0, 0] > 0) & reach
+    grown = greatest_around(sky, CLOSING_PX)  # close narrow gaps
+    sky |= ~greatest_around(~grown, CLOSING_PX) & reach
     distance = BEYOND * min(horizon, FAR * near)
     inverse_depth = torch.where(sky, distance, torch.where(known, inverse_depth.clamp_min(CLEAR * distance), 0.0))
     return inverse_depth, known | sky, float(sky.float().mean())

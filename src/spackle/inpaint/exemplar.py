@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
 from spackle._numba import kernel, reordering_kernel
-from spackle.blur import blurred
 from spackle.device import run_chunks
 from spackle.fill import far_fill
+from spackle.filters import blurred, greatest_around
 from spackle.inpaint.protocol import InpainterOptions, PlainInpainter
 
 RADIUS = 3  # patches have 7×7 cells
@@ -220,8 +220,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
 
 def _fit(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
     """Search and vote in turn, the level's colours in place; None where there is no hole, or no patch for it."""
-    known = torch.from_numpy(~level.hole)[None, None].float()
-    usable = max_pool2d(1 - known, SIDE, stride=1, padding=RADIUS)[0, 0].numpy() == 0
+    usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
     usable[:RADIUS] = usable[-RADIUS:] = False
     usable[:, :RADIUS] = usable[:, -RADIUS:] = False
     if not usable.any() or not level.hole.any():

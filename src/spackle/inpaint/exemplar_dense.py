@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
-from spackle.blur import blurred
+from spackle.filters import blurred
 from spackle.inpaint.exemplar import (
     COARSEST,
     DEPTH_WEIGHT,

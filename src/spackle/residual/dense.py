@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from spackle.camera import Camera, beside
 from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 
@@ -65,7 +66,7 @@ def inside_photo(inverse_depth: Tensor, uv: Tensor, camera: Camera, photo_camera
 def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int, share: float) -> Tensor:
     """See `seeds.placed_behind`."""
     near = torch.where(seen > 0, seen, torch.inf)
-    farthest = -max_pool2d(-near[None, None], 2 * radius + 1, stride=1, padding=radius)[0, 0]
+    farthest = -greatest_around(-near, radius)
     return torch.where(chosen, torch.minimum(filled, farthest) * share, filled)
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
 from spackle.camera import Camera, beside
 from spackle.device import run_chunks
+from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.residual import dense
@@ -26,7 +26,7 @@ WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farth
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
 MAX_REACH_PX = 40.0  # nor is a huge one's reach looked into farther than this
 CLEARANCE = 0.002  # relative distance behind the surface that counts as behind
-GRAIN, ROWS = 1024, 64  # Gaussians, and rows of a guard, that a thread takes at a time
+GRAIN = 1024  # Gaussians that a thread takes at a time
 PIT = 0.027  # of a view's width: a nearer patch that is less than twice as wide is a pit
 STEPS = 48  # candidate positions along the line of sight, even in inverse depth
 
@@ -41,40 +41,12 @@ class OcclusionGuard:
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
         """The guard of a rendered view."""
-        images = [image.detach().float() for image in (rendering.depth, rendering.alpha)]
-        if dense.on_gpu(rendering.depth):
-            seen = torch.where(images[1] < threshold, 0, images[0])
-            return OcclusionGuard(camera, max_pool2d(seen[None], 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0])
-        depth, alpha = (image.contiguous().numpy() for image in images)
-        wide, low = np.empty_like(depth), np.float32(threshold)
-        run_chunks(lambda start, stop: _widest(start, stop, depth, alpha, low, wide), len(depth), ROWS)
-        return OcclusionGuard(camera, torch.from_numpy(wide))
+        seen = torch.where(rendering.alpha < threshold, 0, rendering.depth).detach().float()
+        return OcclusionGuard(camera, greatest_around(seen, WINDOW_PX))
 
     def to(self, device: torch.device) -> OcclusionGuard:
         """The same on another device."""
         return OcclusionGuard(self.camera, self.depth.to(device))
-
-
-@kernel
-def _widest(start: int, stop: int, depth: Any, alpha: Any, threshold: Any, wide: Any) -> None:
-    """Rows start..stop of the farthest depth in the window around each pixel, by columns and then along the row."""
-    height, width = depth.shape
-    above, below = max(start - WINDOW_PX, 0), min(stop + WINDOW_PX, height)
-    seen = np.empty((below - above, width), np.float32)
-    for y in range(above, below):
-        for x in range(width):
-            seen[y - above, x] = np.float32(0) if alpha[y, x] < threshold else depth[y, x]
-    row = np.zeros(width + 2 * WINDOW_PX, np.float32)
-    for y in range(start, stop):
-        row[WINDOW_PX : WINDOW_PX + width] = 0
-        for v in range(max(y - WINDOW_PX, 0), min(y + WINDOW_PX + 1, height)):
-            for x in range(width):
-                row[WINDOW_PX + x] = max(row[WINDOW_PX + x], seen[v - above, x])
-        for x in range(width):
-            wide[y, x] = row[x]
-        for k in range(1, 2 * WINDOW_PX + 1):
-            for x in range(width):
-                wide[y, x] = max(wide[y, x], row[x + k])
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
@@ -123,14 +95,8 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     reach = max(1, round(PIT * cells.shape[1]))
     grid = depths.new_zeros(cells.shape)
     grid[cells] = depths
-    farthest = _greatest(grid, reach)
-    return -_greatest(torch.where(cells, -farthest, -torch.inf), reach)[cells]
-
-
-def _greatest(image: Tensor, reach: int) -> Tensor:
-    """Of [h, w] the greatest in the square around each."""
-    along = max_pool2d(image[None], (1, 2 * reach + 1), stride=1, padding=(0, reach))
-    return max_pool2d(along, (2 * reach + 1, 1), stride=1, padding=(reach, 0))[0]
+    farthest = greatest_around(grid, reach)
+    return -greatest_around(torch.where(cells, -farthest, -torch.inf), reach)[cells]
 
 
 def _factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:

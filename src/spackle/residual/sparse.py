@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, pad
 
 from spackle.crop import Crop
+from spackle.filters import greatest_around
 
 Mask = NDArray[np.bool_]
 
@@ -54,15 +55,7 @@ class Cells:
 
     def grown(self, radius: int) -> Cells:
         """With all that are up to `radius` rows and columns away."""
-        grid = self.grid
-        for _ in range(radius):
-            tall = grid.clone()
-            tall[1:] |= grid[:-1]
-            tall[:-1] |= grid[1:]
-            grid = tall.clone()
-            grid[:, 1:] |= tall[:, :-1]
-            grid[:, :-1] |= tall[:, 1:]
-        return Cells(grid)
+        return Cells(greatest_around(self.grid, radius))
 
     def halved(self) -> Cells:
         """Those of a grid of half the size that bilinear interpolation to these reads."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.blur import blurred
+from spackle.filters import blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.inpaint.exemplar import Exemplar, nearest_known
 from spackle.inpaint.exemplar_dense import dense_nearest_known

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
+from spackle.filters import greatest_in_windows
 from spackle.residual.hole_features import MASK_THRESHOLD
 
 QUIET_HAR = 1e-3  # fewer holes may stay open where a path is looked at; in between up to twice as many were seen
@@ -49,7 +49,8 @@ def has_speck(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> bool:
     """Whether holes lie so close together that they are seen, however few they are."""
     if min(alpha.shape) < SPECK_PX:
         return False
-    return bool((max_pool2d(alpha[None], SPECK_PX, stride=SPECK_PX // 2) < threshold).any())
+    covered = greatest_in_windows(alpha >= threshold, SPECK_PX)
+    return not bool(covered[:: SPECK_PX // 2, :: SPECK_PX // 2].all())
 
 
 class SettledFrames:

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spackle.blur import blurred
+from spackle.filters import blurred, greatest_around
 from spackle.training.features import FeatureNet
 
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
@@ -186,8 +186,7 @@ def dilate(mask: Tensor, side: int) -> Tensor:
     """[B, H, W] bool, grown by a square of `side` pixels around each; ValueError where that is even."""
     if side % 2 != 1:
         raise ValueError(f"a dilation of {side} has no centre: give an odd number")
-    rows = F.max_pool2d(mask.float()[:, None], (side, 1), stride=1, padding=(side // 2, 0))  # a square is separable
-    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, side // 2))[:, 0] > 0
+    return greatest_around(mask, side // 2)
 
 
 def covered(mask: Tensor, features: Tensor) -> Tensor:

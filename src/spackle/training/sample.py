@@ -17,6 +17,7 @@ from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.errors import InputError
+from spackle.filters import greatest_around
 from spackle.formats import atomic_path
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
@@ -64,8 +65,8 @@ class Sample:
     @property
     def tiles(self) -> Tensor:
         """[ceil(H/16), ceil(W/16)] bool: the renderer's tiles that aux Gaussians can touch."""
-        near = max_pool2d(self.hole.float()[None, None], 2 * REACH_PX + 1, stride=1, padding=REACH_PX)
-        return max_pool2d(near, TILE, ceil_mode=True)[0, 0] > 0
+        near = greatest_around(self.hole, REACH_PX)
+        return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
         """The same on another device, but for the camera, whose numbers are read by the host."""

@@ -1,11 +1,13 @@
-"""Gaussian blur of pictures."""
+"""Filters of pictures: Gaussian blur, and the greatest value in a window."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -25,3 +27,24 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
         total.narrow(dim, 0, size - offset).add_(values.narrow(dim, offset, size - offset), alpha=weight)
         total.narrow(dim, offset, size - offset).add_(values.narrow(dim, 0, size - offset), alpha=weight)
     return total
+
+
+def greatest_around(image: Tensor, reach: int) -> Tensor:
+    """Of an image or mask [..., H, W] the greatest value up to `reach` rows and columns away from each pixel."""
+    least = 0 if image.dtype == torch.bool else -math.inf
+    return greatest_in_windows(pad(image, (reach,) * 4, value=least), 2 * reach + 1)
+
+
+def greatest_in_windows(image: Tensor, size: int) -> Tensor:
+    """The greatest value in each window of size × size pixels: of [..., H, W] those of [..., H - size + 1, W - size + 1].
+
+    Of two windows one of up to twice their width is made: a processor's pooling looks at all pixels of each instead.
+    """
+    for dim in (-1, -2):
+        width = 1
+        while width < size:
+            step = min(width, size - width)
+            count = image.shape[dim] - step
+            image = torch.maximum(image.narrow(dim, 0, count), image.narrow(dim, step, count))
+            width += step
+    return image

@@ -1,4 +1,4 @@
-"""The Gaussian blur: of pictures and of stacks of them, and where the border is."""
+"""The Gaussian blur and the greatest value in a window: of pictures and of stacks of them, and where the border is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from spackle.blur import blurred
+from spackle.filters import blurred, greatest_around, greatest_in_windows
 
 
 @pytest.mark.parametrize(("size", "sigma"), [((9, 13), 0.65), ((9, 13), 2.5), ((2, 5), 4.0), ((1, 1), 1.0)])
@@ -22,3 +22,15 @@ def test_a_blur_is_that_of_a_plain_loop_and_nothing_lies_beyond_the_border(size:
         expected[..., y, x, :] = total / mass
     torch.testing.assert_close(blurred(pictures, sigma), expected, rtol=1e-6, atol=0)
     torch.testing.assert_close(blurred(pictures[1, 0].float(), sigma), expected[1, 0].float())
+
+
+@pytest.mark.parametrize("reach", [0, 1, 2, 3, 9])
+def test_the_greatest_value_around_is_that_of_a_plain_loop(reach: int) -> None:
+    pictures = torch.rand(2, 7, 11, generator=torch.Generator().manual_seed(0)) - 0.5
+    near = [slice(max(k - reach, 0), k + reach + 1) for k in range(11)]
+    expected = torch.stack([pictures[:, near[y], near[x]].amax((1, 2)) for y, x in np.ndindex(7, 11)], 1).view(2, 7, 11)
+    assert torch.equal(greatest_around(pictures, reach), expected)
+    assert torch.equal(greatest_around(pictures > 0.4, reach), expected > 0.4)
+    if 2 * reach < 7:
+        inside = expected[:, reach : 7 - reach, reach : 11 - reach]
+        assert torch.equal(greatest_in_windows(pictures, 2 * reach + 1), inside)
