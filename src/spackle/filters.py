@@ -36,7 +36,7 @@ def greatest_around(image: Tensor, reach: int) -> Tensor:
 
 
 def greatest_in_windows(image: Tensor, size: int) -> Tensor:
-    """The greatest value in each window of size × size pixels: of [..., H, W] those of [..., H - size + 1, W - size + 1].
+    """The greatest value in each window of size × size pixels: [..., H, W] to [..., H - size + 1, W - size + 1].
 
     Of two windows one of up to twice their width is made: a processor's pooling looks at all pixels of each instead.
     """
