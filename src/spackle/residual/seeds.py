@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle._numba import kernel
 from spackle.camera import Camera, beside
@@ -29,6 +30,8 @@ SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.9
 FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
+WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
+WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 
 
@@ -183,7 +186,7 @@ def fitting_patches(cues: Cues, seeds: Seeds) -> Exemplar:
 class Rim:
     """For each masked cell, what its line meets; elsewhere the cell itself."""
 
-    rgb: Tensor  # [h, w, 3] sRGB at the far rim
+    rgb: Tensor  # [h, w, 3] sRGB at the far rim, the farther off the more of it
     mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
     exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that fit
@@ -196,7 +199,8 @@ class Rim:
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
         photo's eye. So that line leads from a hole to the surface that goes on behind, and structure
-        at the rim goes on along it more often than not. Where no line meets anything, the seeds stay.
+        at the rim goes on along it more often than not, coarse structure farther than fine. Where no line meets
+        anything, the seeds stay.
         """
         fields = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach(), cues.mask
         eye = photo_camera.position.double()
@@ -213,9 +217,30 @@ class Rim:
                 GRAIN,
             )
             far, near, steps = (torch.from_numpy(grid) for grid in grids)
+        unmirrored = (near == far).all(-1, keepdim=True)
+        far = _widened(far, cues.mask, WIDENING * steps)
+        near = torch.where(unmirrored, far, near)
         patches = patches or fitting_patches(cues, seeds)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
         return Rim(far, near, steps, patches.rgb, patches.mismatch, beyond)
+
+
+def _widened(rgb: Tensor, mask: Tensor, radius: Tensor) -> Tensor:
+    """Colours [h, w, 3], those of masked cells the mean of the masked ones within about `radius` [h, w] cells.
+
+    A small thing at a rim would go on as a streak to the other side of the hole; so it fades as far off as it is large.
+    """
+    finest = torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1) * mask[..., None]
+    sums, level = finest.permute(2, 0, 1)[None], radius.clamp_min(1).log2()
+    colors, finer = rgb, rgb
+    for number in range(1, WIDEST_LEVEL + 1):
+        sums = avg_pool2d(sums, 2, ceil_mode=True, count_include_pad=False)
+        whole = interpolate(sums, scale_factor=2**number, mode="bilinear")[0, :, : len(mask), : mask.shape[1]]
+        coarser = (whole[:3] / whole[3:].clamp_min(1e-6)).permute(1, 2, 0)
+        share = (level - (number - 1)).clamp(0, 1)[..., None]
+        colors = torch.where(share > 0, torch.lerp(finer, coarser, share), colors)
+        finer = coarser
+    return torch.where(mask[..., None], colors, rgb)
 
 
 @kernel
