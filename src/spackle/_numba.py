@@ -9,6 +9,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 from numpy.typing import NDArray
 
 R = TypeVar("R")
@@ -36,6 +37,13 @@ def reordering_kernel(function: Callable[..., R]) -> Callable[..., R]:
 def inlined_kernel(function: Callable[..., R]) -> Callable[..., R]:
     """A `kernel` that becomes part of the loops that call it, which only then run in vector registers."""
     return _compiled(function, _FASTMATH, forceinline=True)
+
+
+def is_compiled(function: Callable[..., Any]) -> bool:
+    """Whether a kernel's machine code for this processor lies on disk, or can never lie there."""
+    kept = _kept(function)
+    processor = cpu_target.target_context.codegen().magic_tuple()
+    return kept is None or any(key[1] == processor for key in kept._load_index())
 
 
 def _compiled(function: Callable[..., R], fastmath: set[str], **more: Any) -> Callable[..., R]:

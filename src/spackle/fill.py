@@ -75,7 +75,7 @@ def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats, swee
     _fill_level(*coarse, sweeps)
     holes, links, rim = _find_holes(known, count)
     samples = _guess(depths, values, coarse[0], coarse[1], holes, rim)
-    _relax(samples, links, bias.ravel()[holes], sweeps)
+    _relax(samples, samples.copy(), links, bias.ravel()[holes], sweeps)
     _put(depths, values, holes, samples)
 
 
@@ -193,15 +193,16 @@ def _guess(depths: Any, values: Any, coarse_depths: Any, coarse_values: Any, hol
             samples[n, 1 + channel] = upper * (1 - fy) + lower * fy
     for m in range(len(rim)):
         samples[len(holes) + m, 0] = depths[rim[m] // width, rim[m] % width]
-        samples[len(holes) + m, 1:] = values[rim[m] // width, rim[m] % width]
+        for channel in range(channels):
+            samples[len(holes) + m, 1 + channel] = values[rim[m] // width, rim[m] % width, channel]
     return samples
 
 
 @kernel
-def _relax(samples: Any, links: Any, bias: Any, sweeps: int) -> None:
+def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> None:
     """Jacobi sweeps on the holes, the first of the samples; nothing flows across the image's border."""
     count, channels = len(links), samples.shape[1]
-    old, new = samples, samples.copy()
+    old, new = samples, copy
     for _ in range(sweeps):
         for n in range(count):
             up, down, left, right = links[n]
@@ -222,7 +223,9 @@ def _relax(samples: Any, links: Any, bias: Any, sweeps: int) -> None:
                 new[n, channel] /= mass
         old, new = new, old
     if sweeps % 2:
-        samples[:] = old
+        for n in range(count):
+            for channel in range(channels):
+                samples[n, channel] = old[n, channel]
 
 
 @kernel
@@ -241,7 +244,8 @@ def _put(depths: Any, values: Any, holes: Any, samples: Any) -> None:
     for n in range(len(holes)):
         y, x = holes[n] // width, holes[n] % width
         depths[y, x] = samples[n, 0]
-        values[y, x] = samples[n, 1:]
+        for channel in range(values.shape[2]):
+            values[y, x, channel] = samples[n, 1 + channel]
 
 
 def dense_far_fill(

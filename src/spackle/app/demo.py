@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 from torch import Tensor
 
+from spackle.app.first_use import compiled_ahead
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
@@ -37,10 +38,9 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
 
     InputError where scikit-image is missing, or `output` cannot be written to.
     """
-    pair = load_motorcycle()
-    with results_folder(output, FILES, alone=True):
+    pair, renderer = load_motorcycle(), get_renderer()
+    with results_folder(output, FILES, alone=True), compiled_ahead(renderer, reporter.log):
         start = time.perf_counter()
-        renderer = get_renderer()
         seconds: dict[str, float] = {}
         with reporter.stage("base", seconds):
             prediction = lift(pair.left, pair.depth, pair.left_camera)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import spackle
 from spackle.app.clip import check_clip_options, predict_clip
 from spackle.app.complete import PhotoCompleter
+from spackle.app.first_use import compiled_ahead
 from spackle.app.predict import (
     REPORT,
     PredictOptions,
@@ -60,11 +61,15 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
             options = dataclasses.replace(options, residual=dataclasses.replace(options.residual, wanted="network"))
     completer = open_completer(options)
     if is_clip(photos):
-        with results_folder(output):
+        with results_folder(output), compiled_ahead(completer.renderer, reporter.log):
             predict_clip(photos, output / found[0].name, completer, options.lens, reporter)
         return 0
     predictor = Predictor(photos, output, options, shared_digest(options, completer.base), completer)
-    with cluster(workers) as ray, results_folder(output, alone=os.path.isdir(photos) or ray is not None):
+    with (
+        cluster(workers) as ray,
+        results_folder(output, alone=os.path.isdir(photos) or ray is not None),
+        compiled_ahead(completer.renderer, reporter.log),
+    ):
         left = predictor.left(found, reporter)
         if workers.count == 1 and ray is None:
             with threads_of_torch(workers.threads):

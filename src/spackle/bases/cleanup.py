@@ -178,17 +178,16 @@ def fill_missing(inverse_depth: Tensor, rgb: Tensor, valid: Tensor) -> Tensor:
     if bool(valid.all()):
         return inverse_depth
     far, _ = far_fill(inverse_depth, inverse_depth[None], valid)
-    spread = _spread(inverse_depth.numpy(), rgb.contiguous().numpy(), valid.numpy(), far.numpy())
+    spread, cost = inverse_depth.numpy().copy(), np.where(valid.numpy(), np.float32(0), np.float32(np.inf))
+    _spread(spread, cost, rgb.contiguous().numpy(), valid.numpy(), far.numpy())
     filled = torch.where(valid, inverse_depth, torch.from_numpy(spread))
     return torch.where(valid, inverse_depth, _median(filled))
 
 
 @kernel
-def _spread(inverse_depth: Any, rgb: Any, valid: Any, far: Any) -> Any:
-    """Cheapest paths from valid pixels by sweeps over the image, down and up; returns their depths."""
-    height, width = inverse_depth.shape
-    cost = np.where(valid, np.float32(0), np.float32(np.inf))
-    result = inverse_depth.copy()
+def _spread(result: Any, cost: Any, rgb: Any, valid: Any, far: Any) -> None:
+    """Cheapest paths from valid pixels, which cost 0, by sweeps over the image, down and up; writes their depths."""
+    height, width = result.shape
     for sweep in range(2 * ROUNDS):
         for i in range(height * width):
             n = i if sweep % 2 == 0 else height * width - 1 - i
@@ -207,7 +206,6 @@ def _spread(inverse_depth: Any, rgb: Any, valid: Any, far: Any) -> Any:
                 if total < cost[y, x]:
                     cost[y, x] = total
                     result[y, x] = result[v, u]
-    return result
 
 
 def _median(image: Tensor) -> Tensor:

@@ -50,9 +50,10 @@ def _rows(inverse_depth: Any, known: Any, steepest: float) -> Any:
     height, width = inverse_depth.shape
     step = np.zeros((height, width), np.float32)
     across = np.zeros((height, width), np.bool_)
-    gaps = np.full(width + 1, np.nan, np.float32)  # gaps[x] lies between x - 1 and x; NaN beside the unknown
+    gaps = np.empty(width + 1, np.float32)  # gaps[x] lies between x - 1 and x; NaN beside the unknown
     for y in range(height):
         row = inverse_depth[y]
+        gaps[0] = gaps[width] = np.nan
         for x in range(1, width):
             gaps[x] = row[x] - row[x - 1] if known[y, x] and known[y, x - 1] else np.nan
         for x in range(1, width):
@@ -240,8 +241,10 @@ def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
     known = sampled.state != HOLE
     if not len(open_pixels):
         return sampled.inverse_depth, known
-    source = _spread(sampled.inverse_depth, sampled.state, sampled.step, rgb, open_pixels)
-    reached = source >= 0
+    cost = np.where(sampled.state == SETTLED, np.float32(0), np.float32(np.inf))
+    sources = np.arange(cost.size)
+    _spread(cost, sources, sampled.inverse_depth, sampled.step, rgb, open_pixels)
+    source, reached = sources[open_pixels], np.isfinite(cost.reshape(-1)[open_pixels])
     known.reshape(-1)[open_pixels[~reached]] = False
     open_pixels, source = open_pixels[reached], source[reached]
     width = sampled.state.shape[1]
@@ -251,17 +254,19 @@ def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
     depth = sampled.inverse_depth.copy()
     depth.reshape(-1)[open_pixels] = at_source + np.clip(lean, -LEAN * at_source, LEAN * at_source)
     for _ in range(VOTES):
-        depth = _vote(depth, known, rgb, open_pixels)
+        before = depth.copy()
+        _vote(before, known, rgb, open_pixels, depth)
     _relax(depth, known, open_pixels)
     return depth, known
 
 
 @kernel
-def _spread(depths: Any, state: Any, steps: Any, rgb: Any, pixels: Any) -> Any:
-    """For each open pixel the settled one, as y·W + x, that the cheapest path leads to; −1 for none."""
+def _spread(cost: Any, source: Any, depths: Any, steps: Any, rgb: Any, pixels: Any) -> None:
+    """For each open pixel the settled one, as y·W + x, that the cheapest path leads to, and what that costs.
+
+    At first settled pixels cost 0, the others infinitely much, and each is its own source.
+    """
     height, width = depths.shape
-    cost = np.where(state == SETTLED, np.float32(0), np.float32(np.inf))
-    source = np.arange(height * width)
     for sweep in range(2 * ROUNDS):
         way = 1 if sweep % 2 else -1  # the neighbours that this sweep has already visited
         changed = False
@@ -283,18 +288,12 @@ def _spread(depths: Any, state: Any, steps: Any, rgb: Any, pixels: Any) -> Any:
                     changed = True
         if not changed and sweep > 0:
             break
-    found = source[pixels]
-    for i in range(len(pixels)):
-        if cost[pixels[i] // width, pixels[i] % width] == np.inf:
-            found[i] = -1
-    return found
 
 
 @kernel
-def _vote(depths: Any, known: Any, rgb: Any, pixels: Any) -> Any:
+def _vote(depths: Any, known: Any, rgb: Any, pixels: Any, result: Any) -> None:
     """Open pixels near an edge change sides where most neighbours, by colour and distance, stand on the other."""
     height, width = depths.shape
-    result = depths.copy()
     for n in pixels:
         y, x = n // width, n % width
         top, bottom = max(y - VOTERS, 0), min(y + VOTERS + 1, height)
@@ -324,7 +323,6 @@ def _vote(depths: Any, known: Any, rgb: Any, pixels: Any) -> Any:
                     strongest, other = vote, depths[v, u]
         if balance < 0:
             result[y, x] = other
-    return result
 
 
 @kernel

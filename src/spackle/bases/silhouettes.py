@@ -133,7 +133,11 @@ def _survey(
             near = image[y, x] > middle
             level[0], level[1] = high, low
             level[0 if near else 1] = image[y, x]
-            m[:], s[:] = 0.0, 0.0
+            for side in range(2):
+                for k in range(9):
+                    m[side, k] = 0
+                for k in range(7):
+                    s[side, k] = 0
             blurred, total = 0.0, 0.0
             for v in range(max(y - WINDOW, 0), min(y + WINDOW + 1, height)):
                 for u in range(max(x - WINDOW, 0), min(x + WINDOW + 1, width)):
@@ -211,7 +215,10 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
                         a = 0.5 + (inside[v, u] + (k % shifts - STEPS) * STEP) / RAMPS[k // shifts]
                         off = min(max(a, 0.0), 1.0) - share
                         costs[k] += weight * min(off * off, OUTLIER)
-            best = np.argmin(costs)
+            best = 0
+            for k in range(len(costs)):
+                if costs[k] < costs[best]:
+                    best = k
             shift = float(best % shifts - STEPS)
             if 0 < best % shifts < shifts - 1:  # the lowest point of a parabola
                 bend = costs[best - 1] - 2 * costs[best] + costs[best + 1]

@@ -1,0 +1,79 @@
+"""The second process of a first use: what it compiles, when it runs, and that it does not outlive the first."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from spackle._numba import is_compiled, kernel
+from spackle.app import first_use
+from spackle.app.first_use import compiled_ahead
+from spackle.render import get_renderer
+from spackle.render.blend import blend_tiles
+
+KERNELS_OF_A_COMPLETION = """
+import gc
+import sys
+
+from numba.core.dispatcher import Dispatcher
+
+sys.path.insert(0, sys.argv[1])
+from scenes import box_before_wall, shifted
+from spackle.app.first_use import compile_kernels
+from spackle.render import get_renderer
+from spackle.residual import Completer
+
+def there():
+    kernels = [o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.__module__.startswith("spackle.")]
+    return {(kernel.__name__, str(signature)) for kernel in kernels for signature in kernel.signatures}
+
+scene = box_before_wall()
+base, camera = scene.base(), scene.camera
+before = there()
+compile_kernels()
+ahead = there()
+aux = Completer(base, camera, get_renderer()).complete_scene([shifted(camera, x) for x in (-0.4, -0.2, 0.2, 0.4)])
+assert len(aux) > 100, "nothing was completed"
+print(len(ahead - before), *sorted(there() - ahead))
+"""
+
+
+def test_what_a_completion_needs_is_compiled_ahead() -> None:
+    command = [sys.executable, "-c", KERNELS_OF_A_COMPLETION, Path(__file__).parent.parent]
+    count, *missing = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split(maxsplit=1)
+    assert int(count) > 20
+    assert not missing
+
+
+def test_the_second_process_ends_with_the_first_and_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Process(subprocess.Popen[bytes]):
+        def __init__(self, *words: object, **options: object) -> None:
+            super().__init__(*words, **options)  # type: ignore[call-overload]
+            started.append(self)
+
+    monkeypatch.setattr(first_use.subprocess, "Popen", Process)
+    with compiled_ahead(get_renderer(), said.append):
+        assert (len(started), len(said)) == (not is_compiled(blend_tiles), not is_compiled(blend_tiles))
+    monkeypatch.setattr(first_use, "is_compiled", lambda kernel: False)
+    said.clear(), started.clear()
+    with compiled_ahead(get_renderer(), said.append):
+        assert len(started) == len(said) == 1
+        assert started[0].poll() is None
+    assert started[0].returncode is not None
+
+
+def test_a_kernel_is_compiled_once_its_code_lies_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @kernel
+    def double(x: float) -> float:
+        return 2 * x
+
+    monkeypatch.setattr(double._cache._cache_file, "_cache_path", str(tmp_path))  # type: ignore[attr-defined]
+    assert not is_compiled(double)
+    assert double(2.0) == 4.0
+    assert is_compiled(double)
