@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -87,7 +88,7 @@ class Reporter:
     @contextlib.contextmanager
     def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
         """Time a stage into `seconds[name]`; yields a function to call as it advances."""
-        start = time.perf_counter()
+        start, busy = time.perf_counter(), time.process_time()
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn()) as bars:
                 task = bars.add_task(name, total=None)
@@ -96,7 +97,9 @@ class Reporter:
             yield lambda done, total: None
         elapsed = time.perf_counter() - start
         seconds[name] = round(seconds.get(name, 0.0) + elapsed, 3)
-        self.detail(f"  {name}: {elapsed:.2f} s")
+        cores = os.cpu_count() or 1
+        busy = (time.process_time() - busy) / max(elapsed, 1e-9) / cores
+        self.detail(f"  {name}: {elapsed:.2f} s, {counted(cores, 'core')} {min(busy, 1.0):.0%} busy")
 
     @contextlib.contextmanager
     def steps(self, name: str, start: int, total: int) -> Iterator[Callable[[int, str], None]]:

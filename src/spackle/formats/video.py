@@ -7,6 +7,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -118,6 +119,7 @@ class VideoWriter:
         self._plays = self._kind.loop if loop is None else loop
         self._rate = max(Fraction(fps).limit_denominator(1001), Fraction(1, 1001))  # 29.97 is 30000/1001
         self._shape: tuple[int, ...] = ()
+        self._encoding: Future[None] | None = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self: W) -> W:
@@ -131,11 +133,18 @@ class VideoWriter:
         if self.frames == 0:
             self._encoder = self._open(*frame.shape[:2])
             self._stack.callback(self._encoder.close)
+            self._aside = self._stack.enter_context(ThreadPoolExecutor(1))
             self._shape = tuple(frame.shape)
         if tuple(frame.shape) != self._shape:
             raise ValueError(f"frame {self.frames} is {tuple(frame.shape)}, the first one was {self._shape}")
-        self._encoder.add(to_bytes(frame).numpy())
+        self._wait()
+        self._encoding = self._aside.submit(self._encoder.add, to_bytes(frame).numpy())
         self.frames += 1
+
+    def _wait(self) -> None:
+        """Until the last frame is encoded, which goes on while the caller makes the next one; raises what that did."""
+        if self._encoding is not None:
+            self._encoding.result()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -146,6 +155,7 @@ class VideoWriter:
         with self._stack:  # closes the file and renames it, or removes it
             if self.frames == 0:
                 raise ValueError(f"{self.path}: a video needs at least one frame")
+            self._wait()
             self._encoder.finish()
 
     def _open(self, height: int, width: int) -> StreamEncoder | GifEncoder:
@@ -163,7 +173,7 @@ def save_video(
 ) -> None:
     """Write frames, sRGB [H, W, 3] in 0..1, in the format of the name; see `VideoWriter`.
 
-    `frames` may be a generator: one frame at a time is held. Where it raises, no file is left.
+    `frames` may be a generator: a frame is encoded while the next one is made. Where it raises, no file is left.
     """
     with VideoWriter(path, fps, loop) as writer:
         for frame in frames:

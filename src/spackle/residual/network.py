@@ -181,14 +181,15 @@ def predict_deltas(
     chosen = torch.ones_like(cues.mask) if dense else cues.mask
     few = network if isinstance(network, ResidualNet) and device.type == "cpu" and not dense else None
     field = cues.alpha.new_zeros(*cues.mask.shape, DELTA_CHANNELS)
-    for inner, outer in crops_around(chosen, STRIDE):
-        there = outer.slices
-        features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
-        own = torch.zeros_like(chosen[there])
-        own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
-        with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+    # Around all crops: autocast converts the weights once.
+    with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+        for inner, outer in crops_around(chosen, STRIDE):
+            there = outer.slices
+            features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
+            own = torch.zeros_like(chosen[there])
+            own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
             found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
-        field[there][own] = found.float()
+            field[there][own] = found.float()
     return field
 
 
