@@ -81,3 +81,11 @@ def _inverse_in_frame(means: Tensor, camera: Camera) -> Tensor:
     uv, z = camera.to("cpu").project(means)
     inside = (z > 0.01) & (uv >= 0).all(dim=-1) & (uv < uv.new_tensor([camera.width, camera.height])).all(dim=-1)
     return 1 / z[inside]
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Values in 0..1 of any shape as uint8 on the CPU, rounded; outside values are clamped, NaN is 0; uint8 stays."""
+    if image.dtype == torch.uint8:
+        return image.detach().cpu()
+    scaled = image.detach().float().mul(255)  # a copy: what follows is in place
+    return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)

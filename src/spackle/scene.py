@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import BaseSettings, open_base, open_loaded
@@ -319,6 +320,7 @@ def complete(
     renderer: Renderer | None = None,
     precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
+    seen: dict[int, Tensor] | None = None,
 ) -> Scene:
     """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `Completer.complete_scene`.
 
@@ -332,6 +334,7 @@ def complete(
         renderer: the CPU's where None.
         precision: of the network.
         progress: called with views done and their number.
+        seen: in scene mode gets pictures of some views, for which they need not be drawn again; see `complete_scene`.
     """
     base, camera = prediction.gaussians, prediction.camera
     if fill == "none":
@@ -339,7 +342,7 @@ def complete(
     chosen = shipped_network() if network == "shipped" else network
     completer = Completer(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
     if mode == "scene":
-        return Scene(base, completer.complete_scene(cameras, exact=exact, progress=progress), camera)
+        return Scene(base, completer.complete_scene(cameras, exact, progress, seen), camera)
     guards, by_view = [completer.photo_guard()], []
     for index, view in enumerate(cameras):
         by_view.append(completer.complete_view(view, guards))

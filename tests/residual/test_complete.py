@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
+import torch
 from holes import CPU, box_view, random_network
 from scenes import (
     away,
@@ -18,9 +19,11 @@ from scenes import (
     shifted,
     wall,
 )
+from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, extremes, trajectory
+from spackle.color import to_bytes
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
@@ -167,17 +170,21 @@ def test_few_frames_of_a_path_are_looked_at_all_of_them_are_closed_and_what_the_
     completer = dataclasses.replace(subject(), renderer=counting)
     path = path_of(completer, kind)
     calls: list[tuple[int, int]] = []
+    seen: dict[int, Tensor] = {}
     sides = extremes(completer.photo_camera, 0.3, DepthRange.of(completer.base))  # as the command line adds them
-    aux = completer.complete_scene([*path, *sides], progress=lambda done, total: calls.append((done, total)))
+    aux = completer.complete_scene([*path, *sides], False, lambda done, total: calls.append((done, total)), seen)
     assert len(counting.cameras) <= most + 2  # the photo, the widest, and those that were looked at
     assert calls == [(k, FRAMES + 2) for k in range(1, FRAMES + 3)]
+    assert len(seen) > 3
+    for index, picture in seen.items():  # as the finished scene is drawn, bit for bit
+        assert torch.equal(picture, to_bytes(CPU.render([completer.base, aux], [*path, *sides][index]).rgb))
     left = [holes_of(camera, completer.base, aux) for camera in (*path, *sides)]
     assert max(left) <= 2e-3
     assert sum(left) / len(left) <= 5e-4
     for index in farthest_first(path, completer.photo_camera)[:WIDEST]:
         before, after = CPU.render(completer.base, path[index]), CPU.render([completer.base, aux], path[index])
-        seen = ~hole_mask(before.alpha)
-        assert psnr(after.rgb[seen], before.rgb[seen]) >= 45
+        shown = ~hole_mask(before.alpha)
+        assert psnr(after.rgb[shown], before.rgb[shown]) >= 45
     counting.cameras.clear()
     completer.complete_scene(path[::5], exact=True)  # views of an exact path speak for themselves alone
     assert all(any(camera is seen for seen in counting.cameras) for camera in path[::5])

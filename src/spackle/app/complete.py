@@ -57,6 +57,7 @@ class CompletedPhoto:
     choice: Choice
     views: PlannedViews
     scene: Scene  # its disparity is None for given views and keyframes
+    seen: dict[int, Tensor]  # pictures of views that completion has drawn as they are, by index
     saved_view: str | None  # in view mode: the view that `scene.aux` belongs to
 
 
@@ -88,11 +89,12 @@ class PhotoCompleter:
         self._say_base(photo, prediction, choice, disparity, reporter)
         views = self._plan(photo.path, prediction)
         with reporter.stage("complete", seconds) as step:
-            scene, saved_view = self._fill(prediction, views, step)
+            seen: dict[int, Tensor] = {}
+            scene, saved_view = self._fill(prediction, views, seen, step)
             if not scene.aux.finite:
                 raise InputError(f"{self.path.cameras or photo.path}: views too extreme to complete: check their K")
         scene = dataclasses.replace(scene, disparity=disparity)
-        return CompletedPhoto(photo, prediction, choice, views, scene, saved_view)
+        return CompletedPhoto(photo, prediction, choice, views, scene, seen, saved_view)
 
     def _say_base(
         self, photo: Photo, prediction: BasePrediction, choice: Choice, disparity: float | None, reporter: Reporter
@@ -137,7 +139,9 @@ class PhotoCompleter:
         step = math.ceil(len(keys) / 16)  # at most 16 views are measured
         return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}
 
-    def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, str | None]:
+    def _fill(
+        self, prediction: BasePrediction, views: PlannedViews, seen: dict[int, Tensor], step: Step
+    ) -> tuple[Scene, str | None]:
         """Fill the holes, as the options say; in view mode also says which view the scene's file holds."""
         scene = complete(
             prediction,
@@ -149,6 +153,7 @@ class PhotoCompleter:
             renderer=self.renderer,
             precision=self.settings.precision,
             progress=step,
+            seen=seen if views.maker.plain else None,
         )
         if scene.by_view is None:
             return scene, None
@@ -164,14 +169,19 @@ def disparity_source(path: PathOptions, choice: Choice) -> str:
     return f"default of {choice.base}" if path.disparity is None else "--disparity"
 
 
-def save_views_video(path: Path, views: PlannedViews, scene: Scene, renderer: Renderer, step: Step) -> None:
+def save_views_video(
+    path: Path, views: PlannedViews, scene: Scene, seen: dict[int, Tensor], renderer: Renderer, step: Step
+) -> None:
     """The views of the video's frames, all of one size; InputError for a file that cannot be written."""
 
     def frames() -> Iterator[Tensor]:
         for index, frame in enumerate(views.frames):
-            with torch.no_grad():
-                eyes = [renderer.render(scene.of_view(k), views.maker.sized(views.cameras[k])) for k in frame]
-                yield views.maker.frame(eyes)
+            if frame[0] in seen:
+                yield seen[frame[0]]
+            else:
+                with torch.no_grad():
+                    eyes = [renderer.render(scene.of_view(k), views.maker.sized(views.cameras[k])) for k in frame]
+                    yield views.maker.frame(eyes)
             step(index + 1, len(views.frames))
 
     save_video(frames(), path, views.maker.options.rate, views.maker.options.loop)

@@ -94,7 +94,7 @@ def predict_one(
         if options.render:
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video", seconds) as step:
-                save_views_video(new / options.files[-1], views, scene, renderer, step)
+                save_views_video(new / options.files[-1], views, scene, done.seen, renderer, step)
         if pictures:
             (new / "views").mkdir()
             with reporter.stage("views", seconds) as step:

@@ -167,6 +167,11 @@ class FrameMaker:
             )
         return maker
 
+    @property
+    def plain(self) -> bool:
+        """Whether a frame is what one view shows, at its own size."""
+        return self.stereo is None and self.depth is None and self.options.size is None
+
     def eyes(self, camera: Camera) -> tuple[Camera, ...]:
         """The view itself, or what the left and the right eye see."""
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)

@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from spackle.camera import Camera
+from spackle.color import to_bytes
 from spackle.dataset.views import PathChoice, ViewStack
 from spackle.errors import InputError
 from spackle.formats.camera_files import checked_camera, read_matrix
-from spackle.formats.png import to_bytes
 from spackle.gaussians import Gaussians
 from spackle.image import check_pixels
 from spackle.render.protocol import Rendering

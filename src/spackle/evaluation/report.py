@@ -15,6 +15,7 @@ from jinja2 import Environment
 from PIL import Image
 from torch import Tensor
 
+from spackle.color import to_bytes
 from spackle.evaluation import paper
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
@@ -25,7 +26,7 @@ from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, ran
 from spackle.evaluation.table import BEST, EMPTY, Table
 from spackle.evaluation.tables import ADDING, NOT_RUN, PAPER_ROW, count_text, make_tables, method_name, ratio_text
 from spackle.formats import atomic_path
-from spackle.formats.png import thumbnail, to_bytes
+from spackle.formats.png import thumbnail
 
 REPORT = "report.html"
 BENCH = "bench.json"  # of `spackle bench`

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import os
 
-import torch
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from spackle.color import to_bytes
 from spackle.formats.atomic import atomic_path
-
-
-def to_bytes(image: Tensor) -> Tensor:
-    """Values in 0..1 of any shape as uint8 on the CPU, rounded; outside values are clamped, NaN is 0."""
-    scaled = image.detach().float().mul(255)  # a copy: what follows is in place
-    return scaled.nan_to_num_(0.0).clamp_(0, 255).round_().to("cpu", torch.uint8)
 
 
 def thumbnail(picture: Tensor, side: int) -> Tensor:

@@ -19,9 +19,9 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spackle.color import to_bytes
 from spackle.errors import InputError
 from spackle.formats.atomic import atomic_path, check_writable
-from spackle.formats.png import to_bytes
 from spackle.formats.video_gif import GifEncoder
 
 MAX_REPEATS = 1000  # of a file that has to hold every repetition
@@ -127,7 +127,7 @@ class VideoWriter:
         return self
 
     def add(self, frame: Tensor) -> None:
-        """Append sRGB [H, W, 3] in 0..1; all frames share one size."""
+        """Append sRGB [H, W, 3] in 0..1, or uint8; all frames share one size."""
         if frame.ndim != 3 or frame.shape[2] != 3 or 0 in frame.shape:
             raise ValueError(f"a video frame is [H, W, 3], got {tuple(frame.shape)}")
         if self.frames == 0:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, place_of, touched_tiles
@@ -104,7 +104,11 @@ class Completer:
 
     @torch.no_grad()
     def complete_scene(
-        self, cameras: Sequence[Camera], exact: bool = False, progress: Callable[[int, int], None] | None = None
+        self,
+        cameras: Sequence[Camera],
+        exact: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+        seen: dict[int, Tensor] | None = None,
     ) -> Gaussians:
         """One set of aux Gaussians for a whole path, the same from every frame.
 
@@ -117,11 +121,12 @@ class Completer:
             exact: look at every view and complete it if it has a hole; else skip frames beside one that needs
                 nothing, so that holes too small to see may stay open.
             progress: called with (views visited, views in all).
+            seen: gets the pictures [H, W, 3], uint8, of views that were looked at once all was added, by their index.
         """
         if not cameras:
             return Gaussians.empty()
         if self.there is not self:
-            return self.there.complete_scene(cameras, exact, progress).to(self.base.means.device)
+            return self.there.complete_scene(cameras, exact, progress, seen).to(self.base.means.device)
         order = farthest_first(cameras, self.photo_camera)
         guards = {-1: self.photo_guard()}
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
@@ -142,7 +147,11 @@ class Completer:
                     new, view = chosen._fill(camera, others, [self.base, aux], view, enough, len(cameras) > 1)
                     filled += 1
                     aux = Gaussians.cat([aux, new])
+                    if seen:
+                        seen.clear()
                     guards[index] = OcclusionGuard.of(view, camera, self.threshold)
+                elif seen is not None:
+                    seen[index] = to_bytes(view.rgb)
                 settled.looked(index, reach)
             if progress:
                 progress(count + 1, len(order))
