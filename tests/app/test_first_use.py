@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from spackle._numba import is_compiled, kernel
+from spackle._numba import is_compiled
 from spackle.app import first_use
 from spackle.app.first_use import compiled_ahead
 from spackle.render import get_renderer
@@ -69,11 +70,10 @@ def test_the_second_process_ends_with_the_first_and_is_announced(monkeypatch: py
 
 
 def test_a_kernel_is_compiled_once_its_code_lies_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    @kernel
-    def double(x: float) -> float:
-        return 2 * x
-
-    monkeypatch.setattr(double._cache._cache_file, "_cache_path", str(tmp_path))  # type: ignore[attr-defined]
+    source = "from spackle._numba import kernel\n\n@kernel\ndef double(x):\n    return 2 * x\n"
+    (tmp_path / "own_kernel.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    double = importlib.import_module("own_kernel").double
     assert not is_compiled(double)
     assert double(2.0) == 4.0
     assert is_compiled(double)
