@@ -146,6 +146,7 @@ TWINS = {
     "inpaint/exemplar.py": "test_exemplar.py",
     "render": "test_render.py",
     "residual/occlusion_guard.py": "test_occlusion_guard.py",
+    "residual/epipolar_walk.py": "test_seeds.py",
     "residual/hole_features.py": "test_hole_features.py",
     "residual/seeds.py": "test_seeds.py",
     "surface.py": "test_surface.py",

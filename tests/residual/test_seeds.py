@@ -14,10 +14,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.camera import Camera
-from spackle.fill import FAR_BIAS, far_fill
+from spackle.fill import far_fill
 from spackle.render.protocol import Rendering
 from spackle.residual import CELL, Cues, Seeds, make_seeds
-from spackle.residual.seeds import BEHIND, BLOB_CELLS, SAME_DEPTH, WIDENING, Rim, cell_centers
+from spackle.residual.beyond_border import fill_around
+from spackle.residual.epipolar_walk import SAME_DEPTH, WIDENING
+from spackle.residual.seeds import BEHIND, BLOB_CELLS, Rim, cell_centers
 from spackle.surface import surface_slope
 
 
@@ -32,7 +34,7 @@ def plain_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     place, z = photo_camera.project(point)
     size = torch.tensor([photo_camera.width, photo_camera.height])
     inside = ((place >= 0) & (place < size)).all(-1) & (z > 0)
-    filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=torch.where(inside, FAR_BIAS, 0.0))
+    filled, rgb = fill_around(cues, across, uv, known, inside, camera, photo_camera)
     seen = torch.where(cues.inverse_depth > 0, cues.inverse_depth, torch.inf)
     close = -max_pool2d(-seen[None, None], 2 * BLOB_CELLS + 1, stride=1, padding=BLOB_CELLS)[0, 0]
     inverse_depth = torch.where(cues.mask, torch.minimum(filled, close) * (1.0 - BEHIND), filled)

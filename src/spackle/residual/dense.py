@@ -71,17 +71,17 @@ def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int, sha
 
 
 class Walk(NamedTuple):
-    """What walks along epipolar lines meet."""
+    """For each masked cell, what its line meets; elsewhere the cell itself."""
 
-    rgb: Tensor  # [h, w, 3]
-    mirrored: Tensor  # [h, w, 3]
-    distance: Tensor  # [h, w]
+    found: Tensor  # [h, w, c] values at the far rim
+    mirrored: Tensor  # [h, w, c] values as far beyond the rim as the cell is before it, if that is the same surface
+    distance: Tensor  # [h, w] cells to the rim; 0 elsewhere, and where no line meets anything
 
 
 def walk(
     uv: Tensor, rgb: Tensor, depths: Tensor, mask: Tensor, epipole: Sequence[float], same: float, still: float
 ) -> Walk:
-    """See `seeds.Rim.of`: of each masked cell its far rim; `still` is the length below which there is no line."""
+    """See `epipolar_walk.walk`: of each masked cell its far rim; `still` is the length below which there is no line."""
     height, width = mask.shape
     flat = mask.flatten().nonzero()[:, 0]
     y, x = flat.div(width, rounding_mode="floor").double(), (flat % width).double()

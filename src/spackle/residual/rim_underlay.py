@@ -32,10 +32,11 @@ def rim_underlay(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
     if not bool(rim.any()) or not bool(known.any()):
         return Gaussians.empty(cues.mask.device)
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
-    # At the rim, behind all that is seen as far around as a blob reaches.
+    # At the rim, behind all that is seen or filled as far around as a blob reaches.
+    shown = dataclasses.replace(cues, inverse_depth=seeds.inverse_depth)
     depth, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
-    placed = placed_behind(depth, chosen, cues, COARSE * BLOB_CELLS)[EVERY]
+    placed = placed_behind(depth, chosen, shown, COARSE * BLOB_CELLS)[EVERY]
     slope = surface_slope(placed) / (COARSE * CELL)
     there = Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
     fine = compose(there, None, camera)

@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle._numba import kernel
 from spackle.camera import Camera, beside
 from spackle.device import run_chunks
-from spackle.fill import FAR_BIAS, far_fill
+from spackle.fill import far_fill
 from spackle.inpaint.exemplar import Exemplar, exemplar
 from spackle.inpaint.exemplar_dense import dense_exemplar
 from spackle.residual import dense
+from spackle.residual.beyond_border import fill_around
+from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
 
@@ -29,10 +30,6 @@ BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
 FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
-SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
-WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
-WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
-SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,20 +65,18 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
     """Seeds for every cell of a view (covered cells keep what they show).
 
     What a hole reveals depends on why it is there. Behind a surface of the photo the far side of the rim continues;
-    beyond the frame of the photo's camera nothing was in front, and near and far go on alike.
+    beyond the frame of the photo's camera nothing was in front, and what reaches the frame goes on.
     """
     known = _sources(cues)
     if not bool(known.any()):
         # Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any.
         uv = cell_centers(camera).to(cues.rgb)
         return Seeds(uv, torch.full_like(cues.alpha, 0.1), torch.zeros_like(uv), torch.full_like(cues.rgb, 0.5), 0.1)
-    colors = cues.rgb.permute(2, 0, 1)
-    across, _ = far_fill(cues.inverse_depth, colors[:0], known, far_bias=0.0)
-    bias = FAR_BIAS * _inside(across, camera, photo_camera)
-    filled, rgb = far_fill(cues.inverse_depth, colors, known, far_bias=bias)
+    across, _ = far_fill(cues.inverse_depth, cues.rgb.permute(2, 0, 1)[:0], known, far_bias=0.0)
+    inside, uv = _inside(across, camera, photo_camera), beside(cell_centers(camera), across)
+    filled, rgb = fill_around(cues, across, uv, known, inside, camera, photo_camera)
     inverse_depth = placed_behind(filled, cues.mask, cues, BLOB_CELLS)
     slope = surface_slope(inverse_depth) / CELL
-    uv = beside(cell_centers(camera), inverse_depth)
     return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
 
 
@@ -202,103 +197,11 @@ class Rim:
         at the rim goes on along it more often than not, coarse structure farther than fine. Where no line meets
         anything, the seeds stay.
         """
-        fields = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach(), cues.mask
-        eye = photo_camera.position.double()
-        # Where the view sees the photo's eye: homogeneous, for it may lie at infinity.
-        epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
-        if dense.on_gpu(cues.mask):
-            far, near, steps = dense.walk(*fields, epipole.tolist(), SAME_DEPTH, SAME_EYE)
-        else:
-            uv, rgb, depths, mask = (image.contiguous().numpy() for image in fields)
-            grids = (rgb.copy(), rgb.copy(), np.zeros(mask.shape, np.float32))
-            run_chunks(
-                lambda start, stop: _walk(start, stop, uv, rgb, depths, mask, epipole, SAME_DEPTH, *grids),
-                len(mask),
-                GRAIN,
-            )
-            far, near, steps = (torch.from_numpy(grid) for grid in grids)
+        uv, rgb, depths = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach()
+        far, near, steps = walk(uv, rgb, depths, cues.mask, camera, photo_camera.position)
         unmirrored = (near == far).all(-1, keepdim=True)
-        far = _widened(far, cues.mask, WIDENING * steps)
+        far = widened(far, cues.mask, WIDENING * steps)
         near = torch.where(unmirrored, far, near)
         patches = patches or fitting_patches(cues, seeds)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
         return Rim(far, near, steps, patches.rgb, patches.mismatch, beyond)
-
-
-def _widened(rgb: Tensor, mask: Tensor, radius: Tensor) -> Tensor:
-    """Colours [h, w, 3], those of masked cells the mean of the masked ones within about `radius` [h, w] cells.
-
-    A small thing at a rim would go on as a streak to the other side of the hole; so it fades as far off as it is large.
-    """
-    finest = torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1) * mask[..., None]
-    sums, level = finest.permute(2, 0, 1)[None], radius.clamp_min(1).log2()
-    colors, finer = rgb, rgb
-    for number in range(1, WIDEST_LEVEL + 1):
-        sums = avg_pool2d(sums, 2, ceil_mode=True, count_include_pad=False)
-        whole = interpolate(sums, scale_factor=2**number, mode="bilinear")[0, :, : len(mask), : mask.shape[1]]
-        coarser = (whole[:3] / whole[3:].clamp_min(1e-6)).permute(1, 2, 0)
-        share = (level - (number - 1)).clamp(0, 1)[..., None]
-        colors = torch.where(share > 0, torch.lerp(finer, coarser, share), colors)
-        finer = coarser
-    return torch.where(mask[..., None], colors, rgb)
-
-
-@kernel
-def _walk(
-    start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
-    found: Any, mirrored: Any, distance: Any,
-) -> None:  # fmt: skip
-    """The masked cells of the rows start..stop."""
-    height, width = depths.shape
-    for y in range(start, stop):
-        for x in range(width):
-            if not mask[y, x]:
-                continue
-            across, down = _line(epipole, uv[y, x, 0], uv[y, x, 1])
-            best, steps, side = np.float32(np.inf), 0, 0.0
-            for turn in (1.0, -1.0):
-                k = _steps_to_rim(mask, y, x, turn * down, turn * across)
-                if k == 0:
-                    continue
-                v, u = _cell(y, x, k * turn * down, k * turn * across)
-                if depths[v, u] < best:
-                    best, steps, side = depths[v, u], k, turn
-            if steps == 0:
-                continue
-            dy, dx = side * down, side * across
-            v, u = _cell(y, x, steps * dy, steps * dx)
-            found[y, x], mirrored[y, x], distance[y, x] = rgb[v, u], rgb[v, u], steps
-            q, p = _cell(y, x, 2 * steps * dy, 2 * steps * dx)
-            if 0 <= q < height and 0 <= p < width and not mask[q, p]:
-                ratio = depths[q, p] / best
-                if ratio < same and ratio > 1.0 / same:
-                    mirrored[y, x] = rgb[q, p]
-
-
-@kernel
-def _line(epipole: Any, u: float, v: float) -> Any:
-    """The unit vector x, y along a pixel's epipolar line; along the rows where both eyes are one."""
-    x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
-    length = np.sqrt(x * x + y * y)
-    if length > SAME_EYE:
-        return x / length, y / length
-    return 1.0, 0.0
-
-
-@kernel
-def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
-    """Steps of one cell to the first that is not masked; 0 where the picture ends before."""
-    height, width = mask.shape
-    k = 1
-    while True:
-        v, u = _cell(y, x, k * dy, k * dx)
-        if v < 0 or u < 0 or v >= height or u >= width:
-            return 0
-        if not mask[v, u]:
-            return k
-        k += 1
-
-
-@kernel
-def _cell(y: int, x: int, dy: float, dx: float) -> Any:
-    return int(np.floor(y + dy + 0.5)), int(np.floor(x + dx + 0.5))

@@ -1,0 +1,85 @@
+"""What goes on beyond the photo's border, where the camera has never looked: floors as floors, walls as walls, sky as sky.
+
+What reaches the border goes on along the line on which the camera moved, at the same distance from the photo's plane.
+So a level floor and a wall stay the planes that they are, from wherever they are seen.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera, beside
+from spackle.fill import FAR_BIAS, far_fill
+from spackle.inpaint.exemplar import nearest_known
+from spackle.inpaint.exemplar_dense import dense_nearest_known
+from spackle.residual import dense
+from spackle.residual.epipolar_walk import WIDENING, walk, widened
+from spackle.residual.hole_features import Cues
+
+AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go on beyond it
+DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
+MIXED, CARRIED = (
+    0.04,
+    0.12,
+)  # of the view's width: up to the one colours are those of all around, from the other carried
+LEAST = 1e-9
+
+
+def fill_around(
+    cues: Cues, across: Tensor, uv: Tensor, known: Tensor, inside: Tensor, camera: Camera, photo_camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Inverse depth [h, w] and colours [3, h, w] of all cells, the photo continued beyond its border.
+
+    Args:
+        cues: of the view.
+        across: [h, w] inverse depth, in holes that of all around.
+        uv: [h, w, 2] pixels of the cells.
+        known: [h, w] bool: cells to start from.
+        inside: [h, w] bool: cells whose points lie in the photo's frame; what is behind goes on there.
+        camera, photo_camera: the view's and the photo's.
+    """
+    mask, rgb, bias = cues.mask, cues.rgb.permute(2, 0, 1), FAR_BIAS * inside
+    beyond = mask & ~inside
+    if not dense.on_gpu(mask) and not bool(beyond.any()):
+        return far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
+    # A cell's point times its inverse depth, in the photo's frame: ray + shift * inverse depth.
+    pixels = uv.double()
+    here, there = (view.world_to_camera.double() for view in (camera, photo_camera))
+    motion = beside(there @ here.inverse(), pixels)
+    lens, photo_lens = (beside(view.K, pixels) for view in (camera, photo_camera))
+    rays = (pixels - lens[:2, 2]) / lens.diagonal()[:2] @ motion[:3, :2].T + motion[:3, 2]
+    points = rays + motion[:3, 3] * across[..., None]
+    depth = points[..., 2:].clamp_min(LEAST)
+    place = points[..., :2] / depth * photo_lens.diagonal()[:2] + photo_lens[:2, 2]
+    size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
+    ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
+    values = torch.stack([*rgb, (across / depth[..., 0]).float(), ends.float()], dim=-1)
+
+    found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
+    apart = _cells_to_known(mask)
+    led = beyond & (steps > 0) & (steps <= DETOUR * apart)
+    hidden = led & (found[..., 4] == 0)  # by something nearer, beside which the photo goes on
+    found = widened(found, led & ~hidden, WIDENING * steps)
+    away = 1 / found[..., 3].double().clamp_min(LEAST) - motion[2, 3]
+    led = led & ~hidden & (away > 0) & (rays[..., 2] > 0)
+    nearest = torch.where(known, cues.inverse_depth, 0).amax()
+    carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).float().clamp_min(LEAST), nearest)
+
+    bias = torch.where(hidden, FAR_BIAS, bias)
+    depths, mixed = far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
+    depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :3].movedim(-1, 0), mixed)
+    others = beyond & ~led
+    if dense.on_gpu(mask) or bool(others.any()):
+        refilled = far_fill(depths, colors, led | known, far_bias=bias)
+        depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
+    share = ((apart / mask.shape[1] - MIXED) / (CARRIED - MIXED)).clamp(0, 1) * beyond
+    return depths, torch.lerp(mixed, colors, share)
+
+
+def _cells_to_known(mask: Tensor) -> Tensor:
+    """[h, w] cells from each masked one to the nearest that is not."""
+    gpu = dense.on_gpu(mask)
+    near = dense_nearest_known(mask) if gpu else torch.from_numpy(nearest_known(mask.contiguous().numpy()))
+    rows, columns = (torch.arange(size, device=mask.device) for size in mask.shape)
+    return torch.hypot((near[0] - rows[:, None]).float(), (near[1] - columns).float())

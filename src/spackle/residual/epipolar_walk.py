@@ -1,0 +1,129 @@
+"""Walks from the cells of a hole along their epipolar lines to its far rim, and what they bring from there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from spackle._numba import kernel
+from spackle.camera import Camera
+from spackle.device import run_chunks
+from spackle.residual import dense
+from spackle.residual.hole_features import CELL, GRAIN
+
+SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
+SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
+WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
+WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
+
+
+def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor) -> dense.Walk:
+    """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
+
+    Args:
+        uv: [h, w, 2] pixels of the cells.
+        values: [h, w, c] what is brought.
+        inverse_depth: [h, w], positive.
+        mask: [h, w] bool.
+        camera: of the view.
+        eye: [3] position of the other camera, through whose image the lines go.
+    """
+    there = eye.double()
+    # Where the view sees that eye: homogeneous, for it may lie at infinity.
+    epipole = (camera.K.to(there) @ camera.to_camera(there)).detach().cpu().numpy()
+    if dense.on_gpu(mask):
+        return dense.walk(uv, values, inverse_depth, mask, epipole.tolist(), SAME_DEPTH, SAME_EYE)
+    places, colors, depths, closed = (image.contiguous().numpy() for image in (uv, values, inverse_depth, mask))
+    grids = (colors.copy(), colors.copy(), np.zeros(closed.shape, np.float32))
+    run_chunks(
+        lambda start, stop: _walk(start, stop, places, colors, depths, closed, epipole, SAME_DEPTH, *grids),
+        len(closed),
+        GRAIN,
+    )
+    return dense.Walk(*(torch.from_numpy(grid) for grid in grids))
+
+
+def widened(values: Tensor, mask: Tensor, radius: Tensor) -> Tensor:
+    """Values [h, w, c], those of masked cells the mean of the masked ones within about `radius` [h, w] cells.
+
+    A small thing at a rim would go on as a streak to the other side of the hole; so it fades as far off as it is large.
+    """
+    level = radius.clamp(1, 2**WIDEST_LEVEL).log2()[..., None]
+    sums = (torch.cat([values, level, torch.ones_like(level)], dim=-1) * mask[..., None]).permute(2, 0, 1)
+    halvings = [sums]
+    for _ in range(WIDEST_LEVEL):
+        halvings.append(avg_pool2d(halvings[-1], 2, ceil_mode=True, count_include_pad=False))
+    wide = torch.zeros_like(halvings[-1][:-1])
+    for number, sums in reversed(list(enumerate(halvings))):
+        *_, height, width = sums.shape
+        means = sums / sums[-1:].clamp_min(1e-9)  # the last: whether a masked cell is there
+        share = (means[-2] - number).clamp(0, 1)
+        coarser = interpolate(wide[None], scale_factor=2, mode="bilinear")[0, :, :height, :width]
+        own = torch.lerp(means[:-2], coarser[:-1] / coarser[-1:].clamp_min(1e-6), share)
+        wide = torch.cat([own, means[-1:]])
+    return torch.where(mask[..., None], wide[:-1].permute(1, 2, 0), values)
+
+
+@kernel
+def _walk(
+    start: int, stop: int, uv: Any, rgb: Any, depths: Any, mask: Any, epipole: Any, same: float,
+    found: Any, mirrored: Any, distance: Any,
+) -> None:  # fmt: skip
+    """The masked cells of the rows start..stop."""
+    height, width = depths.shape
+    for y in range(start, stop):
+        for x in range(width):
+            if not mask[y, x]:
+                continue
+            across, down = _line(epipole, uv[y, x, 0], uv[y, x, 1])
+            best, steps, side = np.float32(np.inf), 0, 0.0
+            for turn in (1.0, -1.0):
+                k = _steps_to_rim(mask, y, x, turn * down, turn * across)
+                if k == 0:
+                    continue
+                v, u = _cell(y, x, k * turn * down, k * turn * across)
+                if depths[v, u] < best:
+                    best, steps, side = depths[v, u], k, turn
+            if steps == 0:
+                continue
+            dy, dx = side * down, side * across
+            v, u = _cell(y, x, steps * dy, steps * dx)
+            found[y, x], mirrored[y, x], distance[y, x] = rgb[v, u], rgb[v, u], steps
+            q, p = _cell(y, x, 2 * steps * dy, 2 * steps * dx)
+            if 0 <= q < height and 0 <= p < width and not mask[q, p]:
+                ratio = depths[q, p] / best
+                if ratio < same and ratio > 1.0 / same:
+                    mirrored[y, x] = rgb[q, p]
+
+
+@kernel
+def _line(epipole: Any, u: float, v: float) -> Any:
+    """The unit vector x, y along a pixel's epipolar line; along the rows where both eyes are one."""
+    x, y = epipole[0] - epipole[2] * u, epipole[1] - epipole[2] * v
+    length = np.sqrt(x * x + y * y)
+    if length > SAME_EYE:
+        return x / length, y / length
+    return 1.0, 0.0
+
+
+@kernel
+def _steps_to_rim(mask: Any, y: int, x: int, dy: float, dx: float) -> int:
+    """Steps of one cell to the first that is not masked; 0 where the picture ends before."""
+    height, width = mask.shape
+    k = 1
+    while True:
+        v, u = _cell(y, x, k * dy, k * dx)
+        if v < 0 or u < 0 or v >= height or u >= width:
+            return 0
+        if not mask[v, u]:
+            return k
+        k += 1
+
+
+@kernel
+def _cell(y: int, x: int, dy: float, dx: float) -> Any:
+    return int(np.floor(y + dy + 0.5)), int(np.floor(x + dx + 0.5))
