@@ -16,7 +16,7 @@ GROUND, BACK = 1.0, 6.0  # y of the floor and z of the wall
 
 
 def room() -> tuple[Cues, Tensor, Tensor]:
-    """What the view shows of a floor and a wall that go on for ever, inverse depths of all cells and which are floor."""
+    """What the view shows of a floor and a wall without end; the inverse depth of all cells, and which are floor."""
     rays = VIEW.unproject(cell_centers(VIEW), torch.ones(VIEW.height // CELL, VIEW.width // CELL)) - VIEW.position
     reach = torch.where(rays[..., 1] > 0, GROUND / rays[..., 1].clamp_min(1e-6), torch.inf)
     floor, depth = reach < BACK / rays[..., 2], torch.minimum(reach, BACK / rays[..., 2])

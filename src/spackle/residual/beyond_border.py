@@ -1,4 +1,4 @@
-"""What goes on beyond the photo's border, where the camera has never looked: floors as floors, walls as walls, sky as sky.
+"""What goes on beyond the photo's border, where no camera has looked: floors as floors, walls as walls, sky as sky.
 
 What reaches the border goes on along the line on which the camera moved, at the same distance from the photo's plane.
 So a level floor and a wall stay the planes that they are, from wherever they are seen.
