@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
-from spackle.formats import atomic_path, save_ply, save_png, save_video
+from spackle.formats import save_ply, save_png, save_video
 from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
@@ -52,14 +52,19 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
         cameras = scene_path(base, camera, "rotate-forward", DISPARITY)
         sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
         with reporter.stage("complete", seconds) as step:
-            scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step)
+            seen: dict[int, Tensor] = {}
+            scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step, seen=seen)
         with reporter.stage("write", seconds):
             save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
             scene.save(output / "scene.ply", disparity=DISPARITY)
         with reporter.stage("video", seconds) as step:
-            total = len(cameras)
-            views = ((step(i + 1, total), scene.render(camera, renderer).rgb)[1] for i, camera in enumerate(cameras))
-            save_video(views, output / "video.mp4")
+
+            def frames() -> Iterator[Tensor]:
+                for index, camera in enumerate(cameras):
+                    yield seen[index] if index in seen else scene.render(camera, renderer).rgb
+                    step(index + 1, len(cameras))
+
+            save_video(frames(), output / "video.mp4")
         holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
         with reporter.stage("truth", seconds):
             scores = _compare_truth(prediction, pair, renderer, output)
@@ -172,5 +177,4 @@ def _save_sheet(first: tuple[str, Tensor], rows: list[list[tuple[str, Tensor]]],
     for r, row in enumerate(rows):
         for c, (name, image) in enumerate(row):
             place(name, image, (c + 1) * (width + MARGIN), r * (height + MARGIN))
-    with atomic_path(path) as temporary:
-        sheet.save(temporary)
+    save_png(torch.from_numpy(np.array(sheet)), path)

@@ -21,7 +21,7 @@ def thumbnail(picture: Tensor, side: int) -> Tensor:
 
 
 def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:
-    """Write sRGB [H, W, 3] in 0..1 with 8 bits a channel; InputError where that cannot be."""
+    """Write sRGB [H, W, 3] in 0..1, or uint8, with 8 bits a channel; InputError where that cannot be."""
     if rgb.ndim != 3 or rgb.shape[2] != 3:
         raise ValueError(f"a colour picture is [H, W, 3], got {tuple(rgb.shape)}")
     _save(Image.fromarray(to_bytes(rgb).numpy()), path)
@@ -36,4 +36,4 @@ def save_gray_png(gray: Tensor, path: str | os.PathLike[str]) -> None:
 
 def _save(image: Image.Image, path: str | os.PathLike[str]) -> None:
     with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG")
+        image.save(temporary, format="PNG", compress_level=4)  # half the time of 6, for files 1 % larger
