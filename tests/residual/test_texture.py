@@ -16,11 +16,11 @@ from spackle.camera_path import DepthRange, trajectory
 from spackle.filters import blurred
 from spackle.inpaint import InpainterOptions
 from spackle.inpaint.protocol import PlainInpainter
-from spackle.residual import Completer, Seeds, hole_mask
+from spackle.residual import Completer, Cues, Seeds, hole_mask
 from spackle.residual.complete import PAINTED_VIEWS
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import from_cells, in_cells
-from spackle.residual.seeds import FINE_SPREAD_PX, fitting_patches
+from spackle.residual.seeds import FINE_SPREAD_PX, Rim, fitting_patches
 from spackle.residual.texture import (
     CONTINUED_CELLS,
     EXEMPLAR,
@@ -28,6 +28,7 @@ from spackle.residual.texture import (
     TEXTURE_PX,
     ExemplarTexture,
     PaintedTexture,
+    _in_proportion,
     _magnified,
     continued,
     sharpened,
@@ -153,3 +154,20 @@ def test_beyond_the_photos_border_its_nearest_cells_go_on_if_they_are_as_far_awa
         depths = math.log(float(seeds.inverse_depth[y, x] / cues.inverse_depth[row, column])) / SAME_DEPTH
         share = math.exp((1 - float(apart.min())) / CONTINUED_CELLS - depths**2)
         torch.testing.assert_close(found[y, x], (1 - share) * structure[y, x] + share * cues.rgb[row, column])
+
+
+def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
+    """A calm wall and a lively one: noise that is as strong everywhere fits in one hole and not in the other."""
+    mask = torch.zeros(48, 96, dtype=torch.bool)
+    mask[16:32, 12:36] = mask[16:32, 60:84] = True
+    noise = 0.1 * torch.randn(96, 192, 3, generator=torch.Generator().manual_seed(0))
+    calm = ~from_cells(mask[..., None, None, None].expand(48, 96, 2, 2, 1))[..., 0]
+    calm[:, 96:] = False
+    flat = torch.ones(48, 96)
+    cues = Cues(flat[..., None].expand(-1, -1, 3), flat, flat, mask)
+    seeds = Seeds(torch.zeros(48, 96, 2), flat, torch.zeros(48, 96, 2), cues.rgb)
+    rim = Rim(cues.rgb, cues.rgb, flat, cues.rgb, flat, mask)
+    factors = _in_proportion(torch.where(calm[..., None], 0.1 * noise, noise), cues, seeds, rim)
+    assert float(factors[20:28, 16:32].mean()) == pytest.approx(0.1, abs=0.04)
+    assert float(factors[20:28, 64:80].mean()) > 0.85
+    assert float(factors.max()) <= 1

@@ -19,10 +19,8 @@ from spackle.residual.hole_features import Cues
 
 AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go on beyond it
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
-MIXED, CARRIED = (
-    0.04,
-    0.12,
-)  # of the view's width: up to the one colours are those of all around, from the other carried
+MIXED, CARRIED = 0.04, 0.12  # of the view's width from the border: colours of all around; those that are led there
+FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
 LEAST = 1e-9
 
 
@@ -41,30 +39,29 @@ def fill_around(
     """
     mask, rgb, bias = cues.mask, cues.rgb.permute(2, 0, 1), FAR_BIAS * inside
     beyond = mask & ~inside
-    if not dense.on_gpu(mask) and not bool(beyond.any()):
+    if not dense.on_gpu(mask) and int(beyond.count_nonzero()) <= FEW * beyond.numel():
         return far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
     # A cell's point times its inverse depth, in the photo's frame: ray + shift * inverse depth.
-    pixels = uv.double()
     here, there = (view.world_to_camera.double() for view in (camera, photo_camera))
-    motion = beside(there @ here.inverse(), pixels)
-    lens, photo_lens = (beside(view.K, pixels) for view in (camera, photo_camera))
-    rays = (pixels - lens[:2, 2]) / lens.diagonal()[:2] @ motion[:3, :2].T + motion[:3, 2]
+    motion = beside(there @ here.inverse(), uv)
+    lens, photo_lens = (beside(view.K, uv) for view in (camera, photo_camera))
+    rays = (uv - lens[:2, 2]) / lens.diagonal()[:2] @ motion[:3, :2].T + motion[:3, 2]
     points = rays + motion[:3, 3] * across[..., None]
     depth = points[..., 2:].clamp_min(LEAST)
     place = points[..., :2] / depth * photo_lens.diagonal()[:2] + photo_lens[:2, 2]
     size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
     ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    values = torch.stack([*rgb, (across / depth[..., 0]).float(), ends.float()], dim=-1)
+    values = torch.stack([*rgb, across / depth[..., 0], ends.float()], dim=-1)
 
     found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     apart = _cells_to_known(mask)
     led = beyond & (steps > 0) & (steps <= DETOUR * apart)
     hidden = led & (found[..., 4] == 0)  # by something nearer, beside which the photo goes on
     found = widened(found, led & ~hidden, WIDENING * steps)
-    away = 1 / found[..., 3].double().clamp_min(LEAST) - motion[2, 3]
+    away = 1 / found[..., 3].clamp_min(LEAST) - motion[2, 3]
     led = led & ~hidden & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, cues.inverse_depth, 0).amax()
-    carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).float().clamp_min(LEAST), nearest)
+    carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
     bias = torch.where(hidden, FAR_BIAS, bias)
     depths, mixed = far_fill(cues.inverse_depth, rgb, known, far_bias=bias)

@@ -11,8 +11,9 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import avg_pool2d, interpolate
 
+from spackle.fill import FAR_BIAS, far_fill
 from spackle.filters import blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.inpaint.exemplar import Exemplar, nearest_known
@@ -25,6 +26,8 @@ from spackle.residual.seeds import Rim, Seeds
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
 GOOD_FIT = 0.18  # mismatch at which a third of the texture is left
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
+CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
+LEAST_ENERGY = 1e-7
 OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
 STEPS = 2
 
@@ -55,11 +58,31 @@ class ExemplarTexture:
         """See `Texture.colors`."""
         known = in_cells(rendering.rgb)
         found = from_cells(patches.of_blocks(known))
-        gain = (-patches.mismatch / GOOD_FIT).exp()[..., None, None, None].expand_as(known)
-        fine = from_cells(gain) * (found - blurred(found, TEXTURE_PX))
+        fine = found - blurred(found, TEXTURE_PX)
+        gain = (-patches.mismatch / GOOD_FIT).exp() * _in_proportion(fine, cues, seeds, rim)
+        fine *= from_cells(gain[..., None, None, None].expand_as(known))
         smooth = in_cells(_magnified(continued(structure, cues, seeds, rim), cues.mask))
         masked = cues.mask[..., None, None, None]
         return from_cells(torch.where(masked, smooth, known)) + fine
+
+
+def _in_proportion(fine: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+    """Factors [h, w] of at most 1 that make texture [2h, 2w, 3] no stronger than that of the surface around a hole.
+
+    Strokes of what is lively elsewhere do not belong on a calm wall, even where they fit what is there.
+    """
+    energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], cues.mask.float()
+    parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole])
+    coarse = avg_pool2d(parts, COARSE, ceil_mode=True, count_include_pad=False)
+    own, masked, others, seen = blurred(coarse.permute(1, 2, 0), CALM_CELLS / COARSE).unbind(-1)
+    every = (slice(None, None, COARSE),) * 2
+    around = (others / seen.clamp_min(1e-6)).clamp_min(LEAST_ENERGY).log()
+    known, bias = ~cues.mask[every], FAR_BIAS * ~rim.beyond[every]
+    if on_gpu(hole) or bool(known.any()):
+        around = far_fill(seeds.inverse_depth[every], around[None], known, far_bias=bias)[1][0]
+    share = (around.exp() / (own / masked.clamp_min(1e-6)).clamp_min(LEAST_ENERGY)).sqrt().clamp_max(1)
+    factors = interpolate(share[None, None], scale_factor=COARSE, mode="bilinear")[0, 0]
+    return factors[: hole.shape[0], : hole.shape[1]]
 
 
 EXEMPLAR = ExemplarTexture()
