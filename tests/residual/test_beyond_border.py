@@ -34,7 +34,7 @@ def test_a_floor_stays_level_and_a_wall_goes_on() -> None:
     assert float(off.median()) < 0.015
     assert float(off.mean()) < 0.06
     for surface, color in ((floor, FLOOR), (~floor, WALL)):
-        assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.04
+        assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.07
 
 
 def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:
@@ -52,7 +52,7 @@ def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:
     )
     seeds = make_seeds(shown, VIEW, PHOTO)
     there = seeds.rgb[row : row + 8, edge + 16 :]
-    assert float((there - WALL).abs().mean()) < 0.15  # of 0.53
+    assert float((there - WALL).abs().mean()) < 0.25  # of 0.53
 
 
 def test_a_view_of_the_photos_own_frame_has_nothing_beyond() -> None:

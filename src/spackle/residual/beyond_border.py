@@ -19,7 +19,7 @@ from spackle.residual.hole_features import Cues
 
 AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go on beyond it
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
-MIXED, CARRIED = 0.04, 0.12  # of the view's width from the border: colours of all around; those that are led there
+MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those that are led there
 FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
 LEAST = 1e-9
 

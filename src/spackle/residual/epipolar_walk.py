@@ -18,6 +18,7 @@ from spackle.residual.hole_features import CELL, GRAIN
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
+CRISP = 0.12  # of a view's width: so far the network sees a rim as it is
 WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
 
 

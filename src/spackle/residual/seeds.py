@@ -21,7 +21,7 @@ from spackle.inpaint.exemplar import Exemplar, exemplar
 from spackle.inpaint.exemplar_dense import dense_exemplar
 from spackle.residual import dense
 from spackle.residual.beyond_border import fill_around
-from spackle.residual.epipolar_walk import WIDENING, walk, widened
+from spackle.residual.epipolar_walk import CRISP, WIDENING, walk, widened
 from spackle.residual.hole_features import CELL, GRAIN, Cues
 from spackle.surface import surface_slope
 
@@ -200,7 +200,7 @@ class Rim:
         uv, rgb, depths = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach()
         far, near, steps = walk(uv, rgb, depths, cues.mask, camera, photo_camera.position)
         unmirrored = (near == far).all(-1, keepdim=True)
-        far = widened(far, cues.mask, WIDENING * steps)
+        far = widened(far, cues.mask, WIDENING * (steps - CRISP * cues.mask.shape[1]).clamp_min(0))
         near = torch.where(unmirrored, far, near)
         patches = patches or fitting_patches(cues, seeds)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
