@@ -193,13 +193,18 @@ def opened(browser: Any, url: str, script: str | None = None) -> Opened:
     return found
 
 
+def settled(page: Any, promise: str) -> None:
+    """Wait for a promise of the page, no longer than for all else (`evaluate` waits for ever)."""
+    page.wait_for_function(f"{promise}.then(() => true)")
+
+
 @pytest.fixture(scope="module")
 def shown(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
     """The single file, opened from the disk."""
     file = tmp_path_factory.mktemp("page") / "box.html"
     file.write_bytes(single_html(page_of_box()))
     found = opened(browser, file.as_uri())
-    found.page.evaluate("spackle.ready")
+    settled(found.page, "spackle.ready")
     yield found
     assert found.said == []  # through all of the tests
     found.page.context.close()
@@ -225,7 +230,7 @@ def picture(page: Any, width: int, height: int) -> Tensor:
 
 def canvas(page: Any) -> Tensor:
     """What is on the screen where the canvas is."""
-    page.evaluate("spackle.settled()")
+    settled(page, "spackle.settled()")
     return pixels(page.locator("#view").screenshot())
 
 
@@ -336,11 +341,11 @@ def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path)
     with ViewerServer(page_files(), complete_photo) as server:
         server.show(page_of_box("First"))
         found = opened(browser, server.url)
-        found.page.evaluate("spackle.ready")
+        settled(found.page, "spackle.ready")
         assert found.page.title() == "First · Spackle"
         found.page.locator("#file").set_input_files(photo)
         found.page.get_by_role("heading", name="my photo.png").wait_for()
-        found.page.evaluate("spackle.settled()")
+        settled(found.page, "spackle.settled()")
         found.page.get_by_text("Gaussians · a").wait_for()
         assert found.page.get_by_role("alert").text_content() == "a; b"
         assert found.said == []
