@@ -197,6 +197,17 @@ def focal_from_exif(tags: dict[int, object], width: int, height: int) -> float |
     return film_to_pixels(film, width, height) if plausible(film) else None
 
 
+class _BoundedFile(io.BufferedReader):
+    """Reads no more than is left: a PNG's chunk that claims 4 GB would be allocated before it is found cut off."""
+
+    def __init__(self, raw: io.FileIO) -> None:
+        super().__init__(raw)
+        self.size = os.fstat(raw.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(size if size is None else min(size, max(0, self.size - self.tell())))
+
+
 def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -> T:
     """Open a picture of at most 100 megapixels and return what `read` makes of it, its pixels not yet loaded.
 
@@ -212,8 +223,8 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
                 import pillow_heif
 
                 pillow_heif.register_heif_opener()
-            with Image.open(path) as image:
-                check_pixels(image.width, image.height, os.path.getsize(path), path)
+            with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
+                check_pixels(image.width, image.height, file.size, path)
                 return read(image)
     except InputError:
         raise

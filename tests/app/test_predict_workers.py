@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -76,21 +78,32 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tm
     assert list(content(out)) == list(content(place / "alone"))
 
 
-def test_a_worker_that_is_killed_is_a_line_and_the_same_command_goes_on(place: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("everybody", "code", "says"),
+    [(False, 2, "a worker process died"), (True, 130, "stopped; the same command goes on from here\ninterrupted")],
+)
+def test_killed_workers_are_a_line_and_the_same_command_goes_on(
+    place: Path, tmp_path: Path, everybody: bool, code: int, says: str
+) -> None:
     out = tmp_path / "out"
 
     def kill() -> None:
         deadline = time.monotonic() + 240
         while not list(out.glob("*/.new")) and time.monotonic() < deadline:
             time.sleep(0.002)
-        multiprocessing.active_children()[0].kill()
+        if not everybody:
+            multiprocessing.active_children()[0].kill()
+            return
+        os.kill(os.getpid(), signal.SIGTERM)  # as a scheduler ends a job
+        for child in multiprocessing.active_children():
+            child.terminate()
 
     killer = threading.Thread(target=kill)
     killer.start()
     done = predict(place, out, "--workers", 2)
     killer.join()
-    assert done.code == 2
-    assert "a worker process died" in done.lines[-1]
+    assert done.code == code
+    assert says in "\n".join(done.lines[-2:])
     assert ".lock" not in names_in(out)
     assert predict(place, out, "--workers", 2).code == 1
     assert list(content(out)) == list(content(place / "alone"))

@@ -45,6 +45,12 @@ def png(side: int, kind: int, depth: int = 8) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
+def claiming(png: bytes) -> bytes:
+    """The same, but that its data are 4 GB long."""
+    at = png.index(b"IDAT")
+    return png[: at - 4] + b"\xff" * 4 + png[at:]
+
+
 def npz(side: int) -> bytes:
     head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({side}, {side})}}".ljust(117) + "\n"
     array = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + head.encode() + np.ones(side * side).tobytes()
@@ -56,6 +62,7 @@ def npz(side: int) -> bytes:
     [
         ("pictures", "a.gif", gif(9_999)),
         *(("pictures", "a.png", png(side, 2)) for side in (9_999, 5_600)),
+        ("pictures", "a.png", claiming(png(64, 2))),
         ("depth", "a.png", png(9_999, 0, 16)),
         ("depth", "a.npz", npz(5_600)),
     ],

@@ -102,19 +102,22 @@ def _predict_by_workers(
     here = (predictor.photos, predictor.output, predictor.options, predictor.shared)
     open_predictor = partial(Predictor.open, *here, verbose=reporter.verbose, word=word)
     failed, ready = 0, total - len(left)
+    done = ready
     with (
         asked_to_stop(alone=True) as stop,
         reporter.steps("photos", ready, total) as step,
-        at_work(ray, workers, open_predictor, left, reporter.log) as results,
+        at_work(ray, workers, open_predictor, left, reporter.log, stop) as results,
     ):
         for done, result in enumerate(results, ready + 1):
             for what in result.said:
                 reporter.log(what) if isinstance(what, str) else reporter.result(what)
             failed += result.failed
             step(done, result.photo)
-            if stop() and done < total:
-                reporter.log("stopped; the same command goes on from here")
-                raise KeyboardInterrupt
+            if stop():
+                break
+    if done < total:
+        reporter.log("stopped; the same command goes on from here")
+        raise KeyboardInterrupt
     return failed
 
 

@@ -102,7 +102,7 @@ class _Build:
                 return self._finish(0.0)
             total: Seconds = {}
             makers = self.options.processes, partial(Maker.of, self.options)
-            with timed("wall", total), at_work(ray, *makers, self.jobs, self.reporter.log) as results:
+            with timed("wall", total), at_work(ray, *makers, self.jobs, self.reporter.log, stop) as results:
                 for done, result in enumerate(results, ready + 1):
                     self._keep(result)
                     self._write_ready()

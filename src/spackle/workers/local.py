@@ -82,9 +82,9 @@ def threads_of_torch(count: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def at_work_here(
-    workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J]
+    workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J], stop: Callable[[], bool]
 ) -> Iterator[Iterator[R]]:
-    """As `at_work`, on this machine; InputError also if a worker dies."""
+    """As `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
     if workers.count == 1 or len(jobs) < 2:
         with threads_of_torch(workers.threads):
             worker = open_worker()
@@ -94,13 +94,13 @@ def at_work_here(
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(workers.threads, open_worker))
     try:
-        yield results_of((pool.submit(_make, job) for job in jobs), IN_HAND * count)
+        yield results_of((pool.submit(_make, job) for job in jobs), IN_HAND * count, stop)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def results_of(futures: Iterable[Future[R]], most: int = 1) -> Iterator[R]:
-    """Results as they come, of at most `most` futures at a time."""
+def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], bool] = lambda: False) -> Iterator[R]:
+    """Results as they come, of at most `most` futures at a time; no more once SIGTERM came to all processes."""
     left, pending = iter(futures), set[Future[R]]()
     try:
         while pending := pending | set(itertools.islice(left, most - len(pending))):
@@ -108,6 +108,8 @@ def results_of(futures: Iterable[Future[R]], most: int = 1) -> Iterator[R]:
             for future in done:
                 yield future.result()
     except BrokenProcessPool as error:
+        if stop():
+            return
         raise InputError(
             "a worker process died, most likely for want of memory: take fewer --workers; the same command goes on"
         ) from error

@@ -138,14 +138,20 @@ class RemoteWorker:
 
 
 def at_work(
-    ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J], log: Log
+    ray: Any,
+    workers: Workers,
+    open_worker: Callable[[], PhotoWorker[J, R]],
+    jobs: Sequence[J],
+    log: Log,
+    stop: Callable[[], bool],
 ) -> AbstractContextManager[Iterator[R]]:
     """Results as they come, in any order: from this process with one worker, from several, or on the cluster `ray`.
 
-    Each process calls `open_worker`, which is pickled, once. InputError where no job can be done.
+    Each process calls `open_worker`, which is pickled, once. InputError where no job can be done. Where SIGTERM, of
+    which `stop` tells, ends the processes of this machine, the results end, too.
     """
     if ray is None:
-        return at_work_here(workers, open_worker, jobs)
+        return at_work_here(workers, open_worker, jobs, stop)
     return _at_work_on(ray, workers, open_worker, jobs, log)
 
 
