@@ -278,6 +278,7 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
     ("tanks", "Truck/sparse/0/points3D.bin", "\xff" * 30, "points3D.bin: "),
     ("eth3d", f"{MODEL}/images.txt", "1 1 0 0 0 0 0 4 a.jpg\n\n" * 2, "images.txt: "),  # a number is missing
     ("eth3d", f"{MODEL}/images.txt", "1 1 0 0 0 0 0 1e300 4 a.jpg\n\n" * 2, "images.txt: "),
+    ("eth3d", f"{MODEL}/points3D.txt", f"{'9' * 400} -1 0 3 1 2 3 0.5 1 0\n", "points3D.txt: "),
     ("eth3d", f"{MODEL}/cameras.txt", f"4 PINHOLE {'9' * 400} 36 40 40 24 18\n", "cameras.txt: "),
     ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 1e300 40 24 18\n", "cameras.txt: "),
     ("wildrgbd", f"{WILD}/metadata", f'{{"w": {"9" * 400}, "h": 3, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}', "metadata: "),

@@ -90,7 +90,10 @@ def read_model(folder: Path) -> Model:
         views = [_view(lenses[camera], name, pose, observed) for pose, camera, name, observed in images]
     except (KeyError, ValueError) as error:
         raise InputError(f"{at[1]}: {reason_in_a_line(error)}: the file is damaged") from error
-    table = np.array([point for point in points if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
+    try:
+        table = np.array([point for point in points if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
+    except OverflowError as error:  # a number of 400 digits
+        raise InputError(f"{at[2]}: {reason_in_a_line(error)}: the file is damaged") from error
     table = table[(np.abs(table[:, :4]) <= [2**53, LARGEST, LARGEST, LARGEST]).all(axis=1)]
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Model(tuple(sorted(views, key=lambda view: view.name)), table[:, 0].astype(np.int64), table[:, 1:4])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,7 @@ def _read_tanks(scene: Path) -> tuple[Model, list[Posed]]:
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
     photos = [top / "images" / view.name for view in model.views]
     for photo in photos:
-        if not photo.is_file():
+        if not os.path.isfile(photo):  # False for a name that is too long
             raise InputError(f"{photo}: no such photo, but {folder} has it: put the scene's photos there")
     return model, posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
 
