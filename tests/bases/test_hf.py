@@ -521,6 +521,7 @@ INPUT = "preprocessor_config.json"
             writing(INDEX, '{"weight_map": {"a": "model-00001-of-00002.safetensors"}}'),
             "not there .model-00001-of-00002.s",
         ),
+        (writing(INDEX, f'{{"weight_map": {{"a": "{"a" * 5000}"}}}}'), "names weights that are not there"),
         (writing(INDEX, '{"weight_map": []}'), "names weights that are not there"),
         (writing(INDEX, "{"), "model.safetensors.index.json cannot be read"),
     ],

@@ -195,6 +195,7 @@ def case_of(name: str, number: int, seeds: Sequence[Files]) -> Files:
 
 def _problem(name: str, files: Files, folder: Path) -> str | None:
     """What a reader did that it must not do."""
+    from av import FFmpegError
     from readers import READERS
 
     from spackle.errors import InputError
@@ -206,11 +207,14 @@ def _problem(name: str, files: Files, folder: Path) -> str | None:
     try:
         READERS[name].read(folder)
     except InputError as error:
-        links: BaseException | None = error
-        while links is not None:
-            if isinstance(links, MemoryError) or "allocate" in str(links):
-                return f"took more than {BYTES:,} bytes: {error}"
-            links = links.__cause__ or links.__context__
+        links = [cause := error]
+        while cause := cause.__cause__ or cause.__context__:
+            links.append(cause)
+        # FFmpeg itself refuses any block over 2 GB, with the same error as where there is no memory.
+        if not any(isinstance(link, FFmpegError) for link in links) and any(
+            isinstance(link, MemoryError) or "allocate" in str(link) for link in links
+        ):
+            return f"took more than {BYTES:,} bytes: {error}"
     except Exception:
         return traceback.format_exc(limit=-4)
     return None
@@ -252,10 +256,10 @@ def fuzz(names: Sequence[str], count: int, first: int = 0) -> Iterator[tuple[str
                 waiting += [([name], number + 1, start + many - number - 1)] if number + 1 < start + many else []
 
 
-def replayed(path: Path) -> str | None:
-    """What a saved case does in a process of its own that it must not do."""
-    done = subprocess.run([sys.executable, __file__, "--replay", path], capture_output=True, text=True)
-    return done.stdout + done.stderr if done.returncode else None
+def replayed(*paths: Path) -> list[str]:
+    """What saved cases do in a process of their own, a line each."""
+    done = subprocess.run([sys.executable, __file__, "--replay", *paths], capture_output=True, text=True)
+    return (done.stdout + done.stderr).splitlines()
 
 
 def main() -> int:
@@ -263,7 +267,7 @@ def main() -> int:
     parser.add_argument("-n", type=int, default=300, help="cases of each reader")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--readers", nargs="*", help="only these")
-    parser.add_argument("--replay", type=Path, help="a case that was written here before")
+    parser.add_argument("--replay", type=Path, nargs="+", help="cases that were written here before")
     parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
@@ -271,15 +275,16 @@ def main() -> int:
         child(json.loads(names), int(first), int(count), Path(log))
         return 0
     if given.replay:
-        case = json.loads(given.replay.read_text())
-        files = {file: base64.b64decode(data) for file, data in case["files"].items()}
         import readers  # noqa: F401  # before memory is bounded
 
+        problems = []
         with tempfile.TemporaryDirectory() as place:
             _bound_memory()
-            problem, _ = _bounded(case["reader"], files, Path(place, "case"))
-        print(problem or "as it should be")
-        return bool(problem)
+            for case in map(json.loads, map(Path.read_text, given.replay)):
+                files = {file: base64.b64decode(data) for file, data in case["files"].items()}
+                problems.append(_bounded(case["reader"], files, Path(place, "case"))[0])
+                print(problems[-1] or "as it should be", flush=True)
+        return any(problems)
     from readers import READERS
 
     failed = 0

@@ -57,19 +57,15 @@ def npz(side: int) -> bytes:
     return sealed({"a.npz": array})["a.npz"]
 
 
-@pytest.mark.parametrize(
-    ("reader", "name", "data"),
-    [
+def test_small_files_that_announce_much_stay_below_the_bound(tmp_path: Path) -> None:
+    cases = [
         ("pictures", "a.gif", gif(9_999)),
         *(("pictures", "a.png", png(side, 2)) for side in (9_999, 5_600)),
         ("pictures", "a.png", claiming(png(64, 2))),
         ("depth", "a.png", png(9_999, 0, 16)),
         ("depth", "a.npz", npz(5_600)),
-    ],
-    ids=lambda value: f"{len(value)} bytes" if isinstance(value, bytes) else value,
-)
-def test_small_files_that_announce_much_stay_below_the_bound(
-    tmp_path: Path, reader: str, name: str, data: bytes
-) -> None:
-    assert len(data) < 1_000_000
-    assert fuzz.replayed(fuzz.save(reader, 0, {name: base64.b64encode(data).decode()}, tmp_path)) is None
+    ]
+    assert all(len(data) < 1_000_000 for _, _, data in cases)
+    coded = [(reader, {name: base64.b64encode(data).decode()}) for reader, name, data in cases]
+    saved = [fuzz.save(reader, number, files, tmp_path) for number, (reader, files) in enumerate(coded)]
+    assert fuzz.replayed(*saved) == ["as it should be"] * len(cases)

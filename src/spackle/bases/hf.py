@@ -316,7 +316,7 @@ def _lacks(folder: Path, files: list[str]) -> str:
     if WEIGHTS[0] in files and index.is_file():
         parts = _read_settings(folder, index.name, str(folder)).get("weight_map")
         names = {str(name) for name in parts.values()} if isinstance(parts, dict) else set()
-        absent = sorted(name for name in names if not (folder / name).is_file())
+        absent = sorted(name for name in names if not os.path.isfile(folder / name))  # nor one too long
         if absent or not names:
             return f"{index.name} names weights that are not there ({', '.join(absent)[:80]}): give its files again"
     elif WEIGHTS[0] in files and not (folder / WEIGHTS[0]).is_file():
