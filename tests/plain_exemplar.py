@@ -31,7 +31,7 @@ class Subject:
         self.padded, step = np.pad(self.level.rgb, [(RADIUS, RADIUS)] * 2 + [(0, 0)]), 0.05 / max(height, width) ** 2
         self.target = (self.padded, self.level.weights, self.level.traits, self.sources, traits, np.float32(step))
         tones = 2**0.5 * blurred(rgb, 4.0).permute(2, 0, 1).numpy()
-        marks = [0.04 * z[None] / z[~hole].std(correction=0), tones, step**0.5 * np.indices(hole.shape)]
+        marks = [0.15 * z[None] / z[~hole].std(correction=0), tones, step**0.5 * np.indices(hole.shape)]
         self.marks = np.stack([np.concatenate(marks)[..., ::way] for way in (1, -1)])
         every = np.argwhere(self.valid).astype(np.int32)
         self.places = every[:: len(every) // len(self.cells)][: len(self.cells)]

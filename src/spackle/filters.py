@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -17,6 +17,15 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
         mass = _weighted_sum(image.new_ones(image.shape[dim]), weights, 0)
         image = _weighted_sum(image, weights, dim) / mass.view(-1, *[1] * (-1 - dim))
     return image
+
+
+def broadly_blurred(image: Tensor, sigma: float) -> Tensor:
+    """About `blurred` for a picture [H, W, C] and many pixels: means of squares are blurred, and magnified again."""
+    step = max(int(sigma / 2), 1)
+    means = avg_pool2d(image.movedim(-1, 0)[None], step, ceil_mode=True, count_include_pad=False)[0]
+    coarse = blurred(means.movedim(0, -1), sigma / step).movedim(-1, 0)
+    height, width, _ = image.shape
+    return interpolate(coarse[None], scale_factor=step, mode="bilinear")[0, :, :height, :width].movedim(0, -1)
 
 
 def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:

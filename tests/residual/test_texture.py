@@ -15,16 +15,20 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
 from spackle.filters import blurred
 from spackle.inpaint import InpainterOptions
+from spackle.inpaint.exemplar import Exemplar
 from spackle.inpaint.protocol import PlainInpainter
+from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, Seeds, hole_mask
 from spackle.residual.complete import PAINTED_VIEWS
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import from_cells, in_cells
-from spackle.residual.seeds import FINE_SPREAD_PX, Rim, fitting_patches
+from spackle.residual.seeds import FINE_SPREAD_PX, Rim
 from spackle.residual.texture import (
+    BROAD,
     CONTINUED_CELLS,
     EXEMPLAR,
     SAME_DEPTH,
+    SHOWN,
     TEXTURE_PX,
     ExemplarTexture,
     PaintedTexture,
@@ -122,8 +126,9 @@ def test_a_scene_asks_for_its_widest_views_and_goes_on_from_the_exemplar(monkeyp
 def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None:
     subject, camera = box_view(0.3)
     view = CPU.render(subject.base, camera)
-    cues, seeds, rim = features_of(view, camera, subject.photo_camera)
-    patches = fitting_patches(cues, seeds)
+    cues, seeds, _ = features_of(view, camera, subject.photo_camera)
+    rim, patches = Rim.with_patches(cues, seeds, camera, subject.photo_camera)
+    rim = dataclasses.replace(rim, beyond=torch.zeros_like(rim.beyond))
     structure = torch.rand(cues.rgb.shape, generator=torch.Generator().manual_seed(0))
     found, plain = (
         EXEMPLAR.colors(
@@ -136,6 +141,30 @@ def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None
     assert float(blurred(fine, 4 * TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
     smooth = in_cells(sharpened(from_cells(in_cells(view.rgb)), 1))[~cues.mask]
     assert float((in_cells(plain)[~cues.mask] - smooth).abs().mean()) < 0.02
+
+
+def test_beyond_the_photos_border_more_of_patches_is_shown_but_nothing_broad() -> None:
+    """Stripes on a wall, brighter where patches come from; the structure that meets them is grey."""
+    stripes = (0.5 + 0.1 * torch.sin(torch.arange(192) * math.tau / 16)).view(1, -1, 1).repeat(96, 1, 3)
+    stripes[:, :96] += 0.2
+    mask = torch.zeros(48, 96, dtype=torch.bool)
+    mask[:, 56:] = True
+    rows, columns = torch.meshgrid(torch.arange(48), torch.arange(96), indexing="ij")
+    matches = torch.stack([torch.zeros_like(rows), rows, columns - 48], dim=-1).where(mask[..., None], torch.tensor(-1))
+    rgb, flat, nothing = in_cells(stripes).mean((2, 3)), torch.ones(48, 96), torch.zeros(48, 96)
+    cues, seeds = Cues(rgb, flat, flat, mask), Seeds(torch.zeros(48, 96, 2), flat, torch.zeros(48, 96, 2), rgb)
+    view = Rendering(stripes, torch.ones(96, 192), torch.ones(96, 192))
+    structure, patches = torch.full_like(rgb, 0.5), Exemplar(rgb, nothing, matches)
+    inner = slice(24, 72), slice(144, 176)
+    amplitudes, means = [], []
+    for beyond in (mask, torch.zeros_like(mask)):
+        rim = Rim(rgb, rgb, nothing, rgb, nothing, beyond)
+        found = EXEMPLAR.colors(structure, view, cues, seeds, rim, patches)[inner]
+        amplitudes.append(float((found - found.mean()).abs().mean() / (stripes[inner] - 0.5).abs().mean()))
+        means.append(float(found.mean()))
+    fine, broad = (1 - math.exp(-2 * (math.pi * width / 16) ** 2) for width in (TEXTURE_PX, BROAD * 192))
+    assert amplitudes == pytest.approx([(1 - SHOWN) * fine + SHOWN * broad, fine], rel=0.1)
+    assert means == pytest.approx([0.5, 0.5], abs=0.02)
 
 
 def test_beyond_the_photos_border_its_nearest_cells_go_on_if_they_are_as_far_away() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from spackle.filters import blurred, greatest_around, greatest_in_windows
+from spackle.filters import blurred, broadly_blurred, greatest_around, greatest_in_windows
 
 
 @pytest.mark.parametrize(("size", "sigma"), [((9, 13), 0.65), ((9, 13), 2.5), ((2, 5), 4.0), ((1, 1), 1.0)])
@@ -22,6 +22,13 @@ def test_a_blur_is_that_of_a_plain_loop_and_nothing_lies_beyond_the_border(size:
         expected[..., y, x, :] = total / mass
     torch.testing.assert_close(blurred(pictures, sigma), expected, rtol=1e-6, atol=0)
     torch.testing.assert_close(blurred(pictures[1, 0].float(), sigma), expected[1, 0].float())
+
+
+@pytest.mark.parametrize(("size", "sigma"), [((60, 81), 5.0), ((60, 81), 0.8), ((120, 101), 20.0), ((3, 4), 9.0)])
+def test_a_broad_blur_is_about_the_exact_one(size: tuple[int, int], sigma: float) -> None:
+    picture = blurred(torch.rand(*size, 3, generator=torch.Generator().manual_seed(0)), 1.0)
+    exact, found = blurred(picture, sigma), broadly_blurred(picture, sigma)
+    assert float((found - exact).abs().mean()) <= 0.1 * float((picture - exact).abs().mean())
 
 
 @pytest.mark.parametrize("reach", [0, 1, 2, 3, 9])

@@ -4,7 +4,7 @@ Each cell of a hole looks for a patch of the known part that fits what is around
 All patches over a cell vote for its colour. Both steps alternate from coarse to fine (Wexler et al. 2007). A patch fits
 by its colours, by the depth and the tone of its centre, and by being near:
 
-    cost = mean |I(p + o) - I(q + o)|²  +  (0.04 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
+    cost = mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
 
 over the offsets o of a patch, with colours I, the logarithm z of inverse depth and the tone L, which is the caller's
 guess, blurred. The mean counts a cell of the hole the less the deeper it lies.
@@ -38,7 +38,7 @@ MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
 TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
 FADING = 0.8  # weight of a cell in a patch, for each cell that it lies deeper in the hole
 FAINTEST_CELL = np.float32(1e-30)  # weight of the deepest: still far from what float32 rounds to nothing
-DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.04, math.sqrt(2), 0.05
+DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
 LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
 SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
 FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8

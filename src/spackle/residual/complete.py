@@ -24,7 +24,7 @@ from spackle.residual.hole_features import CELL, MASK_THRESHOLD, Cues, hole_area
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
 from spackle.residual.rim_underlay import rim_underlay
-from spackle.residual.seeds import BEHIND, FINE_SPREAD_PX, Rim, Seeds, fitting_patches, make_seeds
+from spackle.residual.seeds import BEHIND, FINE_SPREAD_PX, Rim, Seeds, make_seeds
 from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture, sharpened
 from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first, reach_of
 
@@ -210,8 +210,7 @@ class Completer:
         if self.network is None and self.texture is None:
             cells = compose(chosen, None, camera)
         else:
-            patches = fitting_patches(cues, seeds)
-            rim = Rim.of(cues, seeds, camera, self.photo_camera, patches)
+            rim, patches = Rim.with_patches(cues, seeds, camera, self.photo_camera)
             if self.network is not None:
                 deltas = predict_deltas(self.network, cues, seeds, rim, self.precision)[cues.mask]
             cells = compose(chosen, deltas, camera)

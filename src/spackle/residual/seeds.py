@@ -17,7 +17,8 @@ from spackle._numba import kernel
 from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.fill import far_fill
-from spackle.inpaint.exemplar import Exemplar, exemplar
+from spackle.filters import blurred
+from spackle.inpaint.exemplar import TONE_CELLS, Exemplar, exemplar
 from spackle.inpaint.exemplar_dense import dense_exemplar
 from spackle.residual import dense
 from spackle.residual.beyond_border import fill_around
@@ -171,12 +172,6 @@ def cell_centers(camera: Camera) -> Tensor:
     return camera.even().pixel_centers(stride=CELL)
 
 
-def fitting_patches(cues: Cues, seeds: Seeds) -> Exemplar:
-    """Patches of the view that fit its masked cells, for their tone by the seeds' colours."""
-    guess = torch.where(cues.mask[..., None], seeds.rgb, cues.rgb)
-    return (dense_exemplar if dense.on_gpu(guess) else exemplar)(guess, cues.mask, seeds.inverse_depth)
-
-
 @dataclasses.dataclass(frozen=True)
 class Rim:
     """For each masked cell, what its line meets; elsewhere the cell itself."""
@@ -184,24 +179,37 @@ class Rim:
     rgb: Tensor  # [h, w, 3] sRGB at the far rim, the farther off the more of it
     mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
     distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
-    exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that fit
+    exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that fit; their tone is the seeds'
     mismatch: Tensor  # [h, w] how badly they fit: root of their mean squared difference; 0 elsewhere
     beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
 
     @staticmethod
-    def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera, patches: Exemplar | None = None) -> Rim:
+    def of(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera) -> Rim:
+        """See `with_patches`."""
+        return Rim.with_patches(cues, seeds, camera, photo_camera)[0]
+
+    @staticmethod
+    def with_patches(cues: Cues, seeds: Seeds, camera: Camera, photo_camera: Camera) -> tuple[Rim, Exemplar]:
         """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
         photo's eye. So that line leads from a hole to the surface that goes on behind, and structure
         at the rim goes on along it more often than not, coarse structure farther than fine. Where no line meets
         anything, the seeds stay.
+
+        Also returns patches of the view that fit its masked cells: by the seeds' colours behind an object, by what is
+        mirrored beyond the photo's border. There the seeds mix all that reaches the border, which looks like fog, and
+        fog is what would fit it.
         """
         uv, rgb, depths = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach()
         far, near, steps = walk(uv, rgb, depths, cues.mask, camera, photo_camera.position)
         unmirrored = (near == far).all(-1, keepdim=True)
         far = widened(far, cues.mask, WIDENING * (steps - CRISP * cues.mask.shape[1]).clamp_min(0))
         near = torch.where(unmirrored, far, near)
-        patches = patches or fitting_patches(cues, seeds)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
-        return Rim(far, near, steps, patches.rgb, patches.mismatch, beyond)
+        tone = torch.where(cues.mask[..., None], rgb, cues.rgb)
+        find = dense_exemplar if dense.on_gpu(tone) else exemplar
+        patches = find(torch.where(beyond[..., None], near, tone), cues.mask, depths)
+        toned = (patches.rgb - blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
+        found = torch.where(beyond[..., None], toned, patches.rgb)
+        return Rim(far, near, steps, found, patches.mismatch, beyond), patches

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import blurred
+from spackle.filters import blurred, broadly_blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.inpaint.exemplar import Exemplar, nearest_known
 from spackle.inpaint.exemplar_dense import dense_nearest_known
@@ -24,7 +24,9 @@ from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in
 from spackle.residual.seeds import Rim, Seeds
 
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-GOOD_FIT = 0.18  # mismatch at which a third of the texture is left
+GOOD_FIT = 0.25  # mismatch at which a third of the texture is left
+SHOWN, SHOWN_FIT = 0.5, 0.36  # share of patches beyond the photo's border, and mismatch at which a third of it is left
+BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of them is not shown
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
 CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
 LEAST_ENERGY = 1e-7
@@ -50,7 +52,11 @@ class Texture(Protocol):
 
 
 class ExemplarTexture:
-    """High frequencies of the view itself over the residual's structure; at its border the photo goes on."""
+    """High frequencies of the view itself over the residual's structure; at its border the photo goes on.
+
+    Beyond the photo's border the residual knows least, and its structure is fog: half of what is not broad there is
+    that of patches.
+    """
 
     def colors(
         self, structure: Tensor, rendering: Rendering, cues: Cues, seeds: Seeds, rim: Rim, patches: Exemplar
@@ -60,10 +66,14 @@ class ExemplarTexture:
         found = from_cells(patches.of_blocks(known))
         fine = found - blurred(found, TEXTURE_PX)
         gain = (-patches.mismatch / GOOD_FIT).exp() * _in_proportion(fine, cues, seeds, rim)
-        fine *= from_cells(gain[..., None, None, None].expand_as(known))
         smooth = in_cells(_magnified(continued(structure, cues, seeds, rim), cues.mask))
-        masked = cues.mask[..., None, None, None]
-        return from_cells(torch.where(masked, smooth, known)) + fine
+        picture = from_cells(torch.where(cues.mask[..., None, None, None], smooth, known))
+        other = found - broadly_blurred(found - picture, BROAD * found.shape[1])
+        shown = SHOWN * (-patches.mismatch / SHOWN_FIT).exp() * rim.beyond
+        gain, shown = (
+            from_cells(share[..., None, None, None].expand(*share.shape, CELL, CELL, 1)) for share in (gain, shown)
+        )
+        return torch.lerp(picture + gain * fine, other, shown)
 
 
 def _in_proportion(fine: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
