@@ -7,6 +7,7 @@ along the line on which the hole opened.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaus
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
 FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
+ALIKE = 1.4  # factor by which inverse depths may differ where what is mirrored goes on beyond the photo's border
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 
 
@@ -198,18 +200,21 @@ class Rim:
         anything, the seeds stay.
 
         Also returns patches of the view that fit its masked cells: by the seeds' colours behind an object, by what is
-        mirrored beyond the photo's border. There the seeds mix all that reaches the border, which looks like fog, and
-        fog is what would fit it.
+        mirrored beyond the photo's border if that is as far away. There the seeds mix all that reaches the border,
+        which looks like fog, and fog is what would fit it.
         """
         uv, rgb, depths = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach()
-        far, near, steps = walk(uv, rgb, depths, cues.mask, camera, photo_camera.position)
-        unmirrored = (near == far).all(-1, keepdim=True)
+        values = torch.cat([rgb, depths[..., None]], dim=-1)
+        far, near, steps = walk(uv, values, depths, cues.mask, camera, photo_camera.position)
+        unmirrored, apart = (near == far).all(-1, keepdim=True), (near[..., 3] / depths).log().abs()
+        far, near = far[..., :3], near[..., :3]
         far = widened(far, cues.mask, WIDENING * (steps - CRISP * cues.mask.shape[1]).clamp_min(0))
         near = torch.where(unmirrored, far, near)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
         tone = torch.where(cues.mask[..., None], rgb, cues.rgb)
         find = dense_exemplar if dense.on_gpu(tone) else exemplar
-        patches = find(torch.where(beyond[..., None], near, tone), cues.mask, depths)
+        goes_on = (beyond & (apart < math.log(ALIKE)))[..., None]
+        patches = find(torch.where(goes_on, near, tone), cues.mask, depths)
         toned = (patches.rgb - blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
         found = torch.where(beyond[..., None], toned, patches.rgb)
         return Rim(far, near, steps, found, patches.mismatch, beyond), patches
