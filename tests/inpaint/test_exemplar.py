@@ -55,6 +55,17 @@ def test_costs_are_the_formulas_and_a_search_comes_near_the_best(size: tuple[int
     assert costs.mean() < 1.06 * np.mean([subject.formula(*cell).min() for cell in cells])
 
 
+def test_what_is_taken_is_counted_by_squares_of_the_picture_and_of_its_mirror() -> None:
+    matches = torch.full((8, 10, 3), -1)
+    matches[0, :3] = torch.tensor([0, 5, 2])
+    matches[1, 0] = torch.tensor([1, 4, 9 - 3])  # the same square, in the mirror
+    matches[7, 9] = torch.tensor([0, 1, 9])
+    expected = torch.zeros(8, 10)
+    expected[0, :3] = expected[1, 0] = 4 / 16
+    expected[7, 9] = 1 / 16
+    assert torch.equal(room.Exemplar(torch.zeros(8, 10, 3), torch.zeros(8, 10), matches).taken(), expected)
+
+
 def test_votes_are_those_of_a_plain_loop() -> None:
     subject = Subject(24, 31)
     places, costs, found = subject.places, subject.costs, np.zeros_like(subject.level.rgb)

@@ -43,6 +43,7 @@ LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell i
 SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
 FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
 BLOCK_CHOICE = 3.0  # how much harder votes for blocks depend on their costs
+BLOCK = 4  # cells along the side of a square, all of which count as taken when one is
 FAR = 1 << 14  # cells to a place that is not there
 GRAIN = 256  # cells that a thread takes at a time
 
@@ -83,6 +84,16 @@ class Exemplar:
         filled = blocks.clone()
         filled[y, x] = total / mass[:, None, None, None]
         return filled
+
+    def taken(self) -> Tensor:
+        """How often what is around each cell's match is taken, for each of its cells: [H, W]; 0 outside of the hole."""
+        there = self.matches[..., 0] >= 0
+        source, row, column = self.matches.long().unbind(-1)
+        height, width = there.shape
+        column = torch.where(source > 0, width - 1 - column, column)
+        number = row // BLOCK * width + column // BLOCK
+        counts = torch.bincount(number[there], minlength=height * width)
+        return torch.where(there, counts[number.clamp_min(0)] / BLOCK**2, 0)
 
 
 class ExemplarInpainter(PlainInpainter):

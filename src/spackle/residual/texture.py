@@ -26,6 +26,7 @@ from spackle.residual.seeds import Rim, Seeds
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
 GOOD_FIT = 0.25  # mismatch at which a third of the texture is left
 SHOWN, SHOWN_FIT = 0.5, 0.36  # share of patches beyond the photo's border, and mismatch at which a third of it is left
+OFTEN = 4.0  # what is taken more often is a pattern, and fades
 BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of them is not shown
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
 CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
@@ -65,11 +66,12 @@ class ExemplarTexture:
         known = in_cells(rendering.rgb)
         found = from_cells(patches.of_blocks(known))
         fine = found - blurred(found, TEXTURE_PX)
-        gain = (-patches.mismatch / GOOD_FIT).exp() * _in_proportion(fine, cues, seeds, rim)
+        often = (patches.taken() / OFTEN).clamp_min(1)
+        gain = (-patches.mismatch / GOOD_FIT).exp() / often * _in_proportion(fine, cues, seeds, rim)
         smooth = in_cells(_magnified(continued(structure, cues, seeds, rim), cues.mask))
         picture = from_cells(torch.where(cues.mask[..., None, None, None], smooth, known))
         other = found - broadly_blurred(found - picture, BROAD * found.shape[1])
-        shown = SHOWN * (-patches.mismatch / SHOWN_FIT).exp() * rim.beyond
+        shown = SHOWN * (-patches.mismatch / SHOWN_FIT).exp() / often * rim.beyond
         gain, shown = (
             from_cells(share[..., None, None, None].expand(*share.shape, CELL, CELL, 1)) for share in (gain, shown)
         )
