@@ -18,7 +18,7 @@ from spackle._numba import kernel
 from spackle.camera import Camera, beside
 from spackle.device import run_chunks
 from spackle.fill import far_fill
-from spackle.filters import blurred
+from spackle.filters import broadly_blurred
 from spackle.inpaint.exemplar import TONE_CELLS, Exemplar, exemplar
 from spackle.inpaint.exemplar_dense import dense_exemplar
 from spackle.residual import dense
@@ -215,6 +215,6 @@ class Rim:
         find = dense_exemplar if dense.on_gpu(tone) else exemplar
         goes_on = (beyond & (apart < math.log(ALIKE)))[..., None]
         patches = find(torch.where(goes_on, near, tone), cues.mask, depths)
-        toned = (patches.rgb - blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
+        toned = (patches.rgb - broadly_blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
         found = torch.where(beyond[..., None], toned, patches.rgb)
         return Rim(far, near, steps, found, patches.mismatch, beyond), patches

@@ -70,12 +70,12 @@ class ExemplarTexture:
         gain = (-patches.mismatch / GOOD_FIT).exp() / often * _in_proportion(fine, cues, seeds, rim)
         smooth = in_cells(_magnified(continued(structure, cues, seeds, rim), cues.mask))
         picture = from_cells(torch.where(cues.mask[..., None, None, None], smooth, known))
-        other = found - broadly_blurred(found - picture, BROAD * found.shape[1])
+        broad = broadly_blurred(found - picture, BROAD * found.shape[1])
         shown = SHOWN * (-patches.mismatch / SHOWN_FIT).exp() / often * rim.beyond
         gain, shown = (
             from_cells(share[..., None, None, None].expand(*share.shape, CELL, CELL, 1)) for share in (gain, shown)
         )
-        return torch.lerp(picture + gain * fine, other, shown)
+        return fine.mul_(gain).add_(picture).lerp_(found.sub_(broad), shown)
 
 
 def _in_proportion(fine: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
