@@ -19,7 +19,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import BaseSettings, open_base, open_loaded
 from spackle.bases.protocol import USUAL_DISPARITY, Base, BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, trajectory
+from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, extremes, trajectory
 from spackle.device import Precision
 from spackle.downloads import installed
 from spackle.errors import InputError
@@ -245,7 +245,7 @@ def predict(
             is given, the best that there is: the depth in the photo's file, else SHARP where its weights have been
             downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
             what could not be used. A network is then loaded for this photo alone: for many, load a base once.
-        kind: the path that the scene is completed for.
+        kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
         disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as the base has it: 0.15 for
             lite, else 0.3.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
@@ -281,6 +281,7 @@ def predict(
         LOG.info("%s: %s", loaded.path.name, choice.note)
     far = prediction.disparity if disparity is None else disparity
     cameras = scene_path(prediction.gaussians, prediction.camera, kind, far)
+    cameras += extremes(prediction.camera.even(), far, DepthRange.of(prediction.gaussians))
     with progress_line("complete", progress) as step:
         made = complete(prediction, cameras, network=network, fill=fill, renderer=renderer, progress=step)
     return dataclasses.replace(made, disparity=far)
