@@ -29,7 +29,9 @@ from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer, Cues, ResidualNet, farthest_first, hole_area_ratio, hole_mask, make_seeds
 from spackle.residual.complete import WIDEST
+from spackle.residual.occlusion_guard import OcclusionGuard
 from spackle.residual.rim_underlay import COARSE, REACH_CELLS, rim_underlay
+from spackle.residual.seeds import Rim
 
 FRAMES = 60
 
@@ -147,6 +149,23 @@ def test_the_neighbours_of_a_completed_view_have_fewer_holes_for_it(
     alone = completer.complete_view(path[index], rendering=before)
     assert same_bits(completer.complete_scene([path[index]], exact=True), alone)
     assert len(completer.complete_scene([path[index]] * 2, exact=True)) > len(alone)
+
+
+def test_what_lies_beneath_a_rim_covers_nothing_that_earlier_views_moved_away_beyond_the_photos_border() -> None:
+    found = motorcycle_base()
+    completer = Completer(found.gaussians, found.camera, CPU)
+    turned = path_of(completer)[44]
+    left, _ = extremes(found.camera, 0.3, DepthRange.of(completer.base))
+    first, view = completer.completed_view(turned)
+    guards = [completer.photo_guard(), OcclusionGuard.of(view, turned)]
+    there = [completer.base, first]
+    before = CPU.render(there, left)
+    without, both = (completer._fill(left, guards, there, before, underlay=underlay)[1] for underlay in (False, True))
+    cues = Cues.of(before)
+    beyond = Rim.of(cues, make_seeds(cues, left, found.camera), left, found.camera).beyond
+    beyond = beyond.repeat_interleave(2, 0).repeat_interleave(2, 1)[: left.height, : left.width]
+    assert int(beyond.sum()) > 10_000
+    assert float((both.rgb - without.rgb)[beyond].abs().max()) < 0.02
 
 
 class Counting(CpuRenderer):

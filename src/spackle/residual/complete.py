@@ -206,7 +206,7 @@ class Completer:
         if not bool(cues.mask.any()):
             return self._nothing
         seeds, eye = make_seeds(cues, camera, self.photo_camera), camera.position
-        chosen, deltas, picture = seeds.select(cues.mask), None, None
+        chosen, deltas, picture, rim = seeds.select(cues.mask), None, None, None
         if self.network is None and self.texture is None:
             cells = compose(chosen, None, camera)
         else:
@@ -231,7 +231,12 @@ class Completer:
             away = away / (1 - BEHIND)
         parts.append(moved_away(cells, eye, away))
         if underlay:
-            parts.append(push_behind(rim_underlay(cues, seeds, camera), eye, guards))
+            filled = seeds.inverse_depth.clone()
+            if rim is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
+                there = rim.beyond[cues.mask] & (away > 0)
+                filled[cues.mask] = torch.where(there, 1 / (depths * away), filled[cues.mask])
+            beneath = rim_underlay(cues, dataclasses.replace(seeds, inverse_depth=filled), camera)
+            parts.append(push_behind(beneath, eye, guards))
         return Gaussians.cat(parts)
 
 
