@@ -117,14 +117,20 @@ def plain_layers(inverse: Image, slope: Image, colors: Image) -> S.Layers:
             shift += 0.5 * (before - after) / bend if bend > 0 else 0
         alpha[p] = np.clip(0.5 + (inside[p] + shift * S.STEP) / ramp, 0, 1)
     for p in zone:
+        pure = mean[:, p[0], p[1]].copy()
         shares = np.array([alpha[p], 1 - alpha[p]])
         rest = colors[p] - shares @ mean[:, p[0], p[1]]
         for side, share in enumerate(shares):
-            limit = 1 if share > S.SOLE else S.MARGIN + S.TEXTURE * math.sqrt(texture[side][p])
+            limit = S.MARGIN + S.TEXTURE * math.sqrt(texture[side][p])
             change = np.clip(rest * share**2 / (shares**3).sum(), -limit, limit)
             mean[side][p] = np.clip(mean[side][p] + change, 0, 1)
         if ((colors[p] - shares @ mean[:, p[0], p[1]]) ** 2).sum() > S.UNEXPLAINED:
-            alpha[p] = inside[p] > 0
+            apart, own = pure[0] - pure[1], colors[p] - pure[1]
+            share = apart @ own / max(apart @ apart, 1e-9)
+            if 0 < share < 1 and ((own - share * apart) ** 2).sum() <= S.UNMIXED:
+                alpha[p], mean[:, p[0], p[1]] = share, pure
+            else:
+                alpha[p] = inside[p] > 0
     return S.Layers(ring, alpha, depth, slopes, mean)
 
 

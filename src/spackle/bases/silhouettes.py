@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle._numba import kernel
+from spackle._numba import inlined_kernel, kernel
 from spackle.bases.edges import Floats
 from spackle.device import run_chunks
 from spackle.surface import EDGE
@@ -20,8 +20,8 @@ FALL = np.float32(3.0)  # pixels at which a sample's weight has fallen to 1/e
 PURE = np.array([1.0, 0.01, 0.15, 1.0], np.float32)  # weight of a colour on the rings around a step
 STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round things fall off towards their rims
 RIM = 2  # rings of the near surface that are put on its plane
-SOLE = np.float32(0.9)  # a surface that has more of a pixel takes any colour
-UNEXPLAINED = np.float32(0.002)  # squared difference from the photo that says that a pixel is no mixture
+UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which the outline does not explain a pixel
+UNMIXED = np.float32(0.006)  # and from the likest mixture of both colours at which it is none of them
 STEEPEST = np.float32(0.003)  # slope of such a plane, relative to the inverse depth
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
 SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
@@ -33,7 +33,10 @@ VARIED = 2.0  # a colour is known to this many times the variance of those that 
 ASTRAY = 4.0  # and to so many times what it has that no mixture would
 NOISE = 4e-4  # and this much more
 OUTLIER = 0.5  # most that one pixel's share may be off, squared
-MARGIN, TEXTURE = np.float32(0.02), np.float32(1.0)  # a hidden colour leaves the mean so far: plus this many deviations
+MARGIN, TEXTURE = (
+    np.float32(0.005),
+    np.float32(1.5),
+)  # a hidden colour leaves the mean so far: plus this many deviations
 GRAIN = 32
 
 
@@ -186,6 +189,19 @@ def _survey(
                 texture[side, y, x] = variance
 
 
+@inlined_kernel
+def _share(colors: Any, color: Any, y: int, x: int) -> Any:
+    """Of a pixel the near colour's share in the likest mixture of both, how unlike that is, and how unlike they are."""
+    apart, along, away = np.float32(0), np.float32(0), np.float32(0)
+    for c in range(3):
+        difference, own = color[0, y, x, c] - color[1, y, x, c], colors[y, x, c] - color[1, y, x, c]
+        apart += difference * difference
+        along += difference * own
+        away += own * own
+    share = along / max(apart, np.float32(1e-9))
+    return share, max(away - share * along, np.float32(0)), apart
+
+
 @kernel
 def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: Any, texture: Any, alpha: Any) -> None:
     """Rows start..stop: the outline shifted across its direction to where the photo has it, and what it covers."""
@@ -202,14 +218,7 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
                 for u in range(max(x - AROUND, 0), min(x + AROUND + 1, width)):
                     if ring[v, u] == 0:
                         continue
-                    apart, along, away = 0.0, 0.0, 0.0
-                    for c in range(3):
-                        difference, own = color[0, v, u, c] - color[1, v, u, c], colors[v, u, c] - color[1, v, u, c]
-                        apart += difference * difference
-                        along += difference * own
-                        away += own * own
-                    share = along / max(apart, 1e-9)
-                    beside = max(away - share * along, 0.0)  # no mixture of the two has that
+                    share, beside, apart = _share(colors, color, v, u)
                     weight = apart / (VARIED * (texture[0, v, u] + texture[1, v, u] + ASTRAY * beside) + NOISE)
                     for k in range(len(costs)):
                         a = 0.5 + (inside[v, u] + (k % shifts - STEPS) * STEP) / RAMPS[k // shifts]
@@ -231,29 +240,39 @@ def _match(start: int, stop: int, colors: Any, ring: Any, inside: Any, color: An
 def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture: Any) -> None:
     """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains.
 
-    A pixel that no such mixture explains, as the shaded edge of a round thing, is all of the surface that it lies in.
+    A pixel that they do not explain has the share of the likest mixture of them as they were; one that is like none, as
+    the shaded edge of a round thing, is all of the surface that it lies in.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)
+    pure = np.zeros((2, 3), np.float32)
     for y in range(height):
         for x in range(width):
             if ring[y, x] == 0:
                 continue
             a, left = alpha[y, x], np.float32(0)
+            share, beside, _ = _share(colors, color, y, x)
             whole = a * a * a + (1 - a) * (1 - a) * (1 - a)
             for c in range(3):
-                rest[c] = colors[y, x, c] - (a * color[0, y, x, c] + (1 - a) * color[1, y, x, c])
+                pure[0, c], pure[1, c] = color[0, y, x, c], color[1, y, x, c]
+                rest[c] = colors[y, x, c] - (a * pure[0, c] + (1 - a) * pure[1, c])
             for c in range(3):
                 missing = rest[c]
                 for side in range(2):
                     part = a if side == 0 else 1 - a
-                    limit = np.float32(1) if part > SOLE else MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
+                    limit = MARGIN + TEXTURE * np.sqrt(texture[side, y, x])
                     change = min(max(rest[c] * part * part / whole, -limit), limit)
                     moved = min(max(color[side, y, x, c] + change, np.float32(0)), np.float32(1))
                     missing -= part * (moved - color[side, y, x, c])
                     color[side, y, x, c] = moved
                 left += missing * missing
-            if left > UNEXPLAINED:
+            if left <= UNEXPLAINED:
+                continue
+            if beside <= UNMIXED and 0 < share < 1:
+                alpha[y, x] = share
+                for c in range(3):
+                    color[0, y, x, c], color[1, y, x, c] = pure[0, c], pure[1, c]
+            else:
                 alpha[y, x] = 1 if inside[y, x] > 0 else 0
 
 
