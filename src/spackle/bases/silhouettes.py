@@ -33,10 +33,7 @@ VARIED = 2.0  # a colour is known to this many times the variance of those that 
 ASTRAY = 4.0  # and to so many times what it has that no mixture would
 NOISE = 4e-4  # and this much more
 OUTLIER = 0.5  # most that one pixel's share may be off, squared
-MARGIN, TEXTURE = (
-    np.float32(0.005),
-    np.float32(1.5),
-)  # a hidden colour leaves the mean so far: plus this many deviations
+MARGIN, TEXTURE = np.float32(0.005), np.float32(1.5)  # a hidden colour leaves the mean so far, plus deviations
 GRAIN = 32
 
 
