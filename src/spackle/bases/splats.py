@@ -21,6 +21,7 @@ from spackle.surface import surface_gaussians, surface_slope
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
 TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
 BACKING_SPREAD = 0.55  # of the backing's for 2×2 pixels
+RIM_BACKING_SPREAD = 0.42  # of those at a near surface's rim, beyond which they would be seen from beside
 LARGE_BACKING_SPREAD = 0.65  # and of its larger ones, which keep away from depth steps
 BACKING_GAP = 0.005  # the backing's distance behind the front, relative
 BACKING_SLOPE_GAP = 2.0  # and so many of its sides further along a slanted surface, so that none pokes through
@@ -159,7 +160,7 @@ def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
 def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     """A wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface; one for more in flat places.
 
-    None is where only the rest of mixed pixels lies behind.
+    None is where only the rest of mixed pixels lies behind, or where pixels of both surfaces lie in one cell.
     """
     behind = pixels.mixed & pixels.near
     deepest = pixels.most.instead(behind, pixels.rest)
@@ -174,13 +175,15 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     # Its colour is the mean of the pixels on that surface.
     same = (cells - far[..., None] < 0.02 * far[..., None]).to(far)
     color = (_cells(deepest.color) * same[..., None]).sum(2) / same.sum(2)[..., None]
-    wanted = ~_cells(behind).any(-1) | _cells(pixels.edge & ~pixels.near).any(-1)
+    has_near, has_far = (_cells(pixels.edge & side).any(-1) for side in (pixels.near, ~pixels.near))
+    wanted = torch.where(has_far, ~has_near, ~_cells(behind).any(-1))
     flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
     tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
     single, tiles = tree.cut(worth / SHOWN)
     surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
-    small = Tiles(1, 1, *(single & wanted).nonzero(as_tuple=True))
-    parts = [(small, BACKING_SPREAD), *((part, LARGE_BACKING_SPREAD) for part in tiles)]
+    parts = [(part, LARGE_BACKING_SPREAD) for part in tiles]
+    for small, spread in ((~has_near, BACKING_SPREAD), (has_near, RIM_BACKING_SPREAD)):
+        parts.append((Tiles(1, 1, *(single & wanted & small).nonzero(as_tuple=True)), spread))
     return [_receded(surface.samples(part, spread, pixels=2), part) for part, spread in parts]
 
 
