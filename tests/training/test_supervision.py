@@ -33,7 +33,7 @@ from spackle.training.sample import HALVED, HOLE_SHARE, Sample, load_sample, ran
 from spackle.training.sources import frame_view, load_pair, reverse_view, right_view, stereo_view
 
 CPU = CpuRenderer()
-RIM_PX = 2  # blobs are wider than pixels: what stands in front hides so much more than a line says, but not less
+RIM_PX = 2  # blobs are no pixels: what stands in front hides so much more or less than a line says
 
 
 def named_tensors(value: object, prefix: str = "") -> dict[str, Tensor]:
@@ -135,7 +135,7 @@ def test_holes_are_what_a_line_to_the_eye_says(seed: int | None, eye: tuple[floa
     expected = behind | beside
     assert int(behind.sum()) > 100
     assert not (hole & ~grow(expected, RIM_PX) & ~outline(scene)).any()  # what the virtual camera sees is no hole
-    assert not (~hole & ~grow(~expected)).any()  # what it does not see is one
+    assert not (~hole & ~grow(~expected, RIM_PX)).any()  # what it does not see is one, but for a rim of what hides it
     assert not (~hole & outside(scene, viewer, margin=1)).any()
 
 
