@@ -9,16 +9,17 @@ PAIRS holds one folder a scene, see `spackle.training.sources.load_pair`. The le
 - Gaussians: of the base, in thousands; s: seconds of the lift, the best of three.
 
 Made scenes (`SCENES`: poles, pipes, balls, leaves, boards before a wall, all reddish before a greenish one) have
-antialiased photos and a depth for each pixel's centre; --small N gives the lift a map of a side N times smaller, as
-networks do. One view of each of the four trajectories at disparity 0.3 and at 0.5 is completed by the seeds and
-compared with the ray-traced truth, where the photo shows what is there or hides it:
+antialiased photos and a depth for each pixel's centre. One view of each of the four trajectories at disparity 0.3 and
+at 0.5 is completed by the seeds and compared with the ray-traced truth, where the photo shows what is there or hides
+it (--made none leaves them out):
 - band, photo: as above, of the base alone.
 - ghost: of the wall's pixels that the things hid in the photo, or that lay within 3 pixels of them, the share whose
   colour is nearer to the things' than to the wall's there.
 - spike: share of the wall's pixels, at least 2 from any thing, that show a depth nearer than the middle between them.
 
-Both are per mille of the pixels that the base covers; "filled" ones are of its holes, and the seeds' doing. -o FOLDER
-gets pictures: completed view above, truth below.
+Both are per mille of the pixels that the base covers; "filled" ones are of its holes, and the seeds' doing. --small N
+gives the lift maps of a side N times smaller, as networks do, those of pairs in 256 steps of inverse depth, as phones
+do. -o FOLDER gets pictures: completed view above, truth below.
 """
 
 from __future__ import annotations
@@ -80,9 +81,11 @@ def timed_lift(rgb: Tensor, depth: DepthMap, camera: Camera) -> tuple[BasePredic
     return base, {"photo": photo, "Gaussians": len(base.gaussians) / 1000, "s": min(seconds)}
 
 
-def measure_pair(folder: Path, output: Path | None) -> dict[str, float]:
+def measure_pair(folder: Path, times: int, output: Path | None) -> dict[str, float]:
     """Of a stereo pair."""
     left, right, depth, camera, beside = load_pair(folder)
+    if times > 1:
+        depth = as_phones_do(RENDERER.render(lift(left, depth, camera).gaussians, camera).depth, times, depth)
     base, numbers = timed_lift(left, depth, camera)
     view = RENDERER.render(base.gaussians, beside)
     psnr = [hole_psnr(view.rgb, right, part) for part in bands(view.alpha)]
@@ -228,6 +231,15 @@ def small(depth: Tensor, times: int) -> Tensor:
     return 1 / F.avg_pool2d(1 / depth[None], times)[0]
 
 
+def as_phones_do(depth: Tensor, times: int, stored: DepthMap) -> DepthMap:
+    """A portrait photo's map: without gaps, a side so many times smaller, 256 steps of inverse depth."""
+    inverse = 1 / small(depth, times)
+    step = float(inverse.max() - inverse.min()) / 255
+    inverse = inverse.min() + ((inverse - inverse.min()) / step).round() * step
+    valid = torch.ones_like(inverse, dtype=torch.bool)
+    return dataclasses.replace(stored, depth=1 / inverse, valid=valid, K=None, quantum=step, quantity="disparity")
+
+
 def measure_made(name: str, times: int, output: Path | None) -> dict[str, float]:
     """Of a made scene."""
     scene = MadeScene(SCENES[name], list(SCENES).index(name))
@@ -291,7 +303,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", metavar="PAIRS")
     parser.add_argument("--scenes", default="", help="words, one of which a pair's name has to have")
     parser.add_argument("--made", default="", help="words, one of which a made scene's name has to have")
-    parser.add_argument("--small", type=int, default=1, help="how many times smaller the made scenes' depth maps are")
+    parser.add_argument("--small", type=int, default=1, help="how many times smaller a side of the depth maps is")
     parser.add_argument("-o", "--output", type=Path, help="a folder for pictures")
     chosen = parser.parse_args()
     if chosen.folder:
@@ -299,9 +311,10 @@ def main() -> None:
         names = [name for name in pairs if any(word in name for word in chosen.scenes.split(","))]
         if not names:
             parser.error(f"{chosen.folder}: no folder with a scene.json in it")
-        table("pair", names, lambda name: measure_pair(pairs[name], chosen.output))
+        table("pair", names, lambda name: measure_pair(pairs[name], chosen.small, chosen.output))
     names = [name for name in SCENES if any(word in name for word in chosen.made.split(","))]
-    table("made", names, lambda name: measure_made(name, chosen.small, chosen.output))
+    if names:
+        table("made", names, lambda name: measure_made(name, chosen.small, chosen.output))
 
 
 if __name__ == "__main__":
