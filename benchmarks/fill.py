@@ -45,12 +45,13 @@ from torch import Tensor
 from spackle import Camera, Rendering, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
+from spackle.evaluation.metrics import GREY, sharpness
 from spackle.evaluation.niqe import NiqeModel, load_niqe, niqe
 from spackle.inpaint.opencv import RADIUS, OpenCV
 from spackle.residual.network import load_residual
 from spackle.scene import complete, scene_path
 from spackle.training.features import FeatureNet, load_features
-from spackle.training.losses import covered, dilate, hole_psnr
+from spackle.training.losses import covered, hole_psnr
 from spackle.training.sources import load_pair
 
 Draw = Callable[[Camera], Rendering]
@@ -59,8 +60,7 @@ Fill = Callable[[BasePrediction, Sequence[Camera], bool], Draw]  # the last: the
 RENDERER = get_renderer()
 DISPARITY, FRAMES = 0.3, 60
 LAYERS = ("conv1", "fire3", "fire5", "fire9")
-GREY = torch.tensor([0.299, 0.587, 0.114])
-ERODED, NEAR, BESIDE, STEP = 7, 2, 20, 0.05  # side of a square; pixels; relative
+NEAR, BESIDE, STEP = 2, 20, 0.05  # pixels; relative
 PAIRS, SAME = range(0, FRAMES - 1, 5), 0.02
 SECONDS, NIQE = ("s a view", "s a path"), ("NIQE", "NIQE photo", "NIQE render")
 
@@ -203,13 +203,6 @@ def ends(path: Sequence[Camera]) -> list[Camera]:
     """The views farthest to the left and to the right."""
     across = [float(camera.position[0]) for camera in path]
     return [path[int(np.argmin(across))], path[int(np.argmax(across))]]
-
-
-def sharpness(rgb: Tensor, truth: Tensor, hole: Tensor) -> float:
-    """Mean magnitude of the grey gradient over the truth's, in the eroded hole."""
-    inner = ~dilate(~hole[None], ERODED)[0]
-    ours, theirs = (torch.hypot(*torch.gradient(picture @ GREY))[inner].mean() for picture in (rgb, truth))
-    return float(ours / theirs)
 
 
 def border(views: Sequence[Tensor], crossings: Sequence[Sequence[Tensor]]) -> float:

@@ -18,6 +18,7 @@ from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
+from spackle.evaluation.metrics import sharpness
 from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
 from spackle.formats import save_ply, save_png, save_video
 from spackle.output_folder import results_folder, write_report
@@ -135,6 +136,7 @@ def _compare_truth(prediction: BasePrediction, pair: StereoPair, renderer: Rende
             for name, image in methods.items()
         },
         "ssim": {name: _ssim(image, pair.right, hole) for name, image in methods.items()},
+        "sharpness": {name: sharpness(image, pair.right, hole) for name, image in methods.items()},
     }
 
 
@@ -149,12 +151,12 @@ def _ssim(image: Tensor, truth: Tensor, where: Tensor) -> float:
 
 def _table(scores: dict[str, Any]) -> Table:
     title = f"True right camera: {scores['har_before']:.1%} holes before, {scores['har_after']:.2%} after"
-    table = Table(title=title)
-    for header in ("against the true right photo", "hole: PSNR", "hole: SSIM", "outside"):
+    table = Table(title=title, caption="sharpness: gradients over the true photo's; PSNR prefers fog")
+    for header in ("against the true photo", "hole: PSNR", "SSIM", "sharpness", "outside"):
         table.add_column(header, justify="left" if header.startswith("against") else "right")
     for name, score in scores["psnr"].items():
-        similar = f"{scores['ssim'][name]:.3f}"
-        table.add_row(name, f"{score['in_hole']:.2f} dB", similar, f"{score['outside']:.2f} dB")
+        psnr, outside = (f"{score[where]:.2f} dB" for where in ("in_hole", "outside"))
+        table.add_row(name, psnr, f"{scores['ssim'][name]:.3f}", f"{scores['sharpness'][name]:.2f}", outside)
     return table
 
 

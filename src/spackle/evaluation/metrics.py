@@ -18,12 +18,14 @@ import torch
 from torch import Tensor
 
 from spackle.errors import reason_in_a_line
-from spackle.training.losses import hole_psnr
+from spackle.training.losses import dilate, hole_psnr
 
 OWN = "own"
 NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
 NOT_INSTALLED = "pyiqa is not installed: pip install 'spackle-nvs[eval]'"
 WINDOW, SIGMA = 11, 1.5  # of SSIM, in pixels (Wang et al. 2004)
+GREY = torch.tensor([0.299, 0.587, 0.114])
+INNER = 7  # side of the square around each pixel of a mask that must lie in it, for its sharpness to count
 C1, C2 = 0.01**2, 0.03**2  # its constants K1 = 0.01, K2 = 0.03, for values in 0..1
 
 Metric = Callable[[Tensor, Tensor | None], float]  # (picture, truth), [H, W, 3] sRGB 0..1 each, to a score
@@ -115,6 +117,17 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     """`hole_psnr` in float64 over the pixels of `mask` [H, W], all where None: in dB, higher is better."""
     everywhere = torch.ones(image.shape[:2], dtype=torch.bool)
     return hole_psnr(image.double(), truth.double(), everywhere if mask is None else mask)
+
+
+def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
+    """Mean magnitude of the grey gradient over the truth's: 1 is as sharp as the truth, 0 is fog.
+
+    It counts within `mask` [H, W] bool, 3 pixels from its border and farther; NaN where that is nothing. `image` and
+    `truth` are [H, W, 3] sRGB 0..1.
+    """
+    inner = ~dilate(~mask[None], INNER)[0]
+    ours, theirs = (torch.hypot(*torch.gradient(picture @ GREY))[inner].mean() for picture in (image, truth))
+    return float(ours / theirs)
 
 
 def ssim_average(similarity: Tensor, mask: Tensor | None = None) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ from spackle.residual.view_order import QUIET_HAR, SettledFrames, farthest_first
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
 WIDEST = 8  # views of a path whose own content stays in front from the first
+OPPOSITE = 2  # views that are completed before anything goes beneath the rims of either
 PAINTED_VIEWS = 2  # of a scene for which an inpainter paints: the widest ones
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
@@ -114,7 +115,8 @@ class Completer:
 
         Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
         added, and may add only behind what the photo, the widest views and the views before it show:
-        in its holes, and beneath their rims.
+        in its holes, and beneath their rims. What lies beneath a rim of one of the two widest views may be
+        what the other one shows in a hole, and fills better: it has to wait for both.
 
         Args:
             cameras: the frames of a path, in their order; with `exact` any views.
@@ -133,6 +135,7 @@ class Completer:
             view = self.renderer.render(self.base, cameras[index])
             guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
         settled, aux, filled = SettledFrames(len(cameras)), self._nothing, 0
+        waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
         enough = CLOSED_HAR if exact else QUIET_HAR
         for count, index in enumerate(order):
             if exact or not settled.known(index):
@@ -144,18 +147,23 @@ class Completer:
                 if not reach:
                     others = [guard for of, guard in guards.items() if of != index]
                     chosen = self._seeds_alone if holes < SEEDS_HAR and not exact else self._for_view(filled)
-                    new, view = chosen._fill(camera, others, [self.base, aux], view, enough, len(cameras) > 1)
+                    beneath: list[Gaussians] | None = [] if len(cameras) > 1 else None
+                    new, view = chosen._fill(camera, others, [self.base, aux], view, enough, beneath)
+                    waiting += [(index, rims) for rims in beneath or ()]
                     filled += 1
                     aux = Gaussians.cat([aux, new])
                     if seen:
                         seen.clear()
                     guards[index] = OcclusionGuard.of(view, camera, self.threshold)
+                    if filled >= OPPOSITE:
+                        aux = Gaussians.cat([aux, *_behind_others(waiting, cameras, guards)])
+                        waiting.clear()
                 elif seen is not None:
                     seen[index] = to_bytes(view.rgb)
                 settled.looked(index, reach)
             if progress:
                 progress(count + 1, len(order))
-        return aux
+        return Gaussians.cat([aux, *_behind_others(waiting, cameras, guards)])
 
     def _fill(
         self,
@@ -164,13 +172,13 @@ class Completer:
         there: Sequence[Gaussians],
         rendering: Rendering,
         enough: float = CLOSED_HAR,
-        underlay: bool = False,
+        beneath: list[Gaussians] | None = None,
     ) -> tuple[Gaussians, Rendering]:
-        """New aux Gaussians for a view, and the view with them; with `underlay` also beneath the rims of its holes."""
+        """New aux Gaussians for a view, and the view with them; `beneath` gets what lies beneath its holes' rims."""
         added = [self._nothing]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = (self._seeds_alone if turn else self)._propose(rendering, camera, guards, underlay)
+            new = (self._seeds_alone if turn else self)._propose(rendering, camera, guards, beneath)
             if not len(new):
                 break
             added.append(new)
@@ -196,11 +204,11 @@ class Completer:
         return dataclasses.replace(self, texture=EXEMPLAR)
 
     def _propose(
-        self, rendering: Rendering, camera: Camera, guards: Sequence[OcclusionGuard], underlay: bool
+        self, rendering: Rendering, camera: Camera, guards: Sequence[OcclusionGuard], beneath: list[Gaussians] | None
     ) -> Gaussians:
         """Masked selection (eq. 7): a Gaussian for each masked cell of a rendering, with a texture one for each pixel.
 
-        With `underlay` also those beneath the rims. All of them behind what the guards show.
+        They lie behind what the guards show. `beneath` gets those beneath the rims, which are not held back yet.
         """
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
@@ -230,14 +238,23 @@ class Completer:
             cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
             away = away / (1 - BEHIND)
         parts.append(moved_away(cells, eye, away))
-        if underlay:
+        if beneath is not None:
             filled = seeds.inverse_depth.clone()
             if rim is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
                 there = rim.beyond[cues.mask] & (away > 0)
                 filled[cues.mask] = torch.where(there, 1 / (depths * away), filled[cues.mask])
-            beneath = rim_underlay(cues, dataclasses.replace(seeds, inverse_depth=filled), camera)
-            parts.append(push_behind(beneath, eye, guards))
+            beneath.append(rim_underlay(cues, dataclasses.replace(seeds, inverse_depth=filled), camera))
         return Gaussians.cat(parts)
+
+
+def _behind_others(
+    waiting: Sequence[tuple[int, Gaussians]], cameras: Sequence[Camera], guards: Mapping[int, OcclusionGuard]
+) -> list[Gaussians]:
+    """What lies beneath the rims of some views, each behind what the guards of all other views show."""
+    return [
+        push_behind(rims, cameras[index].position, [guard for of, guard in guards.items() if of != index])
+        for index, rims in waiting
+    ]
 
 
 def _pixels(chosen: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:

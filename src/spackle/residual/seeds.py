@@ -31,7 +31,7 @@ BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaus
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
 FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
-ALIKE = 1.4  # factor by which inverse depths may differ where what is mirrored goes on beyond the photo's border
+ALIKE = 1.4  # factor by which the inverse depth of what a line meets may differ from that of what goes on there
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 
 
@@ -196,8 +196,8 @@ class Rim:
 
         What moves in front of what, moves along the lines through the epipole, where the view sees the
         photo's eye. So that line leads from a hole to the surface that goes on behind, and structure
-        at the rim goes on along it more often than not, coarse structure farther than fine. Where no line meets
-        anything, the seeds stay.
+        at the rim goes on along it more often than not, coarse structure farther than fine. Where a line meets
+        nothing, or something much nearer than what goes on, the seeds stay.
 
         Also returns patches of the view that fit its masked cells: by the seeds' colours behind an object, by what is
         mirrored beyond the photo's border if that is as far away. There the seeds mix all that reaches the border,
@@ -207,7 +207,8 @@ class Rim:
         values = torch.cat([rgb, depths[..., None]], dim=-1)
         far, near, steps = walk(uv, values, depths, cues.mask, camera, photo_camera.position)
         unmirrored, apart = (near == far).all(-1, keepdim=True), (near[..., 3] / depths).log().abs()
-        far, near = far[..., :3], near[..., :3]
+        in_front = (cues.mask & (far[..., 3] > ALIKE * depths))[..., None]  # what stands there, does not go on behind
+        far, near = (torch.where(in_front, rgb, met[..., :3]) for met in (far, near))
         far = widened(far, cues.mask, WIDENING * (steps - CRISP * cues.mask.shape[1]).clamp_min(0))
         near = torch.where(unmirrored, far, near)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
