@@ -25,6 +25,7 @@ RIM_BACKING_SPREAD = 0.42  # of those at a near surface's rim, beyond which they
 LARGE_BACKING_SPREAD = 0.65  # and of its larger ones, which keep away from depth steps
 BACKING_GAP = 0.005  # the backing's distance behind the front, relative
 BACKING_SLOPE_GAP = 2.0  # and so many of its sides further along a slanted surface, so that none pokes through
+RIM_BACKING_SLOPE_GAP = 0.5  # at a near rim: what stands far behind it shows beyond it, as teeth, from beside
 MAX_BACKING_GAP = 0.2
 WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
@@ -181,15 +182,16 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
     single, tiles = tree.cut(worth / SHOWN)
     surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
-    parts = [(part, LARGE_BACKING_SPREAD) for part in tiles]
-    for small, spread in ((~has_near, BACKING_SPREAD), (has_near, RIM_BACKING_SPREAD)):
-        parts.append((Tiles(1, 1, *(single & wanted & small).nonzero(as_tuple=True)), spread))
-    return [_receded(surface.samples(part, spread, pixels=2), part) for part, spread in parts]
+    kinds = (~has_near, BACKING_SPREAD, BACKING_SLOPE_GAP), (has_near, RIM_BACKING_SPREAD, RIM_BACKING_SLOPE_GAP)
+    parts = [(part, LARGE_BACKING_SPREAD, BACKING_SLOPE_GAP) for part in tiles]
+    for where, spread, slope_gap in kinds:
+        parts.append((Tiles(1, 1, *(single & wanted & where).nonzero(as_tuple=True)), spread, slope_gap))
+    return [_receded(surface.samples(part, spread, pixels=2), part, gap) for part, spread, gap in parts]
 
 
-def _receded(samples: _Samples, tiles: Tiles) -> _Samples:
-    """The backing behind the front; `tiles` are of cells."""
-    reach = 2 * BACKING_SLOPE_GAP * torch.tensor([tiles.width, tiles.height])
+def _receded(samples: _Samples, tiles: Tiles, slope_gap: float) -> _Samples:
+    """The backing behind the front, by so many of its sides along a slanted surface; `tiles` are of cells."""
+    reach = 2 * slope_gap * torch.tensor([tiles.width, tiles.height])
     gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
     recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
     return dataclasses.replace(samples, depth=samples.depth * recede, slope=samples.slope * recede[:, None])
