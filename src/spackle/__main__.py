@@ -1,6 +1,6 @@
 """`python -m spackle` is `spackle`."""
 
-from spackle.cli import main
+from spackle.cli import run
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -17,6 +17,7 @@ from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.device import run_chunks
 from spackle.errors import InputError, reason_in_a_line
 from spackle.photo_frame import PhotoFrame, find_frame
 
@@ -154,9 +155,14 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
     width, height = working_size(photo.width, photo.height, max_side)
     if (width, height) == (photo.width, photo.height):
         return photo
-    channels = (Image.fromarray(photo.rgb[..., c].contiguous().numpy()) for c in range(3))  # one at a time
-    resized = [np.asarray(c.resize((width, height), Image.Resampling.LANCZOS)) for c in channels]
-    rgb = torch.from_numpy(np.stack(resized, axis=-1)).clamp_(0, 1)
+    rgb = photo.rgb.new_empty(height, width, 3)
+
+    def resize(channel: int, _: int) -> None:
+        full = Image.fromarray(photo.rgb[..., channel].contiguous().numpy())
+        resized = np.array(full.resize((width, height), Image.Resampling.LANCZOS))
+        rgb[..., channel] = torch.from_numpy(resized).clamp_(0, 1)
+
+    run_chunks(resize, 3, 1)
     return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width)
 
 

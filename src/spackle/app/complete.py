@@ -18,7 +18,7 @@ from spackle.camera_path import DepthRange, PathError, extremes
 from spackle.errors import InputError
 from spackle.formats import save_gray_png, save_png, save_video
 from spackle.gaussians import Gaussians
-from spackle.image import Photo, resize_photo
+from spackle.image import Photo
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
@@ -52,7 +52,7 @@ class PlannedViews:
 class CompletedPhoto:
     """What became of a photo."""
 
-    photo: Photo  # at its working size
+    photo: Photo  # at its full size
     prediction: BasePrediction
     choice: Choice
     views: PlannedViews
@@ -82,7 +82,6 @@ class PhotoCompleter:
             base = self.base.load(photo, log=reporter.log)
         with reporter.stage("base", seconds) as step:
             prediction, choice = base.predict(step)
-        photo = resize_photo(photo)
         disparity = None
         if self.given_views is None and self.keyframes is None:
             disparity = self.path.far(prediction.disparity)
@@ -111,9 +110,8 @@ class PhotoCompleter:
         if missing := float(prediction.notes.get("depth_filled", 0)):
             reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
         if self.settings.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
-            reporter.log(
-                f"{name}: the depth map is {size}, and was resampled to the photo's {photo.width}×{photo.height}"
-            )
+            width, height = prediction.camera.width, prediction.camera.height
+            reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's {width}×{height}")
 
     def _plan(self, photo: Path, prediction: BasePrediction) -> PlannedViews:
         """The given views; or a path, and where its holes are measured: at its two extremes, or at its keyframes."""

@@ -176,7 +176,7 @@ def make_report(
     given = path.cameras or path.path
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
-        "photo": {"file": photo.path.name, "width": photo.width, "height": photo.height},
+        "photo": {"file": photo.path.name, "width": prediction.camera.width, "height": prediction.camera.height},
         "focal_px": round(prediction.camera.focal[0], 3),
         "focal_source": prediction.lens_source or photo.focal_source,
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
