@@ -54,8 +54,8 @@ def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
         shown, truth = (image[4:-4, 4:-4] for image in (CPU.render(blobs, camera).rgb, wanted))
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
 
-    assert strength(wanted) < 0.92
-    assert 1.05 < strength(sharpened(wanted)) < 1.25  # some more than one: for what votes have blurred
+    assert strength(wanted) < 0.96
+    assert 1.05 < strength(sharpened(wanted)) < 1.6  # more than one: for what votes have blurred
 
 
 def test_a_cells_structure_is_magnified_without_what_is_seen_beside_it() -> None:

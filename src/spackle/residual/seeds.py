@@ -30,7 +30,7 @@ from spackle.surface import surface_slope
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-FINE_SPREAD_PX = SPREAD_PX / 2  # of one blob a pixel, which a wide one for its cell backs
+FINE_SPREAD_PX = 0.5  # of one blob a pixel, which a wide one for its cell backs
 ALIKE = 1.4  # factor by which the inverse depth of what a line meets may differ from that of what goes on there
 OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
 

@@ -24,7 +24,7 @@ from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in
 from spackle.residual.seeds import Rim, Seeds
 
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-GOOD_FIT = 0.5  # mismatch at which a third of the texture is left
+GOOD_FIT = 0.8  # mismatch at which a third of the texture is left
 SHOWN, SHOWN_FIT = 0.5, 0.36  # share of patches beyond the photo's border, and mismatch at which a third of it is left
 OFTEN = 4.0  # what is taken more often is a pattern, and fades
 BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of them is not shown
