@@ -29,7 +29,7 @@ from spackle.device import thread_count
 from spackle.digest import weights_digest
 from spackle.errors import InputError
 from spackle.formats.clip import is_clip
-from spackle.image import PHOTO_SUFFIXES
+from spackle.image import PHOTO_SUFFIXES, check_file
 from spackle.output_folder import as_recorded, check_mark, mark, results_folder
 from spackle.progress import Notes, Reporter
 from spackle.signals import asked_to_stop
@@ -60,6 +60,8 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
         if options.residual.wanted == "auto":  # and no inpainter is opened
             options = dataclasses.replace(options, residual=dataclasses.replace(options.residual, wanted="network"))
     completer = open_completer(options)
+    if not os.path.isdir(photos):
+        check_file(photos, "photo")
     if is_clip(photos):
         with results_folder(output), compiled_ahead(completer.renderer, reporter.log):
             predict_clip(photos, output / found[0].name, completer, options.lens, reporter)

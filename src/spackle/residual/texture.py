@@ -133,7 +133,7 @@ def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     own = torch.stack(torch.meshgrid(*sides, indexing="ij"))
     row, column = (place.clamp_min(0) for place in near)
     apart = (seeds.inverse_depth / cues.inverse_depth[row, column].clamp_min(1e-9)).log()
-    fading = torch.exp((1 - (near - own).float().norm(dim=0)) / CONTINUED_CELLS - (apart / SAME_DEPTH).square())
+    fading = torch.exp((1 - torch.hypot(*(near - own).float())) / CONTINUED_CELLS - (apart / SAME_DEPTH).square())
     return torch.lerp(structure, cues.rgb[row, column], (fading * rim.beyond)[..., None])
 
 
