@@ -34,7 +34,7 @@ STEEPEST_BACKING = 0.01  # and across one of the backing, which stands the farth
 SHOWN = 0.02  # of a difference in the backing is lost
 LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 MOST = 1.5  # Gaussians a pixel
-FITS = 2  # corrections of the colours
+FITS = 3  # corrections of the colours
 UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: corrected ones show as ghosts from beside
 
 
