@@ -22,6 +22,7 @@ STEADY = np.array([1.0, 0.1, 0.5, 1.0], np.float32)  # and of a depth: round thi
 RIM = 2  # rings of the near surface that are put on its plane
 UNEXPLAINED = np.float32(0.002)  # squared difference from the photo at which the outline does not explain a pixel
 UNMIXED = np.float32(0.006)  # and from the likest mixture of both colours at which it is none of them
+FRINGE = np.float32(6.0)  # variances of the far colour beyond which a pixel has left it, away from the near colour
 STEEPEST = np.float32(0.006)  # slope of such a plane, relative to the inverse depth
 BLUR = np.float32(1.2)  # pixels over which the map's outline is smoothed
 SURE = np.float32(0.2)  # pixels that a pixel's centre lies on its own side of the map's outline, at least
@@ -238,7 +239,8 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
     """Move both colours, in place, as little as makes them mix to the photo's, and no further than texture explains.
 
     A pixel that they do not explain has the share of the likest mixture of them as they were; one that is like none, as
-    the shaded edge of a round thing, is all of the surface that it lies in.
+    the shaded edge of a round thing, is all of the surface that it lies in. A camera that sharpens draws a fringe along
+    an outline, brighter than what lies behind a dark thing: that is the thing's, or it would stay on what lies behind.
     """
     height, width = ring.shape
     rest = np.zeros(3, np.float32)
@@ -248,7 +250,8 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
             if ring[y, x] == 0:
                 continue
             a, left = alpha[y, x], np.float32(0)
-            share, beside, _ = _share(colors, color, y, x)
+            share, beside, apart = _share(colors, color, y, x)
+            fringe = share < 0 and share * share * apart + beside > FRINGE * texture[1, y, x] + UNEXPLAINED
             whole = a * a * a + (1 - a) * (1 - a) * (1 - a)
             for c in range(3):
                 pure[0, c], pure[1, c] = color[0, y, x, c], color[1, y, x, c]
@@ -263,6 +266,9 @@ def _unmix(colors: Any, ring: Any, inside: Any, alpha: Any, color: Any, texture:
                     missing -= part * (moved - color[side, y, x, c])
                     color[side, y, x, c] = moved
                 left += missing * missing
+            if inside[y, x] <= 0 and fringe:
+                alpha[y, x] = 1
+                continue
             if left <= UNEXPLAINED:
                 continue
             if beside <= UNMIXED and 0 < share < 1:
