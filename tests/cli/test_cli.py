@@ -37,7 +37,7 @@ def test_usage_errors(tmp_path: Path, pair: tuple[Path, Path]) -> None:
 
 def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path) -> None:
     commands = [point for point in entry_points(group="console_scripts") if point.name == "spackle"]
-    assert [point.load() for point in commands] == [cli.main]
+    assert [point.load() for point in commands] == [cli.run]
     missing = tmp_path / "missing.png"
     for options, code in ((["--version"], 0), (["predict", "-i", str(missing), "-o", str(tmp_path / "out")], 2)):
         done = subprocess.run([*COMMAND, *options], capture_output=True, text=True, check=False, timeout=300)
