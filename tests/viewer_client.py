@@ -111,6 +111,13 @@ def uploads_of(server: ViewerServer) -> list[Path]:
     return [Path(folder) / name for folder, _, names in os.walk(server.uploads.name) for name in names]
 
 
-def raw_status(server: ViewerServer, path: str) -> bytes:
-    with dial(server, get(path)) as connection:
-        return connection.recv(12).split()[1]
+def admitted(server: ViewerServer, path: str, within: float = 10.0) -> socket.socket:
+    """A connection on which the answer 200 begins: the server lets go of earlier ones only when it next writes to them."""
+    end = time.monotonic() + within
+    while True:
+        connection = dial(server, get(path))
+        if connection.recv(12, socket.MSG_PEEK).endswith(b"200"):
+            return connection
+        connection.close()
+        assert time.monotonic() < end, "it did not come"
+        time.sleep(0.01)

@@ -18,6 +18,7 @@ from PIL import Image
 from viewer_client import (
     QUICK,
     a_scene,
+    admitted,
     answer_of,
     ask,
     complete,
@@ -26,7 +27,6 @@ from viewer_client import (
     eventually,
     get,
     raw,
-    raw_status,
     send,
     serving,
     uploads_of,
@@ -234,8 +234,7 @@ def test_progress_comes_as_it_is_made_and_listeners_are_counted() -> None:
         assert ask(server).status == 200
         for listener in listeners:
             listener.close()
-        eventually(lambda: raw_status(server, "/jobs/1/events") == b"200")
-        with dial(server, get("/jobs/1/events")) as listener:
+        with admitted(server, "/jobs/1/events") as listener:
             heard = b""
             while b": " not in heard or b":\n\n" not in heard:  # the first event, and a sign of life
                 part = listener.recv(1000)
