@@ -112,7 +112,7 @@ def uploads_of(server: ViewerServer) -> list[Path]:
 
 
 def admitted(server: ViewerServer, path: str, within: float = 10.0) -> socket.socket:
-    """A connection on which the answer 200 begins: the server lets go of earlier ones only when it next writes to them."""
+    """A connection with the answer 200: the server lets go of earlier ones only when it next writes to them."""
     end = time.monotonic() + within
     while True:
         connection = dial(server, get(path))
