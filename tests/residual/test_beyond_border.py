@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import pytest
 import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.residual import CELL, Cues, Seeds, make_seeds
+from spackle.residual import CELL, Cues, Seeds, beyond_border, make_seeds
 from spackle.residual.seeds import cell_centers
 
 PHOTO = Camera.from_focal(150, 240, 160)
@@ -35,6 +38,19 @@ def test_a_floor_stays_level_and_a_wall_goes_on() -> None:
     assert float(off.mean()) < 0.06
     for surface, color in ((floor, FLOOR), (~floor, WALL)):
         assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.07
+
+
+def test_a_sky_goes_on_as_it_is_and_leaves_of_its_colour_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    cues, _, floor = room()  # the wall is as blue as a sky
+    there = cues.mask & ~floor
+    dots = torch.rand(floor.shape, generator=torch.Generator().manual_seed(0)) < 0.3
+    lively = torch.where((dots & ~cues.mask)[..., None], torch.tensor([0.1, 0.2, 0.3]), cues.rgb)
+    views = [cues, dataclasses.replace(cues, rgb=lively)]
+    calm, leaves = (make_seeds(view, VIEW, PHOTO).rgb[there] for view in views)
+    monkeypatch.setattr(beyond_border, "AT_ONCE", 1e9)  # a sky fades in as other colours do
+    faded, leaves_faded = (make_seeds(view, VIEW, PHOTO).rgb[there] for view in views)
+    assert float((calm - WALL).abs().mean()) < 0.5 * float((faded - WALL).abs().mean())
+    assert float((leaves - leaves_faded).abs().mean()) < 0.3 * float((calm - faded).abs().mean())
 
 
 def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:

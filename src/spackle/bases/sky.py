@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from spackle._numba import kernel
+from spackle.color import bright_or_blue
 from spackle.filters import greatest_around
 
 NEAR_QUANTILE = 0.9  # of the inverse depth: what counts as the scene's near side
@@ -19,7 +20,6 @@ LEVEL = 0.02  # and no nearer than the far side of all else, by no more than thi
 OUTDOORS_M = 10.0  # farther than rooms are long: so is a sky, or where its depth is unknown what else is far
 BRIGHT = 0.6  # sRGB; a sky is that bright, or blue
 DIM = 0.35  # and may go on in clouds as dark as that
-BLUE, DARKEST_BLUE = 1.1, 0.25  # blue over red, and the least blue
 SMOOTH = 0.12  # largest change between neighbouring pixels of the sky, sum of the channels
 LEAST_SHARE = 0.01  # of the photo
 MOST_NEAR = 0.25  # of a sky may be nearer than at the border: a floor that runs to the horizon comes nearer steadily
@@ -46,7 +46,7 @@ def push_sky(inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> tuple[Tensor,
     if not far[0].any():
         return nothing
     reach = known & (inverse_depth <= GETS_NEAR * near)
-    bright, dim = far & _looks(rgb, BRIGHT), reach & _looks(rgb, DIM)
+    bright, dim = far & bright_or_blue(rgb, BRIGHT), reach & bright_or_blue(rgb, DIM)
     sky = torch.from_numpy(_flood(*(a.contiguous().numpy() for a in (rgb, bright[0], bright | dim))))
     rest = known & ~sky
     if float(sky.float().mean()) < LEAST_SHARE or not rest.any():
@@ -65,13 +65,6 @@ def _quantile(inverse_depth: Tensor, where: Tensor, q: float) -> float:
     """Of up to a hundred thousand of the pixels: enough, and soon sorted."""
     values = inverse_depth[where]
     return float(values[:: 1 + len(values) // 100_000].quantile(q)) if len(values) else 0.0
-
-
-def _looks(rgb: Tensor, bright: float) -> Tensor:
-    """[H, W] bool: bright, or blue."""
-    red, green, blue = rgb.unbind(-1)
-    is_blue = (blue >= BLUE * red) & (blue >= green) & (blue > DARKEST_BLUE)
-    return (rgb.amin(-1) > bright) | is_blue
 
 
 @kernel
@@ -114,7 +107,7 @@ def _stands_behind(sky: Tensor, inverse_depth: Tensor, known: Tensor, near: floa
 
 def _leaks(sky: Tensor, inverse_depth: Tensor, rgb: Tensor, known: Tensor) -> bool:
     """Whether what has been left out of the sky for its depth alone goes on as the sky does."""
-    looks, outline, leaks = _looks(rgb, DIM), 0, 0
+    looks, outline, leaks = bright_or_blue(rgb, DIM), 0, 0
     for axis in (0, 1):
         size = sky.shape[axis] - 1
         for one, other in ((0, 1), (1, 0)):

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from spackle.camera import Camera, beside
+from spackle.color import bright_or_blue
 from spackle.fill import FAR_BIAS, far_fill
+from spackle.filters import broadly_blurred
 from spackle.inpaint.exemplar import nearest_known
 from spackle.inpaint.exemplar_dense import dense_nearest_known
 from spackle.residual import dense
@@ -21,6 +24,8 @@ AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go o
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
 MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those that are led there
 FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
+SKY, CALM, CALM_CELLS = 0.6, 0.2, 4.0  # a sky is so bright, or blue; colours vary so little among so many cells
+AT_ONCE = 0.03  # of the view's width from the border: a sky goes on as it is from there
 LEAST = 1e-9
 
 
@@ -51,7 +56,7 @@ def fill_around(
     place = points[..., :2] / depth * photo_lens.diagonal()[:2] + photo_lens[:2, 2]
     size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
     ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    values = torch.stack([*rgb, across / depth[..., 0], ends.float()], dim=-1)
+    values = torch.stack([*rgb, across / depth[..., 0], ends.float(), _variance(cues.rgb, known)], dim=-1)
 
     found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     apart = _cells_to_known(mask)
@@ -63,15 +68,27 @@ def fill_around(
     nearest = torch.where(known, cues.inverse_depth, 0).amax()
     carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
+    sky = bright_or_blue(found[..., :3], SKY) * torch.exp(-found[..., 5] / CALM**2)
+
     bias = torch.where(hidden, FAR_BIAS, bias)
     depths, mixed = far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
-    depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :3].movedim(-1, 0), mixed)
+    led_there = torch.cat([found[..., :3], sky[..., None]], dim=-1).movedim(-1, 0)
+    depths, colors = torch.where(led, carried, depths), torch.where(led, led_there, pad(mixed, (0, 0, 0, 0, 0, 1)))
     others = beyond & ~led
     if dense.on_gpu(mask) or bool(others.any()):
         refilled = far_fill(depths, colors, led | known, far_bias=bias)
         depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
-    share = ((apart / mask.shape[1] - MIXED) / (CARRIED - MIXED)).clamp(0, 1) * beyond
-    return depths, torch.lerp(mixed, colors, share)
+    far = apart / mask.shape[1]
+    share = torch.maximum((far - MIXED) / (CARRIED - MIXED), colors[3] * (far / AT_ONCE).clamp_max(1)).clamp(0, 1)
+    return depths, torch.lerp(mixed, colors[:3], share * beyond)
+
+
+def _variance(rgb: Tensor, known: Tensor) -> Tensor:
+    """Of the colours [h, w, 3] of known cells [h, w] around each, summed over the channels: [h, w]."""
+    seen = known[..., None].float()
+    sums = broadly_blurred(torch.cat([rgb * seen, rgb.square() * seen, seen], dim=-1), CALM_CELLS)
+    mean, square = (sums[..., :6] / sums[..., 6:].clamp_min(LEAST)).split(3, dim=-1)
+    return (square - mean.square()).sum(-1).clamp_min(0)
 
 
 def _cells_to_known(mask: Tensor) -> Tensor:
