@@ -24,7 +24,7 @@ AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go o
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
 MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those that are led there
 FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
-SKY, CALM, CALM_CELLS = 0.6, 0.2, 4.0  # a sky is so bright, or blue; colours vary so little among so many cells
+SKY, CALM, CALM_CELLS = 0.85, 0.2, 4.0  # a sky is so bright, or blue; its colours vary so little among so many cells
 AT_ONCE = 0.03  # of the view's width from the border: a sky goes on as it is from there
 LEAST = 1e-9
 
@@ -68,7 +68,8 @@ def fill_around(
     nearest = torch.where(known, cues.inverse_depth, 0).amax()
     carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
-    sky = bright_or_blue(found[..., :3], SKY) * torch.exp(-found[..., 5] / CALM**2)
+    above = rays[..., 1] < 0  # the middle of the photo
+    sky = above * bright_or_blue(found[..., :3], SKY) * torch.exp(-found[..., 5] / CALM**2)
 
     bias = torch.where(hidden, FAR_BIAS, bias)
     depths, mixed = far_fill(cues.inverse_depth, rgb, known, far_bias=bias)

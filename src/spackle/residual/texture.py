@@ -24,8 +24,8 @@ from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in
 from spackle.residual.seeds import Rim, Seeds
 
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-GOOD_FIT = 0.8  # mismatch at which a third of the texture is left
-SHOWN, SHOWN_FIT = 0.5, 0.36  # share of patches beyond the photo's border, and mismatch at which a third of it is left
+GOOD_FIT = 0.5  # mismatch at which a third of the texture is left
+SHOWN, SHOWN_FIT = 0.4, 0.36  # share of patches beyond the photo's border, and mismatch at which a third of it is left
 OFTEN = 4.0  # what is taken more often is a pattern, and fades
 BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of them is not shown
 CONTINUED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
@@ -55,8 +55,8 @@ class Texture(Protocol):
 class ExemplarTexture:
     """High frequencies of the view itself over the residual's structure; at its border the photo goes on.
 
-    Beyond the photo's border the residual knows least, and its structure is fog: half of what is not broad there is
-    that of patches.
+    Beyond the photo's border the residual knows least, and its structure is fog: a part of what is not broad there
+    is that of patches.
     """
 
     def colors(
