@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import gc
 import json
 import os
 import sys
@@ -104,6 +105,8 @@ def main() -> None:
     # Read when torch is loaded. Its idle threads would otherwise spin: where other programs want the cores too,
     # that makes completion three to five times slower.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Its collector would look again and again at the 200,000 objects of torch and numba, which stay.
+    gc.set_threshold(50_000)
     exit_on_sigterm()
     try:
         code = app(standalone_mode=False)
