@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from spackle.camera import Camera, beside
 from spackle.color import bright_or_blue
@@ -42,10 +41,10 @@ def fill_around(
         inside: [h, w] bool: cells whose points lie in the photo's frame; what is behind goes on there.
         camera, photo_camera: the view's and the photo's.
     """
-    mask, rgb, bias = cues.mask, cues.rgb.permute(2, 0, 1), FAR_BIAS * inside
+    mask, bias = cues.mask, FAR_BIAS * inside
     beyond = mask & ~inside
     if not dense.on_gpu(mask) and int(beyond.count_nonzero()) <= FEW * beyond.numel():
-        return far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
+        return far_fill(cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=bias)
     # A cell's point times its inverse depth, in the photo's frame: ray + shift * inverse depth.
     here, there = (view.world_to_camera.double() for view in (camera, photo_camera))
     motion = beside(there @ here.inverse(), uv)
@@ -56,40 +55,39 @@ def fill_around(
     place = points[..., :2] / depth * photo_lens.diagonal()[:2] + photo_lens[:2, 2]
     size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
     ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    values = torch.stack([*rgb, across / depth[..., 0], ends.float(), _variance(cues.rgb, known)], dim=-1)
+    looks = torch.cat([cues.rgb, _sky(cues.rgb, known)[..., None]], dim=-1)
+    values = torch.cat([looks, (across / depth[..., 0])[..., None], ends[..., None].float()], dim=-1)
 
     found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     apart = _cells_to_known(mask)
     led = beyond & (steps > 0) & (steps <= DETOUR * apart)
-    hidden = led & (found[..., 4] == 0)  # by something nearer, beside which the photo goes on
+    hidden = led & (found[..., 5] == 0)  # by something nearer, beside which the photo goes on
     found = widened(found, led & ~hidden, WIDENING * steps)
-    away = 1 / found[..., 3].clamp_min(LEAST) - motion[2, 3]
+    away = 1 / found[..., 4].clamp_min(LEAST) - motion[2, 3]
     led = led & ~hidden & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, cues.inverse_depth, 0).amax()
     carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
-    above = rays[..., 1] < 0  # the middle of the photo
-    sky = above * bright_or_blue(found[..., :3], SKY) * torch.exp(-found[..., 5] / CALM**2)
-
     bias = torch.where(hidden, FAR_BIAS, bias)
-    depths, mixed = far_fill(cues.inverse_depth, rgb, known, far_bias=bias)
-    led_there = torch.cat([found[..., :3], sky[..., None]], dim=-1).movedim(-1, 0)
-    depths, colors = torch.where(led, carried, depths), torch.where(led, led_there, pad(mixed, (0, 0, 0, 0, 0, 1)))
+    depths, mixed = far_fill(cues.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
+    depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :4].movedim(-1, 0), mixed)
     others = beyond & ~led
     if dense.on_gpu(mask) or bool(others.any()):
         refilled = far_fill(depths, colors, led | known, far_bias=bias)
         depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
     far = apart / mask.shape[1]
-    share = torch.maximum((far - MIXED) / (CARRIED - MIXED), colors[3] * (far / AT_ONCE).clamp_max(1)).clamp(0, 1)
-    return depths, torch.lerp(mixed, colors[:3], share * beyond)
+    sky = colors[3] * (rays[..., 1] < 0) * (far / AT_ONCE).clamp_max(1)  # there is none below the middle of the photo
+    share = torch.maximum((far - MIXED) / (CARRIED - MIXED), sky).clamp(0, 1) * beyond
+    return depths, torch.lerp(mixed[:3], colors[:3], share)
 
 
-def _variance(rgb: Tensor, known: Tensor) -> Tensor:
-    """Of the colours [h, w, 3] of known cells [h, w] around each, summed over the channels: [h, w]."""
+def _sky(rgb: Tensor, known: Tensor) -> Tensor:
+    """How much known cells [h, w], of sRGB colours [h, w, 3], look like a sky: [h, w] from 0 to 1."""
     seen = known[..., None].float()
     sums = broadly_blurred(torch.cat([rgb * seen, rgb.square() * seen, seen], dim=-1), CALM_CELLS)
     mean, square = (sums[..., :6] / sums[..., 6:].clamp_min(LEAST)).split(3, dim=-1)
-    return (square - mean.square()).sum(-1).clamp_min(0)
+    variance = (square - mean.square()).sum(-1).clamp_min(0)
+    return bright_or_blue(rgb, SKY) * torch.exp(-variance / CALM**2)
 
 
 def _cells_to_known(mask: Tensor) -> Tensor:
