@@ -85,8 +85,8 @@ def _sky(rgb: Tensor, known: Tensor) -> Tensor:
     """How much known cells [h, w], of sRGB colours [h, w, 3], look like a sky: [h, w] from 0 to 1."""
     seen = known[..., None].float()
     sums = broadly_blurred(torch.cat([rgb * seen, rgb.square() * seen, seen], dim=-1), CALM_CELLS)
-    mean, square = (sums[..., :6] / sums[..., 6:].clamp_min(LEAST)).split(3, dim=-1)
-    variance = (square - mean.square()).sum(-1).clamp_min(0)
+    means = sums[..., :6] / sums[..., 6:].clamp_min(LEAST)
+    variance = (means[..., 3:] - means[..., :3].square()).sum(-1).clamp_min(0)
     return bright_or_blue(rgb, SKY) * torch.exp(-variance / CALM**2)
 
 
