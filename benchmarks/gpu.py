@@ -31,7 +31,7 @@ from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.evaluation.suite_sections import SIDE, find_view, holed_scene, photo_scene
 from spackle.evaluation.timing import TOTAL, Task, measure
-from spackle.formats import write_whole
+from spackle.files import write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.machine import commit, hardware, versions

@@ -20,7 +20,7 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
 # they are named here; all others are values.
-SHARED = {"digest", "machine", "output_folder", "progress", "signals"}
+SHARED = {"machine", "progress", "signals"}
 BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "formats", "downloads", "shared"}
 BELOW_DATASET = {*BELOW_SCENE, "scene"}
 ALLOWED: dict[str, set[str]] = {

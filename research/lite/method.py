@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 from weights import save_networks
 
 from spackle.bases.lite import LiteNet
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.formats.png import thumbnail
 from spackle.training.method import PICTURED, Method
 from spackle.training.ranks import Ranks

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate, max_pool2d
 
 from spackle.bases.lite import InputScale, LiteBase, scaled_size
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.image import load_photo
 
 UPRIGHT = 0.2  # share of steps whose pictures stand upright

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.image import load_photo
 from spackle.training.composites import Photos
 

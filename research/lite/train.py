@@ -22,7 +22,7 @@ from weights import first_network, freeze
 
 from spackle.bases.lite import LiteBase, LiteNet
 from spackle.errors import InputError
-from spackle.output_folder import make_folder
+from spackle.files import make_folder
 from spackle.progress import Reporter
 from spackle.training.method import CACHE, Plan, RunContext, Start, parameters
 from spackle.training.recipe import load_recipe

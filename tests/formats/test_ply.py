@@ -20,14 +20,8 @@ from scenes import random_gaussians
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
-from spackle.formats import (
-    atomic_path,
-    load_ply,
-    load_ply_base_count,
-    load_ply_camera,
-    load_ply_disparity,
-    save_ply,
-)
+from spackle.files import atomic_path
+from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
 from spackle.formats.ply import BLOCK
 from spackle.gaussians import Gaussians
 

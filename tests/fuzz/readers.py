@@ -29,9 +29,9 @@ from spackle.camera import Camera
 from spackle.dataset import DatasetFiles
 from spackle.dataset.photos import find_photos
 from spackle.dataset.shards import load_manifest, problems
-from spackle.digest import digest_of
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import get_dataset
+from spackle.files import digest_of
 from spackle.formats import load_cameras, load_path, save_ply
 from spackle.formats.clip import clip_frames, is_clip, read_clip
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity

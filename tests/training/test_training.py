@@ -25,8 +25,8 @@ from scenes import box_before_wall, shifted, tensors_of
 from torch import nn
 from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state, trained
 
-from spackle.downloads import hold
 from spackle.errors import InputError
+from spackle.files import hold
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, GsplatRenderer, cuda, get_renderer
 from spackle.residual.network import ResidualNet, load_residual

@@ -19,11 +19,11 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, view_at
 from spackle.device import Precision
 from spackle.errors import InputError
+from spackle.files import file_records, results_folder, whole_set, write_json
 from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.opencv import OpenCV
-from spackle.output_folder import file_records, results_folder, whole_set, write_report
 from spackle.progress import Reporter, Step, timed
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
@@ -94,7 +94,7 @@ def predict_clip(
         with reporter.stage("frames", seconds) as step:
             run.write(new / FILES[0], step)
         report = run.report(seconds) | {"files": file_records(new, [new / FILES[0]])}
-        write_report(report, new / FILES[-1])
+        write_json(report, new / FILES[-1])
     holes, figures = report["hole_area_ratio"], report["flicker"]
     calm = ""
     if figures["carried"] is not None:

@@ -20,8 +20,8 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import sharpness
 from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
+from spackle.files import results_folder, write_json
 from spackle.formats import save_ply, save_png, save_video
-from spackle.output_folder import results_folder, write_report
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
@@ -78,7 +78,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
             "residual": {"weights": "seeds" if shipped_network() is None else "shipped"},
             "seconds": {**seconds, "total": round(time.perf_counter() - start, 3)},
         }
-        write_report(report, output / "report.json")
+        write_json(report, output / "report.json")
         reporter.console.print(_table(scores))
         reporter.log(
             f"{len(scene.aux):,} aux Gaussians; holes at disparity ±{DISPARITY:g}: "

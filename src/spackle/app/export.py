@@ -11,11 +11,10 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from spackle.errors import InputError
-from spackle.formats import check_writable, write_whole
+from spackle.files import check_writable, results_folder, write_whole
 from spackle.formats.ply import read_header
 from spackle.formats.scene_files import SceneFile, Writer, writer_of
 from spackle.formats.spz import LARGEST, spz_grid
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.scene import Scene
 from spackle.viewer import PageScene, single_html

@@ -21,17 +21,11 @@ from spackle.app.complete import (
 from spackle.app.video import PathOptions, video_problem
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseSettings, OpenedBase
-from spackle.digest import digest_of, fingerprint
 from spackle.downloads import installed
 from spackle.errors import InputError
+from spackle.files import digest_of, file_records, fingerprint, results_folder, whole_set, write_json
 from spackle.formats import save_ply
 from spackle.image import load_photo
-from spackle.output_folder import (
-    file_records,
-    results_folder,
-    whole_set,
-    write_report,
-)
 from spackle.progress import Reporter
 from spackle.scene import Mode, ResidualChoice
 
@@ -103,7 +97,7 @@ def predict_one(
             holes = measure_holes(views, scene, renderer)
         report = make_report(done, completer, holes, video, request, seconds)
         report["files"] = file_records(new, sorted(file for file in new.rglob("*") if file.is_file()))
-        write_report(report, new / REPORT)
+        write_json(report, new / REPORT)
     before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))
     aux, weights, total = report["aux"], completer.residual.weights, report["seconds"]["total"]
     reporter.log(

@@ -26,11 +26,11 @@ from spackle.app.predict import (
 )
 from spackle.bases.open import BaseError
 from spackle.device import thread_count
-from spackle.digest import weights_digest
+from spackle.downloads import weights_digest
 from spackle.errors import InputError
+from spackle.files import as_recorded, check_file, check_mark, mark, results_folder
 from spackle.formats.clip import is_clip
-from spackle.image import PHOTO_SUFFIXES, check_file
-from spackle.output_folder import as_recorded, check_mark, mark, results_folder
+from spackle.image import PHOTO_SUFFIXES
 from spackle.progress import Notes, Reporter
 from spackle.signals import asked_to_stop
 from spackle.workers import Workers, at_work, cluster, threads_of_torch

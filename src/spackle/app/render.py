@@ -16,12 +16,12 @@ from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
+from spackle.files import results_folder
 from spackle.formats import load_ply, load_ply_camera, save_png, save_video
 from spackle.formats.ply import load_ply_disparity
 from spackle.formats.video import FORMATS
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio

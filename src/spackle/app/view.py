@@ -24,7 +24,8 @@ from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, ROUGH, BaseSettings
 from spackle.downloads import installed
 from spackle.errors import InputError, check_name
-from spackle.image import Photo, check_file, load_photo
+from spackle.files import check_file
+from spackle.image import Photo, load_photo
 from spackle.progress import Reporter, Step
 from spackle.scene import ResidualChoice, Scene
 from spackle.signals import asked_to_stop

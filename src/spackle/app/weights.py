@@ -27,16 +27,14 @@ from spackle.downloads import (
     KnownWeights,
     check_recorded,
     download,
-    hold,
     known_weights,
     read_record,
     weights_folder,
 )
 from spackle.downloads.transfer import digest, write_json
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path, hold, results_folder
 from spackle.inpaint import lama_network
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 
 

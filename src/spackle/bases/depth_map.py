@@ -18,7 +18,8 @@ from PIL import Image
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import MAX_PIXELS, check_file, check_pixels, read_image
+from spackle.files import check_file
+from spackle.image import MAX_PIXELS, check_pixels, read_image
 
 Array = NDArray[Any]
 StrPath = str | os.PathLike[str]

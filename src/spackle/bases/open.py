@@ -22,9 +22,9 @@ from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
 from spackle.bases.sharp.base import SharpBase, check_windows
 from spackle.device import PRECISIONS, MemoryShort, Precision
-from spackle.digest import fingerprint
 from spackle.downloads import check_recorded, installed, known_weights, read_record
 from spackle.errors import InputError, check_name
+from spackle.files import fingerprint
 from spackle.image import Photo
 
 AUTO = "auto"

@@ -13,10 +13,8 @@ from spackle.dataset.maker import PARTS, Made, Maker, PhotoJob, Seconds, key_of,
 from spackle.dataset.options import MAX_PHOTOS, DatasetOptions, configuration
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
-from spackle.digest import differences
 from spackle.errors import InputError
-from spackle.formats import atomic_path
-from spackle.output_folder import make_folder, remove_half_written, results_folder
+from spackle.files import atomic_path, differences, make_folder, remove_half_written, results_folder
 from spackle.progress import Reporter, counted, timed
 from spackle.signals import asked_to_stop
 from spackle.workers import at_work, cluster

@@ -17,9 +17,9 @@ from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import load_manifest, problems
 from spackle.errors import InputError, one_line
+from spackle.files import results_folder
 from spackle.formats import save_png, save_video
 from spackle.formats.png import thumbnail
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter, counted
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"

@@ -13,8 +13,8 @@ from spackle.dataset.options import DatasetOptions, configuration
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.sample import pack_sample
 from spackle.dataset.views import draw_path, path_cameras, render_views
-from spackle.digest import fingerprint
 from spackle.errors import InputError
+from spackle.files import fingerprint
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import InpainterOptions
 from spackle.progress import timed

@@ -14,8 +14,9 @@ from spackle.camera_path import MAX_DISPARITY
 from spackle.dataset.completion import COMPLETIONS, Completion
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import ViewChoices
-from spackle.digest import digest_of, fingerprint, weights_digest
+from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
+from spackle.files import digest_of, fingerprint
 from spackle.inpaint import INPAINTERS
 from spackle.workers import Workers
 

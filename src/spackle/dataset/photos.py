@@ -15,7 +15,8 @@ from typing import Any
 from spackle.bases.open import Log
 from spackle.downloads.transfer import digest
 from spackle.errors import InputError
-from spackle.image import PHOTO_SUFFIXES, check_file, load_photo
+from spackle.files import check_file
+from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.progress import Step
 
 SUFFIXES = (*PHOTO_SUFFIXES, ".gif", ".bmp")

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import IO, Any
 
 from spackle.dataset.sample import END, PhotoGroup
-from spackle.digest import digest_of
 from spackle.errors import InputError, reason_in_a_line
-from spackle.formats import atomic_path
+from spackle.files import atomic_path, digest_of
 from spackle.progress import Step
 
 NAME = "manifest.json"

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import os
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from spackle.downloads.transfer import BLOCK, Progress, check_url, digest, read_json, receive, version_file, write_json
 from spackle.errors import InputError
+from spackle.files import hold
 
 AGAIN = "run `spackle weights get` again"
 
@@ -229,45 +226,10 @@ def installed(name: str) -> Path | None:
     return path if os.path.isfile(path) else None
 
 
-if sys.platform == "win32":
-    import msvcrt
-
-    def _lock(file: BinaryIO) -> None:
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError as error:
-            raise BlockingIOError(*error.args) from error
-else:
-    import fcntl
-
-    def _lock(file: BinaryIO) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-@contextlib.contextmanager
-def hold(path: Path) -> Iterator[None]:
-    """Hold the lock file `path` during the block; a killed process's lock is free.
-
-    Raises:
-        BlockingIOError: somebody else holds it.
-        OSError: the file cannot be created, or the file system has no locks.
-    """
-    file = _acquire(path)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):  # Windows deletes no open file, and it may stay
-            path.unlink()
-        file.close()
-
-
-def _acquire(path: Path) -> BinaryIO:
-    while True:
-        with contextlib.ExitStack() as stack:
-            file = stack.enter_context(open(path, "ab"))
-            _lock(file)
-            # Its last holder may have removed it between these two steps: then what we hold has no name.
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
-                    stack.pop_all()
-                    return file
+def weights_digest(path: Path) -> str:
+    """SHA-256 of a checkpoint: the recorded one of a download, else of the file."""
+    record = read_record(path)
+    if record is not None:
+        return record.sha256
+    with open(path, "rb") as file:
+        return digest(file).hexdigest()

@@ -26,8 +26,8 @@ from spackle.evaluation.run import inputs_digest, problem_of
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.timing import MS, TOTAL, Lap, Task, complete_in_laps, measure
+from spackle.files import results_folder
 from spackle.machine import hardware, load_average, versions
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.residual import Completer, ResidualNet
 from spackle.signals import asked_to_stop

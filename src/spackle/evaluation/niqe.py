@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import check_file
+from spackle.files import check_file
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from spackle.evaluation.results import RESULTS, TIMES, ImageResult, Run, image_f
 from spackle.evaluation.sheets import TRUTH, Ranking, column_title, columns, rank
 from spackle.evaluation.table import BEST, EMPTY, Table
 from spackle.evaluation.tables import ADDING, NOT_RUN, PAPER_ROW, count_text, make_tables, method_name, ratio_text
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.formats.png import thumbnail
 
 REPORT = "report.html"

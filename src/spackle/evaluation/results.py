@@ -10,10 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from spackle.digest import differences
 from spackle.errors import InputError
-from spackle.formats import atomic_path
-from spackle.output_folder import make_folder, remove_half_written
+from spackle.files import atomic_path, differences, make_folder, remove_half_written
 
 IMAGES = "images"
 CONFIG, RESULTS, TIMES = "config.json", "results.json", "times.json"

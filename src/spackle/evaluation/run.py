@@ -13,7 +13,6 @@ from torch import Tensor
 
 from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
-from spackle.digest import digest_of, fingerprint
 from spackle.errors import InputError
 from spackle.evaluation import report, results
 from spackle.evaluation.alignment import Alignment, align, to_base
@@ -27,9 +26,9 @@ from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluatio
 from spackle.evaluation.sheets import CASES, TRUTH, rank, sheet, strip
 from spackle.evaluation.table import to_latex, to_markdown
 from spackle.evaluation.tables import NOT_RUN, make_tables
-from spackle.formats import atomic_path, save_png
+from spackle.files import as_recorded, atomic_path, digest_of, file_records, fingerprint, results_folder
+from spackle.formats import save_png
 from spackle.machine import hardware, versions
-from spackle.output_folder import as_recorded, file_records, results_folder
 from spackle.progress import Reporter
 from spackle.residual import hole_mask
 from spackle.signals import asked_to_stop

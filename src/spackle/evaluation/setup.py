@@ -16,7 +16,7 @@ from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open
 from spackle.camera_path import MAX_DISPARITY
 from spackle.dataset.options import base_digest
 from spackle.device import PRECISIONS, pick_dtype
-from spackle.digest import digest_of, weights_digest
+from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
 from spackle.evaluation.datasets import DATASETS, get_dataset
@@ -24,6 +24,7 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
+from spackle.files import digest_of
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet

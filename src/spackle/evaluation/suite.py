@@ -14,7 +14,7 @@ import torch
 from spackle.bases.lift import lift
 from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.sharp import SharpBase
-from spackle.digest import weights_digest
+from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation import suite_sections as sections
 from spackle.evaluation.bench import check_runs
@@ -23,9 +23,9 @@ from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.evaluation.results import begin, load_part, save_part, write_json, write_text
 from spackle.evaluation.suite_sections import SIDE, Section, holed_scene
 from spackle.evaluation.table import EMPTY, Line, Table, to_markdown
+from spackle.files import results_folder
 from spackle.image import Photo
 from spackle.machine import commit, hardware, load_average, versions, without_nan
-from spackle.output_folder import results_folder
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual.network import load_residual

@@ -1,6 +1,5 @@
-"""Files in and out: scenes, videos, pictures and cameras, each written whole or not at all."""
+"""Files in and out: scenes, videos, pictures and cameras."""
 
-from spackle.formats.atomic import atomic_path, check_writable, write_whole
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
 from spackle.formats.png import save_gray_png, save_png
@@ -8,8 +7,6 @@ from spackle.formats.video import VideoWriter, save_video
 
 __all__ = [
     "VideoWriter",
-    "atomic_path",
-    "check_writable",
     "load_cameras",
     "load_path",
     "load_ply",
@@ -20,5 +17,4 @@ __all__ = [
     "save_ply",
     "save_png",
     "save_video",
-    "write_whole",
 ]

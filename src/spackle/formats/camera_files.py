@@ -12,7 +12,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.camera_path import UNITS, Keyframe, KeyframePath, PathError
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import check_file
+from spackle.files import check_file
 
 MAX_CAMERA_BYTES, MAX_PATH_BYTES = 64 << 20, 4 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes

@@ -22,8 +22,9 @@ from av.video.stream import VideoStream
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
+from spackle.files import check_file
 from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
-from spackle.image import check_file, check_pixels
+from spackle.image import check_pixels
 
 SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),

@@ -17,10 +17,9 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError, reason_in_a_line
-from spackle.formats.atomic import atomic_path
+from spackle.files import atomic_path, check_file
 from spackle.formats.camera_files import checked_camera
 from spackle.gaussians import Gaussians
-from spackle.image import check_file
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_EXTRA_ROWS = 64  # SHARP's elements after the vertices hold at most 16 numbers

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from spackle.color import to_bytes
-from spackle.formats.atomic import atomic_path
+from spackle.files import atomic_path
 
 
 def thumbnail(picture: Tensor, side: int) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.formats.atomic import write_whole
+from spackle.files import write_whole
 from spackle.formats.columns import Columns
 from spackle.formats.compressed_ply import encode_compressed_ply
 from spackle.formats.gltf import encode_glb

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from spackle.color import to_bytes
 from spackle.errors import InputError
-from spackle.formats.atomic import atomic_path, check_writable
+from spackle.files import atomic_path, check_writable
 from spackle.formats.video_gif import GifEncoder
 
 MAX_REPEATS = 1000  # of a file that has to hold every repetition

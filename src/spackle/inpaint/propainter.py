@@ -21,7 +21,8 @@ from torch.nn.functional import max_pool2d
 
 from spackle.device import enough_memory, pick_device
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import MAX_SIDE, check_file, working_size
+from spackle.files import check_file
+from spackle.image import MAX_SIDE, working_size
 from spackle.inpaint.protocol import InpainterOptions
 
 NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; so their files begin

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.training.recipe import AnyRecipe, differences
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.image import PHOTO_SUFFIXES
 from spackle.render import Renderer
 from spackle.training.recipe import DataRecipe, plain

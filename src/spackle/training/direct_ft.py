@@ -23,10 +23,9 @@ from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, own
 from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import DatasetView
 from spackle.device import enough_memory
-from spackle.digest import weights_digest
-from spackle.downloads import check_recorded, installed
+from spackle.downloads import check_recorded, installed, weights_digest
 from spackle.errors import InputError
-from spackle.formats import atomic_path
+from spackle.files import atomic_path
 from spackle.render import Renderer, place_of
 from spackle.training.data import short_digest
 from spackle.training.method import (

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import check_file
+from spackle.files import check_file
 
 Shapes = dict[str, tuple[int, ...]]
 

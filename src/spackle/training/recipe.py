@@ -18,7 +18,7 @@ from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
 from spackle.downloads import installed
 from spackle.errors import InputError, reason_in_a_line, shown
-from spackle.image import check_file
+from spackle.files import check_file
 from spackle.residual.hole_features import CELL
 
 PACKAGED = Path(__file__).parent / "recipes"

@@ -12,8 +12,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.formats import atomic_path
-from spackle.output_folder import make_folder
+from spackle.files import atomic_path, make_folder
 from spackle.render import Renderer, place_of, render_batch
 from spackle.residual.compose import compose
 from spackle.residual.hole_features import Cues

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from spackle.device import pick_device
 from spackle.errors import InputError, reason_in_a_line
+from spackle.files import NEW, results_folder, write_json
 from spackle.machine import hardware, versions, without_nan
-from spackle.output_folder import NEW, results_folder, write_report
 from spackle.progress import Reporter
 from spackle.signals import asked_to_stop
 from spackle.training.checkpoint import (
@@ -189,7 +189,7 @@ def _run(context: RunContext[Any], place: Path, start: Start, checkpoint: Checkp
     }
 
     def write(progress: Progress, ended: str | None = None) -> None:
-        write_report(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), place / RUN)
+        write_json(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), place / RUN)
 
     def stepped(step: int, numbers: Mapping[str, float]) -> None:
         logs.numbers("train", numbers, step)

@@ -17,8 +17,8 @@ from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.errors import InputError
+from spackle.files import atomic_path
 from spackle.filters import greatest_around
-from spackle.formats import atomic_path
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
 from spackle.residual.hole_features import CELL, Cues, hole_mask

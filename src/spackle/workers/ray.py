@@ -18,8 +18,8 @@ from typing import Any, Generic
 
 import torch
 
-from spackle.digest import differences
 from spackle.errors import InputError, reason_in_a_line
+from spackle.files import differences
 from spackle.workers.local import IN_HAND, J, PhotoWorker, R, Workers, at_work_here
 
 ANSWER_S = 30.0  # for a cluster to answer

@@ -41,7 +41,8 @@ from spackle.bases.photo_depth.containers import (
 )
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.image import DEFAULT_FOCAL_MM, check_file, check_pixels, film_to_pixels, focal_from_exif, read_image
+from spackle.files import check_file
+from spackle.image import DEFAULT_FOCAL_MM, check_pixels, film_to_pixels, focal_from_exif, read_image
 
 _EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
 PLAUSIBLE_M = (0.3, 30.0)  # a scene's middle, where the file does not say its unit

@@ -28,7 +28,7 @@ from spackle.bases.sharp.network import SharpNetwork
 from spackle.device import enough_memory
 from spackle.downloads.transfer import digest
 from spackle.errors import InputError, reason_in_a_line
-from spackle.image import check_file
+from spackle.files import check_file
 
 Shapes = dict[str, tuple[int, ...]]
 

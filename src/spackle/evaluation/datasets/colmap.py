@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line, shown
 from spackle.evaluation.case import Points
+from spackle.files import check_file
 from spackle.formats.camera_files import LARGEST, checked_camera
 from spackle.gaussians import quat_to_matrix
-from spackle.image import check_file
 
 Array = NDArray[Any]
 T = TypeVar("T")

@@ -19,7 +19,8 @@ from spackle.camera import Camera
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case, SecondView
 from spackle.evaluation.datasets.folders import by_name, photo_files, scene_folders
-from spackle.image import check_file, read_image
+from spackle.files import check_file
+from spackle.image import read_image
 
 # Middlebury and Booster calibrate with tools that put (0, 0) into the middle of the first pixel; here it is that
 # pixel's corner. (Middlebury's smaller sizes have the big one's principal point divided plainly, so there it is known
