@@ -25,6 +25,7 @@ from spackle.app.clip import ClipCompleter, CompletedView
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.clips.temporal import flicker, pixel_grid, sample
 from spackle.color import srgb_to_linear
 from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.gaussians import Gaussians
@@ -33,7 +34,6 @@ from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import Completer
 from spackle.residual.network import shipped_network
-from spackle.residual.temporal import flicker, pixel_grid, sample
 from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0

@@ -32,14 +32,15 @@ ALLOWED: dict[str, set[str]] = {
     "bases": {"values", "downloads", "shared"},
     "inpaint": {"values", "downloads"},
     "residual": {"values", "render", "inpaint"},
+    "clips": {"values", "render", "bases", "residual", "inpaint", "formats"},
     "viewer": {"values", "formats"},
     "scene": {*BELOW_SCENE, "viewer"},
     "workers": {"values", "shared"},
     "dataset": {*BELOW_DATASET, "workers"},
     "training": {*BELOW_DATASET, "dataset"},
     "evaluation": {*BELOW_DATASET, "dataset", "training"},
-    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "workers"},
-    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app", "workers"},
+    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "workers", "clips"},
+    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app", "workers", "clips"},
 }
 
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.

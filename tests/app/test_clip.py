@@ -15,10 +15,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
-from spackle.inpaint.opencv import OpenCV
-from spackle.render import CpuRenderer
-from spackle.residual import hole_mask
-from spackle.residual.temporal import (
+from spackle.clips.temporal import (
     DepthAlignment,
     Track,
     align_depth,
@@ -27,6 +24,9 @@ from spackle.residual.temporal import (
     pixel_grid,
     sample,
 )
+from spackle.inpaint.opencv import OpenCV
+from spackle.render import CpuRenderer
+from spackle.residual import hole_mask
 
 pytest.importorskip("cv2")
 CPU = CpuRenderer()

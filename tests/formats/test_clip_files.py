@@ -16,8 +16,8 @@ from photos import metres, picture, write_depth
 from PIL import Image
 from scenes import psnr
 
+from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.errors import InputError
-from spackle.formats.clip import clip_frames, is_clip, read_clip
 
 pytest.importorskip("cv2")
 

@@ -26,6 +26,7 @@ from spackle.bases.depth_map import load_depth
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
 from spackle.camera import Camera
+from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.dataset import DatasetFiles
 from spackle.dataset.photos import find_photos
 from spackle.dataset.shards import load_manifest, problems
@@ -33,7 +34,6 @@ from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import get_dataset
 from spackle.files import digest_of
 from spackle.formats import load_cameras, load_path, save_ply
-from spackle.formats.clip import clip_frames, is_clip, read_clip
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
 from spackle.gaussians import Gaussians
 from spackle.image import load_photo, resize_photo

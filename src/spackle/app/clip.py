@@ -17,19 +17,8 @@ from spackle.bases.open import BaseSettings, Choice
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, view_at
-from spackle.device import Precision
-from spackle.errors import InputError
-from spackle.files import file_records, results_folder, whole_set, write_json
-from spackle.formats.clip import Clip, ClipWriter, clip_frames, read_clip
-from spackle.gaussians import Gaussians
-from spackle.image import Photo, focal_length, resize_photo
-from spackle.inpaint.opencv import OpenCV
-from spackle.progress import Reporter, Step, timed
-from spackle.render import Renderer
-from spackle.render.protocol import Rendering
-from spackle.residual import Completer, ResidualNet, hole_area_ratio, hole_mask
-from spackle.residual.occlusion_guard import OcclusionGuard
-from spackle.residual.temporal import (
+from spackle.clips.files import Clip, ClipWriter, clip_frames, read_clip
+from spackle.clips.temporal import (
     CompletedFrame,
     DepthAlignment,
     Flow,
@@ -41,6 +30,17 @@ from spackle.residual.temporal import (
     sample,
     track,
 )
+from spackle.device import Precision
+from spackle.errors import InputError
+from spackle.files import file_records, results_folder, whole_set, write_json
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, focal_length, resize_photo
+from spackle.inpaint.opencv import OpenCV
+from spackle.progress import Reporter, Step, timed
+from spackle.render import Renderer
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, ResidualNet, hole_area_ratio, hole_mask
+from spackle.residual.occlusion_guard import OcclusionGuard
 from spackle.scene import ResidualChoice
 
 FILES = ("video.mp4", "report.json")

@@ -25,11 +25,11 @@ from spackle.app.predict import (
     shared_files,
 )
 from spackle.bases.open import BaseError
+from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.downloads import weights_digest
 from spackle.errors import InputError
 from spackle.files import as_recorded, check_file, check_mark, mark, results_folder
-from spackle.formats.clip import is_clip
 from spackle.image import PHOTO_SUFFIXES
 from spackle.progress import Notes, Reporter
 from spackle.signals import asked_to_stop

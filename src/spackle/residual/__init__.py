@@ -5,7 +5,7 @@
 - `network`: f_res (eq. 5), which predicts deltas over the seeds; `sparse` runs it around the holes alone.
 - `compose`: seeds and deltas to Gaussians; of the masked cells they are 𝒢̃_aug (eq. 7).
 - `complete`: one view as the paper has it, or one set for a path; the union with the base is eq. 8.
-- For one scene along a path, beyond the paper: `view_order`, `occlusion_guard`, `rim_underlay`; for clips: `temporal`.
+- For one scene along a path, beyond the paper: `view_order`, `occlusion_guard`, `rim_underlay`.
 """
 
 from spackle.residual.complete import Completer
