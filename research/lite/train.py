@@ -87,7 +87,7 @@ def _make_guesses(context: RunContext[LiteRecipe], files: LiteFiles) -> GuessedP
     if context.ranks.first:
         make_folder(folder)
         reporter.log(f"guesses of {len(files.guessed)} photos in {folder}")
-        with reporter.stage("guesses", {}) as step:
+        with reporter.stage("guesses") as step:
             guesses.fill(LiteBase.load(data.teacher, device=str(context.device)), step, reporter.log)
     context.ranks.wait()
     return guesses
@@ -101,7 +101,7 @@ def _make_scenes(context: RunContext[LiteRecipe], files: LiteFiles) -> Synthetic
     if context.ranks.first:
         make_folder(folder)
         reporter.log(f"{data.made} synthetic scenes in {folder}")
-        with reporter.stage("synthetic scenes", {}) as step:
+        with reporter.stage("synthetic scenes") as step:
             scenes.fill(step, reporter.log)
     context.ranks.wait()
     return scenes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import json
 import os
@@ -70,6 +71,13 @@ class Reporter:
         self.console = console or Console(stderr=True, highlight=False)
         self.verbose = verbose
         self.as_json = as_json
+        self.seconds: dict[str, float] = {}  # of each stage so far
+
+    def restarted(self) -> Reporter:
+        """The same, with no stage timed yet: for the next photo."""
+        other = copy.copy(self)
+        other.seconds = {}
+        return other
 
     def result(self, values: Mapping[str, object]) -> None:
         """What has come out, for scripts that asked for it."""
@@ -86,8 +94,8 @@ class Reporter:
             self.log(line)
 
     @contextlib.contextmanager
-    def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
-        """Time a stage into `seconds[name]`; yields a function to call as it advances."""
+    def stage(self, name: str) -> Iterator[Step]:
+        """Time a stage into `self.seconds[name]`; yields a function to call as it advances."""
         start, busy = time.perf_counter(), time.process_time()
         if self.console.is_terminal:
             with self._bars(MofNCompleteColumn()) as bars:
@@ -96,7 +104,7 @@ class Reporter:
         else:
             yield lambda done, total: None
         elapsed = time.perf_counter() - start
-        seconds[name] = round(seconds.get(name, 0.0) + elapsed, 3)
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + elapsed, 3)
         cores = os.cpu_count() or 1
         busy = (time.process_time() - busy) / max(elapsed, 1e-9) / cores
         self.detail(f"  {name}: {elapsed:.2f} s, {counted(cores, 'core')} {min(busy, 1.0):.0%} busy")

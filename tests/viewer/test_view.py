@@ -33,8 +33,8 @@ import time
 from spackle import cli
 from spackle.app.complete import PhotoCompleter
 
-def for_ever(self, photo, reporter, seconds):
-    with reporter.stage("base", seconds):
+def for_ever(self, photo, reporter):
+    with reporter.stage("base"):
         time.sleep(60)
 
 PhotoCompleter.complete = for_ever

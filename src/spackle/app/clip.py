@@ -83,17 +83,17 @@ def predict_clip(
 
     InputError for a clip, a frame, a depth map or a folder that cannot be used.
     """
-    seconds: dict[str, float] = {}
+    reporter = reporter.restarted()
     with results_folder(folder, FILES, alone=True), whole_set(folder, FILES[-1]) as new:
-        with reporter.stage("read", seconds) as step:
+        with reporter.stage("read") as step:
             clip = read_clip(path, completer.path.frames, step)
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
             reporter.log(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")
         run = _Run(clip, focal, completer, reporter)
-        with reporter.stage("frames", seconds) as step:
+        with reporter.stage("frames") as step:
             run.write(new / FILES[0], step)
-        report = run.report(seconds) | {"files": file_records(new, [new / FILES[0]])}
+        report = run.report(reporter.seconds) | {"files": file_records(new, [new / FILES[0]])}
         write_json(report, new / FILES[-1])
     holes, figures = report["hole_area_ratio"], report["flicker"]
     calm = ""

@@ -74,20 +74,20 @@ class PhotoCompleter:
         self.base = open_base(base)
         self.renderer = get_renderer(base.device)
 
-    def complete(self, photo: Photo, reporter: Reporter, seconds: dict[str, float]) -> CompletedPhoto:
+    def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
         """A photo at its full size to its completed scene; InputError for a photo or depth map that cannot be used."""
         if photo.frame is not None:
             reporter.log(f"{photo.path.name}: {photo.frame.note}; --keep-frame keeps it")
-        with reporter.stage("prepare", seconds):
+        with reporter.stage("prepare"):
             base = self.base.load(photo, log=reporter.log)
-        with reporter.stage("base", seconds) as step:
+        with reporter.stage("base") as step:
             prediction, choice = base.predict(step)
         disparity = None
         if self.given_views is None and self.keyframes is None:
             disparity = self.path.far(prediction.disparity)
         self._say_base(photo, prediction, choice, disparity, reporter)
         views = self._plan(photo.path, prediction)
-        with reporter.stage("complete", seconds) as step:
+        with reporter.stage("complete") as step:
             seen: dict[int, Tensor] = {}
             scene, saved_view = self._fill(prediction, views, seen, step)
             if not scene.aux.finite:

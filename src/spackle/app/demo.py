@@ -42,8 +42,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
     pair, renderer = load_motorcycle(), get_renderer()
     with results_folder(output, FILES, alone=True), compiled_ahead(renderer, reporter.log):
         start = time.perf_counter()
-        seconds: dict[str, float] = {}
-        with reporter.stage("base", seconds):
+        with reporter.stage("base"):
             prediction = lift(pair.left, pair.depth, pair.left_camera)
         missing = float(prediction.notes["depth_filled"])
         reporter.log(
@@ -52,13 +51,13 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
         base, camera = prediction.gaussians, prediction.camera
         cameras = scene_path(base, camera, "rotate-forward", DISPARITY)
         sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
-        with reporter.stage("complete", seconds) as step:
+        with reporter.stage("complete") as step:
             seen: dict[int, Tensor] = {}
             scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step, seen=seen)
-        with reporter.stage("write", seconds):
+        with reporter.stage("write"):
             save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
             scene.save(output / "scene.ply", disparity=DISPARITY)
-        with reporter.stage("video", seconds) as step:
+        with reporter.stage("video") as step:
 
             def frames() -> Iterator[Tensor]:
                 for index, camera in enumerate(cameras):
@@ -67,7 +66,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
 
             save_video(frames(), output / "video.mp4")
         holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
-        with reporter.stage("truth", seconds):
+        with reporter.stage("truth"):
             scores = _compare_truth(prediction, pair, renderer, output)
         report: dict[str, Any] = {
             "disparity": DISPARITY,
@@ -76,7 +75,7 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
             "hole_area_ratio": holes,
             "right_camera": scores,
             "residual": {"weights": "seeds" if shipped_network() is None else "shipped"},
-            "seconds": {**seconds, "total": round(time.perf_counter() - start, 3)},
+            "seconds": {**reporter.seconds, "total": round(time.perf_counter() - start, 3)},
         }
         write_json(report, output / "report.json")
         reporter.console.print(_table(scores))

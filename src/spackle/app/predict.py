@@ -69,33 +69,33 @@ def predict_one(
 
     The files take their places once all are whole. InputError for a photo, a depth map or a folder that cannot be used.
     """
-    seconds: dict[str, float] = {}
-    with reporter.stage("load", seconds):
+    reporter = reporter.restarted()
+    with reporter.stage("load"):
         photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
     with contextlib.ExitStack() as folders:
         pictures = picture_files(len(completer.given_views or []))
         folders.enter_context(results_folder(folder, options.files, alone=True))
         if pictures:
             folders.enter_context(results_folder(folder / "views", pictures))
-        done = completer.complete(photo, reporter, seconds)
+        done = completer.complete(photo, reporter)
         _warn_of_rougher(done, folder, options.base, reporter)
         scene, views, renderer = done.scene, done.views, completer.renderer
         new = folders.enter_context(whole_set(folder, REPORT))
-        with reporter.stage("write", seconds):
+        with reporter.stage("write"):
             for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
                 save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
         video = None
         if options.render:
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
-            with reporter.stage("video", seconds) as step:
+            with reporter.stage("video") as step:
                 save_views_video(new / options.files[-1], views, scene, done.seen, renderer, step)
         if pictures:
             (new / "views").mkdir()
-            with reporter.stage("views", seconds) as step:
+            with reporter.stage("views") as step:
                 save_pictures(new / "views", views, scene, renderer, step)
-        with reporter.stage("measure", seconds):
+        with reporter.stage("measure"):
             holes = measure_holes(views, scene, renderer)
-        report = make_report(done, completer, holes, video, request, seconds)
+        report = make_report(done, completer, holes, video, request, reporter.seconds)
         report["files"] = file_records(new, sorted(file for file in new.rglob("*") if file.is_file()))
         write_json(report, new / REPORT)
     before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))

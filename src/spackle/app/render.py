@@ -46,8 +46,7 @@ def render_scene(
     if path.cameras is not None and focal_px is not None:
         raise InputError(f"--focal-px: the views of --cameras {path.cameras} have lenses of their own: leave it out")
     renderer = get_renderer(device)
-    seconds: dict[str, float] = {}
-    with reporter.stage("load", seconds):
+    with reporter.stage("load"):
         given, keyframes = path.load()
         gaussians = load_ply(scene)
         cameras = given or _fly(scene, gaussians, path, keyframes, focal_px, reporter)
@@ -60,7 +59,7 @@ def render_scene(
         hint = "give a folder with -o for pictures only" if given else "give --size"
         raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
     open_shares: list[float] = []
-    with results_folder(target.parent, [*names, target.name]), reporter.stage("video", seconds) as step:
+    with results_folder(target.parent, [*names, target.name]), reporter.stage("video") as step:
 
         def frames() -> Iterator[Tensor]:
             """The frames of the video, each also saved as a picture, where these are wanted."""
@@ -83,7 +82,7 @@ def render_scene(
     result = {
         "gaussians": len(gaussians),
         "frames": len(cameras),
-        "seconds": seconds["video"],
+        "seconds": reporter.seconds["video"],
         "open": round(widest, 5),
     }
     if widest > TOLERATED:
@@ -94,7 +93,8 @@ def render_scene(
         reporter.result({"folder": output, **result})
         return
     reporter.log(
-        f"{scene.name}: {len(gaussians):,} Gaussians, {len(cameras)} frames in {seconds['video']:.1f} s -> {target}"
+        f"{scene.name}: {len(gaussians):,} Gaussians, {len(cameras)} frames in "
+        f"{reporter.seconds['video']:.1f} s -> {target}"
     )
     reporter.result({"file": target, **result})
 

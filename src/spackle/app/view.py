@@ -97,19 +97,18 @@ def _first(
     target: Path, options: ViewOptions, uploads: Uploads, reporter: Reporter
 ) -> Callable[[ViewerServer], object]:
     """What the server begins with: a scene that it shows, or a photo that it works on."""
-    seconds: dict[str, float] = {}
     depth = options.base.depth
     if is_scene(target):
         if depth is not None:
             raise InputError(f"--depth {depth}: {target.name} is a scene already: leave the option out")
-        with reporter.stage("load", seconds):
+        with reporter.stage("load"):
             scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
             page = with_downloads(page_of(scene, target), scene)
         return lambda server: server.show(page)
     completer = options.completer(options.base)
     if depth is None:
         uploads.completer = completer  # it holds the network
-    with reporter.stage("load", seconds):
+    with reporter.stage("load"):
         photo = load_photo(target, focal_px=options.focal_px, fov=options.fov, keep_frame=options.keep_frame)
         if depth is not None:
             completer.base.load(photo)  # what is wrong with a depth map is known before a page opens
@@ -122,11 +121,10 @@ def _first(
 
 def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller: Teller) -> PageScene:
     """A loaded photo to what the page shows; the terminal gets errors too."""
-    seconds: dict[str, float] = {}
     try:
-        done = completer.complete(photo, teller, seconds)
+        done = completer.complete(photo, teller)
         note = ROUGH if done.choice.base == LiteBase.name else ""
-        with teller.stage("page", seconds):
+        with teller.stage("page"):
             return with_downloads(done.scene.page(name, note), done.scene)
     except InputError as error:
         Reporter.log(teller, f"error: {error}")  # the page is told as the job ends
@@ -181,8 +179,7 @@ class Uploads:
             completer = copy.copy(completer)
             completer.path = PathOptions(disparity=_number(disparity))
             completer.path.check()
-        seconds: dict[str, float] = {}
-        with teller.stage("load", seconds):
+        with teller.stage("load"):
             photo = load_photo(path, keep_frame=self._options.keep_frame)
         return complete_for_page(photo, name, completer, teller)
 
@@ -222,10 +219,10 @@ class Teller(Reporter):
             super().log(line)
 
     @contextlib.contextmanager
-    def stage(self, name: str, seconds: dict[str, float]) -> Iterator[Step]:
+    def stage(self, name: str) -> Iterator[Step]:
         """As `Reporter.stage`; a total of 0 is unknown."""
         self._tell({"stage": name, "done": 0, "total": 0})
-        with super().stage(name, seconds) as step:
+        with super().stage(name) as step:
 
             def advance(done: int, total: int) -> None:
                 step(done, total)

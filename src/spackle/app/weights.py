@@ -68,7 +68,7 @@ def get_weights(
         hint = "" if output is None else f"; {known.named_by}"
         reporter.log(f"{_summary(known, record)} -> {path}{hint}")
     else:
-        with reporter.stage("check", {}):
+        with reporter.stage("check"):
             record = check_recorded(path)
         if record is None:
             unchecked = "there already, unchecked for want of a record; --force downloads it again"
@@ -149,7 +149,7 @@ def _fetch(known: KnownWeights, hub: HubFiles, path: Path, reporter: Reporter) -
     folder, part = path.parent, path.parent.with_name(f"{path.parent.name}.part")
     try:
         with hold(path.with_name(f"{path.name}.lock")):
-            with reporter.stage("download", {}):
+            with reporter.stage("download"):
                 fetch_revision(hub.model, hub.revision, [path.name, *hub.others], part)
             with open(part / path.name, "rb") as file:
                 record = DownloadRecord(known.url, os.path.getsize(part / path.name), digest(file).hexdigest())

@@ -50,7 +50,7 @@ def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[P
             f"{source}: {len(found.names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
             "give --sample, or build several"
         )
-    with reporter.stage("photos", {}) as step:
+    with reporter.stage("photos") as step:
         return choose(found, options.sample, options.choices.seed, reporter.log, step)
 
 
@@ -94,7 +94,7 @@ class _Build:
         """Make what is missing, on a Ray cluster where `ray` is the package; "complete" or "stopped"."""
         if ready := len(self.photos) - len(self.jobs):
             self.reporter.log(f"{self.output}: going on, {ready} of {len(self.photos)} photos are done")
-        with self.reporter.stage("photos", {}) as step, asked_to_stop(alone=True) as stop:
+        with self.reporter.stage("photos") as step, asked_to_stop(alone=True) as stop:
             self._write_ready()
             if not self.jobs:
                 return self._finish(0.0)

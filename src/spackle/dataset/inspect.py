@@ -51,7 +51,7 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
     """Read every byte; returns how many things are wrong, after a line for each. InputError without a manifest."""
     manifest = load_manifest(location)
     count = 0
-    with reporter.stage("verify", {}) as step:
+    with reporter.stage("verify") as step:
         for line in problems(location, manifest, step):
             reporter.log(f"{location}: {line}")
             count += 1

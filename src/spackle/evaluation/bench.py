@@ -60,7 +60,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     warm = False  # whether this process has predicted something
     with results_folder(output, (RESULTS, MARKDOWN, LATEX), alone=True):
         begin(output, config)
-        with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
+        with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
             for index, case in enumerate(tools.cases):
                 if stop():
                     reporter.log("stopped; the same command goes on from here")

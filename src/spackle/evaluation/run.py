@@ -73,7 +73,7 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
 def _do_images(evaluation: Evaluation, output: Path, reporter: Reporter) -> list[tuple[ImageResult, float]] | None:
     """Do what is missing: each image's record and seconds; None where Ctrl-C came."""
     cases, found, begun = evaluation.cases, [], False
-    with reporter.stage("images", {}) as step, asked_to_stop(alone=True) as stop:
+    with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
                 return None

@@ -110,7 +110,7 @@ def run_suite(options: SuiteOptions, output: Path, reporter: Reporter) -> str:
                 else:
                     load, start = load_average(), time.perf_counter()
                     try:
-                        with reporter.stage(name, {}):
+                        with reporter.stage(name):
                             rows, facts = _section(name, options, device, found)
                     except InputError as error:
                         not_run[name] = str(error)

@@ -147,7 +147,7 @@ def plan_residual(context: RunContext[Recipe]) -> Plan:
 
         make_folder(folder)
         log(f"samples of {recipe.data.views + recipe.data.validation_views} views in {folder}")
-        with context.reporter.stage("samples", {}) as step:
+        with context.reporter.stage("samples") as step:
             samples = supply.samples(folder, step, skip)
         if skipped:
             log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
