@@ -1,0 +1,401 @@
+"""The scoreboard: how good lifted and completed scenes are, measured on stereo pairs.
+
+    python benchmarks/scoreboard.py PAIRS --features squeezenet_v1.0.npz [--small 4] [-o NOW.json] [--against OLD.json]
+    python benchmarks/scoreboard.py PAIRS ... --without "far bias" --without "network+texture"
+    python benchmarks/scoreboard.py PAIRS ... --ledger > ledger.md
+    python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
+
+PAIRS holds one folder a scene: two photos, a disparity map and a `scene.json` (`spackle.training.sources.load_pair`).
+The left photo is lifted by its true depth, and the right camera's view is completed and compared with the right photo.
+The hole is where the lifted photo's opacity in that view is below 0.95; the band is what lies within 8 pixels of it.
+
+distance ↓    SqueezeNet 1.0 at conv1, fire3, fire5 and fire9: mean squared difference of unit feature vectors over the
+              cells, by the share of each that is hole; outside of the hole the view is the truth. 0 to 2
+texture ↓     Frobenius norm of the difference of the vectors' Gram matrices over that of the truth's
+sharpness     mean magnitude of the grey gradient over the truth's, 3 pixels and more inside of the hole; 1 is best
+PSNR ↑        in the hole; band ↑ in the band; elsewhere ↑ outside of both, dB
+seam ↓        mean grey difference within 2 pixels of the photo's former border, over that of 3 to 20 pixels beside it
+photo ↑       PSNR of the completed scene at the photo's own camera against the photo, dB
+agreement ↑   the same against the lifted photo, at most 100 dB
+HAR ↓         what is left of the hole, percent of the view
+NIQE ↓        of the view over that of the right photo, with --niqe
+base, aux     thousands of Gaussians; s lift and s fill: processor seconds of all threads
+
+--small N gives the lift maps of a side N times smaller, in 256 steps of inverse depth, as phones store them. --without
+switches one mechanism of `MECHANISMS` off, or several joined by +, in a run of its own; hole and band stay those of
+the default. --ledger does so with each, and prints what changes. --against compares with another run's file: up : down
+counts the scenes whose figure rose and fell, p is that of a two-sided sign test. --photos completes some photos by
+`lite` and writes a sheet: a row a photo, at the left and at the right end of its move the lifted photo and what each
+run makes of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+import spackle
+from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.edges import Edges
+from spackle.bases.lift import lift
+from spackle.bases.silhouettes import Layers
+from spackle.camera_path import DepthRange, extremes
+from spackle.evaluation.metrics import GREY, sharpness
+from spackle.evaluation.niqe import NiqeModel, load_niqe, niqe
+from spackle.fill import FAR_BIAS, far_fill
+from spackle.training.features import FeatureNet, load_features
+from spackle.training.losses import covered, dilate, hole_psnr
+from spackle.training.sources import load_pair
+
+Row = dict[str, float]  # a scene's figures
+Rows = dict[str, Row]  # of scenes, by their names
+Replace = Callable[[Any], Any]  # from a function or constant to what stands in for it
+
+LAYERS = ("conv1", "fire3", "fire5", "fire9")
+BAND_PX = 8
+NEAR, BESIDE, STEP = 2, 20, 0.05  # of a seam: pixels, pixels, and the relative step of depth that makes it none
+STEPS = 255  # of a phone's inverse depth
+DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR", "NIQE"), 3)  # others 2
+SECONDS = ("s lift", "s fill")
+PHOTOS, PHOTO_HEIGHT = 8, 256  # of a sheet
+DEFAULT = "default"
+RENDERER = get_renderer()
+
+
+def first(own: Any) -> Any:
+    """A function that returns its first argument in place of another."""
+    return lambda given, *more, **named: given
+
+
+def unbiased(own: Any) -> Any:
+    """`far_fill` with both sides of a rim alike."""
+    return lambda *given, far_bias=None, **named: own(*given, far_bias=0.0, **named)
+
+
+def filled_from_around(own: Any) -> Any:
+    """`fill_around` that treats what lies beyond the photo's border as any hole."""
+    return lambda cues, across, uv, known, inside, *cameras: far_fill(
+        cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=FAR_BIAS * inside
+    )
+
+
+def all_covered(own: Any) -> Any:
+    """`_sources` with specks."""
+    return lambda cues: cues.covered if bool(cues.covered.any()) else cues.inverse_depth > 0
+
+
+def no_edges(own: Any) -> Any:
+    """`find_edges` that sees none."""
+    return lambda depth, known, focal: Edges(np.zeros_like(depth), np.zeros_like(known), np.zeros_like(known))
+
+
+def one_surface(own: Any) -> Any:
+    """`find_layers` of pixels that show one surface each."""
+
+    def layers(*images: Any) -> Layers:
+        found: Layers = own(*images)
+        return Layers(found.ring, np.zeros_like(found.alpha), *(np.stack([image, image]) for image in images))
+
+    return layers
+
+
+NO_SKY: dict[str, Replace] = {"beyond_border._sky": lambda own: lambda rgb, known: torch.zeros_like(rgb[..., 0])}
+# What is switched off while a photo is lifted, and while it is completed: names in the package, and what replaces them.
+LIFT: dict[str, dict[str, Replace]] = {
+    "smooth_noise": {"smooth_noise": first},
+    "sky": {"push_sky": lambda own: lambda inverse_depth, rgb, known: (inverse_depth, known, 0.0)},
+    "undo_quantisation": {"undo_quantisation": first},
+    "attach_flying": {"attach_flying_pixels": first},
+    "edges": {"find_edges": no_edges},
+    "two layers": {"find_layers": one_surface},
+    "colour fit": {"splats._fitted": first},
+    "blended opacities": {"blended_opacities": first},
+}
+FILL: dict[str, dict[str, Replace]] = {
+    "far bias": {"far_fill": unbiased},
+    "network": {"shipped_network": lambda own: lambda: None},
+    "texture": {"open_texture": lambda own: lambda fill: None},
+    "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
+    "GOOD_FIT 0.12": {"GOOD_FIT": lambda own: 0.12},
+    "sharpened": {"sharpened": first},
+    "sky rule": NO_SKY,
+    "beyond_border": {"fill_around": filled_from_around},
+    "beyond_border's colours": {**NO_SKY, "MIXED": lambda own: 10.0, "CARRIED": lambda own: 20.0},
+    "shown beyond the border": {"texture.SHOWN": lambda own: 0.0},
+    "in proportion": {"_in_proportion": lambda own: lambda fine, cues, *more: torch.ones_like(cues.alpha)},
+    "repeat count": {"OFTEN": lambda own: math.inf},
+    "continued": {"continued": first},
+    "widened": {"widened": first},
+    "ALIKE": {"ALIKE": lambda own: math.inf},
+    "solid sources": {"_sources": all_covered},
+}
+MECHANISMS = (*FILL, *LIFT)
+
+
+def holders(target: str) -> list[ModuleType]:
+    """Modules of the package that hold a thing under its name, or under `home.name` where others are called so, too.
+
+    LookupError unless it is one thing: a mechanism that is gone, or has another name now, is no silence.
+    """
+    home, _, name = target.rpartition(".")
+    modules = [m for n, m in list(sys.modules.items()) if n.startswith("spackle.") and name in vars(m)]
+    things = {id(vars(m)[name]) for m in modules if home in ("", m.__name__.rpartition(".")[2])}
+    if len(things) != 1:
+        raise LookupError(f"{target}: the package has {len(things)} things of that name: mend benchmarks/scoreboard.py")
+    return [m for m in modules if id(vars(m)[name]) in things]
+
+
+@contextlib.contextmanager
+def switched_off(run: str, *stages: dict[str, dict[str, Replace]]) -> Iterator[None]:
+    """Without the mechanisms of a run that belong to some stages."""
+    with contextlib.ExitStack() as stack:
+        for stage in stages:
+            for target, replace in [item for name in run.split("+") for item in stage.get(name, {}).items()]:
+                modules, name = holders(target), target.rpartition(".")[2]
+                other = replace(vars(modules[0])[name])
+                for module in modules:
+                    stack.enter_context(mock.patch.object(module, name, other))
+        yield
+
+
+class Perception:
+    """Distance and texture by a frozen SqueezeNet."""
+
+    def __init__(self, network: FeatureNet) -> None:
+        self.network, self.maps = network, dict[str, Tensor]()
+        for layer in LAYERS:
+            network.get_submodule(layer).register_forward_hook(
+                lambda _, __, output, layer=layer: self.maps.update({layer: output.relu()})
+            )
+
+    def compare(self, rgb: Tensor, truth: Tensor, hole: Tensor) -> Row:
+        """Of views [H, W, 3] in a hole [H, W]."""
+        self.network(torch.stack([torch.where(hole[..., None], rgb, truth), truth]).movedim(-1, 1))
+        distances, textures = [], []
+        for both in (self.maps[layer] for layer in LAYERS):  # [2, C, h, w]
+            unit = (both / both.norm(dim=1, keepdim=True).clamp_min(1e-10)).flatten(2)
+            weight = covered(hole[None], both)[0, 0].flatten()
+            weight /= weight.sum()
+            distances.append(float(((unit[0] - unit[1]).square().sum(0) * weight).sum()))
+            ours, theirs = (vectors * weight @ vectors.T for vectors in unit)
+            textures.append(float((ours - theirs).norm() / theirs.norm()))
+        return {"distance": float(np.mean(distances)), "texture": float(np.mean(textures))}
+
+
+class Pair:
+    """A stereo pair, and what all runs share: hole, band and former border of the right camera's view."""
+
+    def __init__(self, folder: Path, small: int) -> None:
+        self.left, self.right, depth, self.camera, self.beside = load_pair(folder)
+        self.depth = smaller(depth, small) if small > 1 else depth
+        prediction = lift(self.left, self.depth, self.camera)
+        self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
+        self.near = dilate(self.hole[None], 2 * BAND_PX + 1)[0]
+        seeds = spackle.complete(prediction, [self.beside], exact=True, network=None, fill="network")
+        self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
+
+    def measure(self, run: str, perception: Perception | None, model: NiqeModel | None) -> Row:
+        """A run's figures."""
+        began = time.process_time()
+        with switched_off(run, LIFT):
+            prediction = lift(self.left, self.depth, self.camera)
+        lifted = time.process_time()
+        with switched_off(run, FILL):
+            scene = spackle.complete(prediction, [self.beside], exact=True, fill="exemplar")
+        seconds = (lifted - began, time.process_time() - lifted)
+        view, photo, everywhere = scene.render(self.beside), scene.render(self.camera).rgb, torch.ones_like(self.hole)
+        row = perception.compare(view.rgb, self.right, self.hole) if perception else {}
+        row["sharpness"] = sharpness(view.rgb, self.right, self.hole)
+        row["PSNR"] = hole_psnr(view.rgb, self.right, self.hole)
+        row["seam"] = seam(view.rgb, self.crossings)
+        row["band"] = hole_psnr(view.rgb, self.right, self.near & ~self.hole)
+        row["elsewhere"] = hole_psnr(view.rgb, self.right, ~self.near)
+        row["photo"] = hole_psnr(photo, self.left, everywhere)
+        base = RENDERER.render(prediction.gaussians, self.camera).rgb
+        row["agreement"] = min(hole_psnr(photo, base, everywhere), 100.0)
+        row["HAR"] = 100 * hole_area_ratio(view.alpha)
+        if model:
+            row["NIQE"] = niqe(view.rgb, model) / niqe(self.right, model)
+        row |= {"base": len(scene.base) / 1000, "aux": len(scene.aux) / 1000}
+        return row | dict(zip(SECONDS, seconds, strict=True))
+
+
+def smaller(depth: DepthMap, times: int) -> DepthMap:
+    """A map of a side so many times smaller: the mean inverse depth of what is known in each cell, in 256 steps."""
+    valid = depth.valid.float()
+    sums = F.avg_pool2d(torch.stack([valid / depth.depth.where(depth.valid, torch.ones(())), valid]), times)
+    known = sums[1] > 0
+    inverse = sums[0] / sums[1].where(known, torch.ones(()))
+    low, high = inverse[known].min(), inverse[known].max()
+    step = float(high - low) / STEPS
+    stepped = low + ((inverse - low) / step).round() * step
+    small = (1 / stepped).where(known, torch.zeros(()))
+    return dataclasses.replace(depth, depth=small, valid=known, K=None, quantum=step, quantity="disparity")
+
+
+def crossings(depth: Tensor, camera: Camera, photo: Camera) -> list[Tensor]:
+    """Where neighbours (in rows: [H, W − 1], in columns: [W, H − 1]) lie on both sides of the photo's border."""
+    uv, _ = photo.project(camera.unproject(camera.pixel_centers(), depth))
+    found = []
+    for axis, size in enumerate((photo.width, photo.height)):
+        inside, z = (uv[..., axis] >= 0) & (uv[..., axis] < size), depth.log()
+        inside, z = (inside, z) if axis == 0 else (inside.T, z.T)
+        found.append((inside[:, 1:] != inside[:, :-1]) & ((z[:, 1:] - z[:, :-1]).abs() < STEP))
+    return found
+
+
+def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
+    """Mean grey difference across the crossings over that beside them; NaN where there is none."""
+    sums = torch.zeros(2, 2, dtype=torch.float64)  # near, beside: (differences, their number)
+    for picture, crossing in zip((rgb @ GREY, (rgb @ GREY).T), crossings, strict=True):
+        steps = (picture[:, 1:] - picture[:, :-1]).abs()
+        reach = [F.max_pool1d(crossing.float(), 2 * r - 1, 1, r - 1) > 0 for r in (NEAR, BESIDE)]
+        for row, where in zip(sums, (reach[0], reach[1] & ~reach[0]), strict=True):
+            row += torch.stack([steps[where].double().sum(), where.sum()])
+    near, beside = (sums[:, 0] / sums[:, 1]).tolist()
+    return float(near / beside)
+
+
+def text(measure: str, value: float, sign: str = "") -> str:
+    return f"{value:{sign}.{DIGITS.get(measure, 2)}f}"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---", *["---:"] * (len(head) - 1)], *rows))
+
+
+def table(rows: Rows) -> str:
+    """A row a scene, and the mean."""
+    measures = list(next(iter(rows.values())))
+    means = {m: change(m, rows, rows)[0] for m in measures}
+    every = [*rows.items(), ("mean", means)]
+    return markdown(["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every])
+
+
+def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, int]:
+    """A measure's means before and now over the scenes that have both, and in how many it rose and fell."""
+    pairs = np.array([(before[name][measure], now[name][measure]) for name in now if name in before]).reshape(-1, 2)
+    old, new = pairs[~np.isnan(pairs).any(1)].T
+    before_mean, mean = (float(part.mean()) if len(part) else math.nan for part in (old, new))
+    return before_mean, mean, int((new > old).sum()), int((new < old).sum())
+
+
+def sign_test(up: int, down: int) -> float:
+    """How likely a split as uneven is, where up and down are equally likely."""
+    ways = sum(math.comb(up + down, k) for k in range(min(up, down) + 1))
+    return min(1.0, ways / 2.0 ** (up + down - 1))
+
+
+def comparison(before: Rows, now: Rows) -> str:
+    """A row a measure."""
+    known = next(iter(before.values()), {})
+    changes = {m: change(m, before, now) for m in next(iter(now.values())) if m in known}
+    rows = [
+        [m, text(m, old), text(m, new), text(m, new - old, "+"), f"{up} : {down}", f"{sign_test(up, down):.2f}"]
+        for m, (old, new, up, down) in changes.items()
+    ]
+    moved = [m for m, (*_, up, down) in changes.items() if m not in SECONDS and up + down]
+    note = f"{len(set(before) & set(now))} scenes; but for the seconds {', '.join(moved) or 'nothing'} changed."
+    return f"{markdown(['', 'before', 'now', 'change', 'up : down', 'p'], rows)}\n\n{note}"
+
+
+def ledger(runs: dict[str, Rows]) -> str:
+    """The default's means, and for each other run how they change without its mechanisms."""
+    default = runs[DEFAULT]
+    measures = [m for m in next(iter(default.values())) if m not in SECONDS]
+    rows = [["(nothing)", *(text(m, change(m, default, default)[0]) for m in measures)]]
+    for name in [name for name in runs if name != DEFAULT]:
+        changes = [(m, *change(m, default, runs[name])) for m in measures]
+        rows.append([name, *(f"{text(m, new - old, '+')} ({up}:{down})" for m, old, new, up, down in changes)])
+    return markdown(["without", *measures], rows)
+
+
+def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
+    """A row a photo: at the left and the right end of its move the lifted photo, and what each run makes of it."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
+    base, rows = spackle.LiteBase.load(), []
+    for file in [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, PHOTOS)})]:
+        pictures = []
+        for run in runs:
+            with switched_off(run, LIFT, FILL):
+                scene = spackle.predict(file, base=base, fill="exemplar")
+            sets = ([scene.base], [scene.base, scene.aux]) if run == DEFAULT else ([scene.base, scene.aux],)
+            ends = extremes(scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base))
+            pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
+        ordered = [picture for end in zip(*pictures, strict=True) for group in end for picture in group]
+        rows.append(np.concatenate([thumbnail(rgb) for rgb in ordered], axis=1))
+        print(file.name, file=sys.stderr, flush=True)
+    width = max(row.shape[1] for row in rows)
+    return Image.fromarray(np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows]))
+
+
+def thumbnail(rgb: Tensor) -> np.ndarray:
+    """[PHOTO_HEIGHT, w, 3] bytes."""
+    picture = Image.fromarray((255 * rgb.clamp(0, 1)).round().byte().numpy())
+    return np.asarray(picture.resize((round(picture.width * PHOTO_HEIGHT / picture.height), PHOTO_HEIGHT)))
+
+
+@torch.no_grad()
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", metavar="PAIRS")
+    parser.add_argument("--features", type=Path, help="SqueezeNet 1.0's weights; distance and texture need them")
+    parser.add_argument("--niqe", type=Path, help="NIQE's pristine model")
+    parser.add_argument("--small", type=int, default=1, help="how many times smaller a side of the depth maps is")
+    parser.add_argument("--scenes", default="", help="words, one of which a scene's name has to have")
+    parser.add_argument("--without", action="append", default=[], help=f"NAME+...: {', '.join(MECHANISMS)}")
+    parser.add_argument("--ledger", action="store_true", help="a run without each of these")
+    parser.add_argument("--photos", type=Path, help="a folder of photos to complete by lite, in place of pairs")
+    parser.add_argument("-o", "--output", type=Path, help="a file for the figures, or for the sheet of the photos")
+    parser.add_argument("--against", type=Path, help="compare with these figures")
+    chosen = parser.parse_args(arguments)
+    names = [DEFAULT, *(MECHANISMS if chosen.ledger else ()), *chosen.without]
+    for name in [part for run in names[1:] for part in run.split("+") if part not in MECHANISMS]:
+        parser.error(f"--without {name!r}: choose of {', '.join(MECHANISMS)}")
+    if chosen.photos:
+        sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
+        return
+    folders = [path.parent for path in sorted((chosen.folder or Path()).glob("*/scene.json"))]
+    folders = [path for path in folders if any(word in path.name for word in chosen.scenes.split(","))]
+    if not folders:
+        parser.error(f"{chosen.folder}: no folder with a scene.json in it")
+    before = json.loads(chosen.against.read_text()) if chosen.against else None
+    if before and before["small"] != chosen.small:
+        parser.error(f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}")
+    network = load_features("squeezenet", chosen.features) if chosen.features else None
+    perception, model = Perception(network) if network else None, load_niqe(chosen.niqe) if chosen.niqe else None
+    runs: dict[str, Rows] = {name: {} for name in names}
+    for folder in folders:
+        pair = Pair(folder, chosen.small)
+        for name, rows in runs.items():
+            rows[folder.name] = pair.measure(name, perception, model)
+            print(folder.name, name, *(f"{m} {text(m, v)}" for m, v in rows[folder.name].items()), file=sys.stderr)
+        if chosen.output:
+            chosen.output.write_text(json.dumps({"small": chosen.small, "runs": runs}, indent=1) + "\n")
+    print(table(runs[DEFAULT]))
+    if len(runs) > 1:
+        print(f"\n{ledger(runs)}")
+    if before:
+        print(f"\n{comparison(before['runs'][DEFAULT], runs[DEFAULT])}")
+
+
+if __name__ == "__main__":
+    main()

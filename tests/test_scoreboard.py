@@ -1,0 +1,125 @@
+"""The scoreboard measures a pair, compares with itself, and knows every mechanism by its name in the package."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scoreboard
+import torch
+from photos import box, picture, write_photo
+from PIL import Image
+
+from spackle.training.features import SqueezeNet
+
+WALL_PX, BOX_PX = 4, 12  # disparities
+
+
+@pytest.fixture
+def pairs(tmp_path: Path) -> Path:
+    """A folder of one pair, a box before a wall, and SqueezeNet's weights before any training."""
+    folder, width, height = tmp_path / "pair", 120, 84
+    write_photo(folder / "left.png", width, height)
+    inside, left = box(width, height), picture(width, height)
+    right = np.roll(left, -WALL_PX, 1)
+    right[np.roll(inside, -WALL_PX, 1)] = (50, 100, 180)  # the wall that the box hides
+    right[np.roll(inside, -BOX_PX, 1)] = left[inside]
+    Image.fromarray(right).save(folder / "right.png")
+    np.save(folder / "disparity.npy", np.where(inside, BOX_PX, WALL_PX).astype(np.float32))
+    facts: dict[str, Any] = {"left": "left.png", "right": "right.png", "disparity": "disparity.npy"}
+    facts |= {"focal_px": 100.0, "cx": width / 2, "cy": height / 2, "doffs_px": 0.0, "baseline_m": 0.2}
+    (folder / "scene.json").write_text(json.dumps(facts))
+    torch.manual_seed(0)
+    names = {".weight": ".w", ".bias": ".b"}
+    state = {key.replace(".conv", "/conv"): value.numpy() for key, value in SqueezeNet().state_dict().items()}
+    for ours, theirs in names.items():
+        state = {key.replace(ours, theirs): value for key, value in state.items()}
+    np.savez(tmp_path / "squeezenet.npz", **state)
+    return tmp_path
+
+
+def run(pairs: Path, *words: str) -> dict[str, Any]:
+    """The figures that a run writes."""
+    scoreboard.main([str(pairs), "--features", str(pairs / "squeezenet.npz"), "-o", str(pairs / "now.json"), *words])
+    runs: dict[str, Any] = json.loads((pairs / "now.json").read_text())["runs"]
+    return runs
+
+
+def test_a_pair_is_measured_and_compared(pairs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    row = run(pairs)["default"]["pair"]
+    assert 0 < row["distance"] < 2
+    assert 10 < row["PSNR"] < min(row["band"], row["elsewhere"])
+    assert row["photo"] > 30
+    assert row["agreement"] >= 45
+    assert 0 <= row["HAR"] < 0.5
+    assert 0 < row["aux"] < row["base"] < 1.5 * 120 * 84 / 1000
+    (pairs / "now.json").rename(pairs / "before.json")
+    without = run(pairs, "--against", str(pairs / "before.json"), "--without", "network+texture")
+    changed = without["network+texture"]["pair"]
+    assert changed["aux"] < row["aux"]  # one a cell, where the texture has one a pixel
+    assert changed["base"] == row["base"]
+    output = capsys.readouterr().out
+    assert "1 scenes; but for the seconds nothing changed." in output
+    assert "| network+texture |" in output
+    with pytest.raises(SystemExit):
+        run(pairs, "--small", "4", "--against", str(pairs / "before.json"))
+
+
+def test_small_maps_are_means_of_inverse_depth(pairs: Path) -> None:
+    depth = scoreboard.load_pair(pairs / "pair")[2]
+    depth.valid[:4, :8] = False
+    depth.valid[0, 0] = True
+    small = scoreboard.smaller(depth, 4)
+    assert small.depth.shape == (21, 30)
+    assert bool(small.valid[0, 0])
+    assert not bool(small.valid[0, 1])
+    wall, thing = (0.2 * 100 / d for d in (WALL_PX, BOX_PX))
+    assert float(small.depth[0, 0]) == pytest.approx(wall, rel=1e-3)
+    assert float(small.depth[10, 15]) == pytest.approx(thing, rel=1e-3)
+
+
+def test_sign_test() -> None:
+    assert scoreboard.sign_test(5, 5) == 1
+    assert scoreboard.sign_test(9, 1) == pytest.approx(22 / 1024)  # 2 (1 + 10) of 2¹⁰
+    assert scoreboard.sign_test(0, 11) == pytest.approx(2 / 2048)
+    before, now = {"a": {"x": 1.0}, "b": {"x": 2.0}, "c": {"x": 7.0}}, {"a": {"x": 2.0}, "b": {"x": 1.5}}
+    assert scoreboard.change("x", before, now) == (1.5, 1.75, 1, 1)
+
+
+@pytest.mark.parametrize("name", scoreboard.MECHANISMS)
+def test_each_mechanism_is_in_the_package(name: str) -> None:
+    for stage in (scoreboard.LIFT, scoreboard.FILL):
+        for target in stage.get(name, {}):
+            own = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
+            with scoreboard.switched_off(name, stage):
+                there = [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
+                assert there[0] is not own[0]
+            assert own == [vars(module)[target.rpartition(".")[2]] for module in scoreboard.holders(target)]
+
+
+def test_a_mechanism_that_is_gone_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(scoreboard.FILL, "gone", {"no_such_function": scoreboard.first})
+    with pytest.raises(LookupError, match="no_such_function"), scoreboard.switched_off("gone", scoreboard.FILL):
+        pass
+    with pytest.raises(LookupError, match="2 things"):
+        scoreboard.holders("SHOWN")  # the backing's, and the patches'
+
+
+@pytest.mark.slow
+def test_every_mechanism_can_be_switched_off(pairs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = run(pairs, "--ledger")
+    assert set(runs) == {"default", *scoreboard.MECHANISMS}
+    rows = capsys.readouterr().out.splitlines()
+    assert all(any(row.startswith(f"| {name} |") for row in rows) for name in scoreboard.MECHANISMS)
+
+
+@pytest.mark.slow
+def test_photos_are_completed_on_a_sheet(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_photo(tmp_path / f"{name}.png", 96, 64)
+    scoreboard.main(["--photos", str(tmp_path), "--without", "texture", "-o", str(tmp_path / "sheet.jpg")])
+    width, height = Image.open(tmp_path / "sheet.jpg").size
+    assert (width, height) == (2 * 3 * 384, 2 * (scoreboard.PHOTO_HEIGHT + 4))
