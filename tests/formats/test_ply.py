@@ -224,8 +224,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "beyond float32": (spoiled(1, 1e200, "double"), "2 of 3"),
     "SHARP, cut": (SHARP[:-4], "cut off"),
     "ascii cut": (ASCII[:-300], "cut off"),
-    "ascii words": (ASCII.replace(b"end_header\n", b"end_header\nzero "), "no number"),
-    "ascii surplus": (ASCII[:-1] + b" 1 2 3\n", "exactly 14 numbers"),
+    "ascii words": (ASCII.replace(b"end_header\n", b"end_header\nzero "), "'vertex' is broken"),
+    "ascii surplus": (ASCII[:-1] + b" 1 2 3\n", "requires 14 columns"),
 }
 
 

@@ -12,7 +12,7 @@ from rich.filesize import decimal
 
 from spackle.errors import InputError
 from spackle.files import check_writable, results_folder, write_whole
-from spackle.formats.ply import read_header
+from spackle.formats.ply import PlyFile
 from spackle.formats.scene_files import SceneFile, Writer, writer_of
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.progress import Reporter
@@ -45,9 +45,8 @@ def _export(scene: Path, outputs: Sequence[Path], writers: Sequence[Writer], rep
         raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
     loaded = SceneFile.load(scene)
     size = os.path.getsize(scene)
-    with open(scene, "rb") as file:
-        elements = read_header(file, scene).elements
-    if rest := sum(name.startswith("f_rest_") for element in elements for name, *_ in element.fields):
+    elements = PlyFile(scene).elements
+    if rest := sum(name.startswith("f_rest_") for element in elements for name, _ in element.fields):
         reporter.log(
             f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
         )

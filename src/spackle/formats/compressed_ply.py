@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.formats.columns import Columns, Floats, smallest_three
-from spackle.formats.ply import header_comments
+from spackle.formats.columns import Columns, Floats, as_shares, smallest_three
+from spackle.formats.ply import ply_header
 from spackle.gaussians import Gaussians
 
 CHUNK = 256  # Gaussians that share bounds
@@ -35,9 +35,7 @@ def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, ba
     columns = columns.select(order)
     scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     starts = np.arange(0, count, CHUNK)
-    lines = ["ply", "format binary_little_endian 1.0", *header_comments(camera, base_count, None)]
-    lines += [f"element chunk {len(starts)}", *(f"property float {name}" for name in _CHUNK_NAMES)]
-    lines += [f"element vertex {count}", *(f"property uint {name}" for name in _VERTEX_NAMES), "end_header", ""]
+    tables = ("chunk", len(starts), "float", _CHUNK_NAMES), ("vertex", count, "uint", _VERTEX_NAMES)
     chunks = np.zeros((len(starts), len(_CHUNK_NAMES)), "<f4")
     rows = np.zeros((count, len(_VERTEX_NAMES)), "<u4")
     if count:
@@ -46,10 +44,10 @@ def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, ba
         colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
         rows[:, 0] = _packed(places, (11, 10, 11))
         largest, others = smallest_three(columns.quats)
-        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(others, (10, 10, 10))
+        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), (10, 10, 10))
         rows[:, 2] = _packed(sizes, (11, 10, 11))
         rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), (8, 8, 8, 8))
-    return "\n".join(lines).encode() + chunks.tobytes() + rows.tobytes()
+    return ply_header(*tables, camera=camera, base_count=base_count) + chunks.tobytes() + rows.tobytes()
 
 
 def morton_order(means: Floats) -> NDArray[np.int64]:

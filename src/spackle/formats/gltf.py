@@ -15,7 +15,6 @@ from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
 from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, Columns
-from spackle.formats.ply import SH_C0
 from spackle.gaussians import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -59,7 +58,7 @@ def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
         f"{EXTENSION}:ROTATION": (columns.quats * FLIPPED_QUATS)[:, [1, 2, 3, 0]].astype("<f4"),
         f"{EXTENSION}:SCALE": np.exp(columns.log_scales).astype("<f4"),
         f"{EXTENSION}:OPACITY": columns.opacities.astype("<f4"),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": ((columns.srgb - np.float32(0.5)) / np.float32(SH_C0)).astype("<f4"),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": columns.harmonics.astype("<f4"),
         "COLOR_0": np.round(rgba * 65535).astype("<u2"),
     }
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spackle.errors import InputError
-from spackle.formats.columns import Columns, Floats, smallest_three
-from spackle.formats.ply import SH_C0
+from spackle.formats.columns import Columns, Floats, as_shares, smallest_three
 from spackle.gaussians import Gaussians
 
 LARGEST_SIDE = 16_380  # of a WebP picture, in fours
@@ -42,11 +41,11 @@ def encode_sog(gaussians: Gaussians) -> bytes:
     columns = Columns.of(gaussians)
     means, low, high = _means(columns.means)
     scale_book, scales = codebook(columns.log_scales)
-    color_book, colors = codebook((columns.srgb - np.float32(0.5)) / np.float32(SH_C0))
+    color_book, colors = codebook(columns.harmonics)
     opacities = np.round(columns.opacities * 255).astype(np.uint8)[:, None]
     opaque = np.full_like(opacities, 255)
     largest, others = smallest_three(columns.quats)
-    quats = np.concatenate([np.round(others * 255), largest[:, None] + 252], axis=1).astype(np.uint8)
+    quats = np.concatenate([np.round(as_shares(others) * 255), largest[:, None] + 252], axis=1).astype(np.uint8)
     pictures = {
         "means_l.webp": [(means & 255).astype(np.uint8), opaque],
         "means_u.webp": [(means >> 8).astype(np.uint8), opaque],

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.errors import InputError
-from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, Columns, Floats
-from spackle.formats.ply import SH_C0
+from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, SH_C0, Columns, Floats, smallest_three
 from spackle.gaussians import Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
@@ -126,7 +125,7 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
         np.minimum(255, np.round(columns.opacities * (255 / step)) * step).astype(np.uint8).tobytes(),
         np.clip(np.round(colors), 0, 255).astype(np.uint8).tobytes(),
         scales.tobytes(),
-        _smallest_three(quats, 2 ** (9 - detail.quat_bits)).tobytes(),
+        _rotations(quats, detail.quat_bits).tobytes(),
     ]
 
 
@@ -141,17 +140,14 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
     return np.ascontiguousarray(whole.view(np.uint8).reshape(-1, 3, 4)[:, :, :3])
 
 
-def _smallest_three(quats: Floats, step: int) -> NDArray[np.uint32]:
-    """[N] words of unit quaternions wxyz: which of xyzw is largest, then sign and 9 bits of each other one."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    negative = np.take_along_axis(xyzw, largest[:, None], axis=1)[:, 0] < 0
+def _rotations(quats: Floats, bits: int) -> NDArray[np.uint32]:
+    """[N] words of unit quaternions wxyz: which of xyzw is largest; sign and `bits` bits, of 9, of the others."""
+    largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
+    step = 2 ** (9 - bits)
+    sizes = np.minimum(511, np.round(np.abs(others) * np.float32(511 * 2**0.5 / step)) * step).astype("<u4")
     words: NDArray[np.uint32] = largest.astype("<u4")
-    for axis in range(4):
-        part = xyzw[:, axis]
-        size = np.minimum(511, np.round(np.abs(part) * np.float32(511 * 2**0.5 / step)) * step).astype("<u4")
-        sign = (((part < 0) ^ negative) & (size > 0)).astype("<u4")
-        words = np.where(largest == axis, words, words << 10 | sign << 9 | size)
+    for size, other in zip(sizes.T, others.T, strict=True):
+        words = words << 10 | ((other < 0) & (size > 0)).astype("<u4") << 9 | size
     return words
 
 
