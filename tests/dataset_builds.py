@@ -53,7 +53,7 @@ def dying_build(script: Path, patch: str, place: Path, output: Path, *more: obje
     """A build in a process of its own, in which `patch` makes `die()` be called."""
     script.write_text(f"""
 import multiprocessing, os, subprocess, sys
-import spackle.dataset.build as build, spackle.dataset.maker as maker
+import spackle.dataset.build as build
 sys.argv = {["spackle", *map(str, words_of(place, output, *more))]!r}
 def die(*arguments):
     os.kill(os.getpid(), 9)

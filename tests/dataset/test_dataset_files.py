@@ -21,8 +21,7 @@ from PIL import Image
 from scenes import box_before_wall, psnr
 from torch.utils.data import DataLoader
 
-from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.camera_path import TRAJECTORIES
 from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
 from spackle.dataset.sample import (
     END,
@@ -34,7 +33,6 @@ from spackle.dataset.sample import (
     encode_gaussians,
 )
 from spackle.dataset.shards import load_manifest
-from spackle.dataset.views import APART, PathChoice, path_cameras
 from spackle.errors import InputError
 from spackle.files import digest_of
 from spackle.gaussians import Gaussians
@@ -62,7 +60,7 @@ def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
         assert {f"{own.key}.{n}": data for n, data in group.items() if not n.startswith("__")} == dict(own.files)
 
 
-def test_what_is_read_is_what_was_drawn_and_what_the_paper_asks_for(whole: Path, place: Path) -> None:
+def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
     group = DatasetFiles(whole).group(0)
     facts = group.facts
     assert facts["photo"]["name"] == "0.png"
@@ -98,7 +96,7 @@ def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
     for shard in manifest.shards:
         path = copy / shard.file
         original = path.read_bytes()
-        places = [0, len(original) - 1, len(original) - len(END), *rng.integers(0, len(original), 6).tolist()]
+        places = [0, len(original) - 1, len(original) - len(END), *rng.integers(0, len(original), 3).tolist()]
         for place in places:
             path.write_bytes(original[:place] + bytes([original[place] ^ 1]) + original[place + 1 :])
             done = run("dataset", "verify", copy)
@@ -109,7 +107,7 @@ def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
         path.write_bytes(original)
 
 
-def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) -> None:
+def test_verify_finds_cut_shards_and_a_changed_manifest(copy: Path) -> None:
     first, second, third = (copy / f"shard-00000{number}.tar" for number in range(3))
     os.truncate(first, first.stat().st_size // 2)
     second.unlink()
@@ -126,7 +124,10 @@ def test_verify_finds_cut_and_missing_shards_and_a_changed_manifest(copy: Path) 
     manifest.unlink()
     refused(run("dataset", "info", copy), f"{manifest}: not there")
     manifest.mkdir()
-    refused(run("dataset", "info", copy), f"{manifest}: cannot be read: Is a directory")
+    refused(run("dataset", "preview", copy, "-o", copy / "look"), f"{manifest}: cannot be read: [Errno 21]")
+    manifest.rmdir()
+    manifest.write_text('{"format": 1, "config": ' + "[" * 10_000 + "]" * 10_000 + "}")
+    refused(run("dataset", "verify", copy), f"{manifest}: damaged")
 
 
 def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -139,28 +140,22 @@ def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
 
 
 FIELDS: list[tuple[str, object]] = [
-    *((name, value) for name in ("offset", "size") for value in ("1", -1, 1.5, True, None, 10**400)),
-    *(("file", name) for name in (["a"], "../photos.tar", "/etc/passwd", "shard-0.tar", "shard-000000.tar\n")),
-    *(("key", name) for name in ("../a", "", 3, ["a"])),
-    *(("holes", value) for value in (["a"], [2.0], "ab", None, [0.1])),
-    *((name, value) for name in ("photo", "sha256", "passed_over") for value in (3, [[]])),
-]
+    *(("size", value) for value in ("1", -1, 1.5, True, 10**400)),
+    *(("file", name) for name in (["a"], "../photos.tar", "shard-000000.tar\n")),
+    *(("holes", value) for value in ("ab", [2.0], [0.1])),
+    ("offset", 512), ("key", "../a"), ("photo", 3), ("sha256", None), ("passed_over", [[]]), ("more", 1),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "value"), FIELDS)
-def test_fields_that_cannot_be_are_refused_although_the_digest_fits(copy: Path, name: str, value: object) -> None:
+def test_impossible_fields_are_refused_though_the_digest_fits(copy: Path, name: str, value: object) -> None:
     def change(content: dict[str, Any]) -> None:
         shard = content["shards"][0]
-        (shard if name in shard and name != "sha256" else shard["samples"][0])[name] = value
+        (shard if name in ("size", "file", "passed_over") else shard["samples"][0])[name] = value
 
     resealed(copy, change)
-    for words in (("info", copy), ("verify", copy), ("preview", copy, "-o", copy / "look")):
-        refused(run("dataset", *words), f"{copy / 'manifest.json'}: damaged")
-
-
-def test_a_manifest_of_endless_depth_is_refused(copy: Path) -> None:
-    (copy / "manifest.json").write_text('{"format": 1, "config": ' + "[" * 10_000 + "]" * 10_000 + "}")
-    refused(run("dataset", "verify", copy), f"{copy / 'manifest.json'}: damaged")
+    with pytest.raises(InputError, match=r"manifest\.json: damaged"):
+        load_manifest(copy)
 
 
 def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
@@ -176,10 +171,7 @@ def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
     "data",
     [
         member("000000.json", type=tarfile.SYMTYPE, linkname="/etc/passwd"),
-        member("000000.json", type=tarfile.LNKTYPE, linkname="000001.json"),
         member("000000.json", type=tarfile.GNUTYPE_SPARSE),
-        member("000000.json", type=tarfile.FIFOTYPE),
-        member("000000.json", type=tarfile.XHDTYPE),
         member("000000.json", size=1 << 40),
         member("000000.json", size=-512),
         member("000000.json", b"[" * 10_000),
@@ -188,7 +180,7 @@ def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
         b"no tar",
     ],
 )
-def test_what_is_no_plain_file_of_a_photo_is_refused_although_all_digests_fit(copy: Path, data: bytes) -> None:
+def test_odd_members_are_refused_though_all_digests_fit(copy: Path, data: bytes) -> None:
     def change(content: dict[str, Any]) -> None:
         shard = content["shards"][0]
         shard["samples"] = [shard["samples"][0] | {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}]
@@ -231,9 +223,7 @@ def test_ranks_and_workers_read_every_view_once(whole: Path) -> None:
         ViewDataset(whole, rank=2, ranks=2)
 
 
-def test_damage_is_skipped_named_and_counted_where_that_is_asked_for(
-    copy: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damage_is_skipped_named_and_counted_on_request(copy: Path, caplog: pytest.LogCaptureFixture) -> None:
     good = names_of(list(ViewDataset(copy, on_error="skip")))
     assert len(good) == 5 * VIEWS
     (copy / "shard-000001.tar").unlink()  # photos 2 and 3
@@ -252,7 +242,7 @@ def test_damage_is_skipped_named_and_counted_where_that_is_asked_for(
         list(ViewDataset(copy))
 
 
-def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: Path) -> None:
+def test_the_order_depends_on_seed_and_epoch_alone(whole: Path) -> None:
     def order(seed: int, epoch: int) -> list[tuple[str, int]]:
         dataset = ViewDataset(whole, shuffle=8, seed=seed)
         dataset.set_epoch(epoch)
@@ -262,7 +252,7 @@ def test_the_order_is_random_and_the_same_for_the_same_seed_and_epoch(whole: Pat
     assert len({tuple(order(seed, epoch)) for seed in (0, 1) for epoch in (0, 1)}) == 4
 
 
-def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_address_is_read_by_fsspec(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fsspec = pytest.importorskip("fsspec")
     memory = fsspec.filesystem("memory")
     for path in whole.iterdir():
@@ -274,20 +264,7 @@ def test_an_address_is_read_by_fsspec_and_without_it_is_a_line(whole: Path, monk
     refused(run("dataset", "info", "memory://there"), "pip install fsspec")
 
 
-# Views and encoding -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", TRAJECTORIES)
-@pytest.mark.parametrize("views", [2, 3, 20])
-def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind, views: int) -> None:
-    camera = Camera.from_focal(80.0, 96, 72)
-    cameras = path_cameras(PathChoice(kind, 0.4), camera, DepthRange(2.0, 3.0), views)
-    assert len(cameras) == views
-    assert cameras[0] is camera
-    eyes = torch.stack([view.position.double() for view in cameras])
-    assert float(torch.nn.functional.pdist(eyes).min()) > APART
-    with pytest.raises(ValueError, match="different views"):
-        path_cameras(PathChoice(kind, 0.0), camera, DepthRange(2.0, 3.0), views)
+# Encoding -----------------------------------------------------------------------------------------
 
 
 def test_depth_and_opacity_come_back_within_what_the_page_says() -> None:
@@ -318,5 +295,3 @@ def test_gaussians_come_back_and_look_the_same() -> None:
     assert torch.equal(back.means, base.means)
     torch.testing.assert_close(back.scales, base.scales, rtol=3e-4, atol=0)
     assert len(decode_gaussians(encode_gaussians(Gaussians.empty()))) == 0
-    with pytest.raises(ValueError, match="no Gaussians"):
-        decode_gaussians(b"nothing")

@@ -16,12 +16,11 @@ from command import Run, names_in
 from dataset_builds import build, content, refused
 
 from spackle.bases.open import BaseSettings
-from spackle.dataset.maker import Made, Maker, PhotoJob
+from spackle.dataset.build import Made, Maker
 from spackle.dataset.options import DatasetOptions
-from spackle.dataset.views import ViewChoices
+from spackle.dataset.photos import PhotoFile
 from spackle.workers import ray as on_ray
-from spackle.workers.local import IN_HAND
-from spackle.workers.ray import RemoteWorker, WorkerPool
+from spackle.workers.ray import RemoteWorker
 
 ray = pytest.importorskip("ray")
 
@@ -57,8 +56,8 @@ def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteW
                 turn()
             super().begin(expected)
 
-        def make(self, job: PhotoJob, seen: object) -> Made:
-            answer: Made = super().make(job, seen)
+        def make(self, job: PhotoFile, expected: object) -> Made:
+            answer: Made = super().make(job, expected)
             if where == "make" and job.index == at:
                 turn()
             return answer
@@ -74,25 +73,16 @@ def on(address: str, place: Path, output: Path, *more: object) -> Run:
 # The same bytes -----------------------------------------------------------------------------------
 
 
-def test_a_local_cluster_makes_the_same_bytes_and_ends(
-    place: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before, hand_out, counts = signal.getsignal(signal.SIGTERM), WorkerPool._hand_out, list[int]()
-
-    def noting(pool: Any) -> None:
-        hand_out(pool)
-        counts.extend(len(worker.jobs) for worker in pool.workers)
-
-    monkeypatch.setattr(WorkerPool, "_hand_out", noting)
+def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, whole: Path, tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
     done = on("local", place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (0, "", 2), done.err  # nothing of Ray's own
-    assert max(counts) == IN_HAND
     assert content(tmp_path / "out") == content(whole)
     assert not ray.is_initialized()
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_photos_of_a_killed_worker_are_made_again_by_another(
+def test_a_killed_workers_photos_are_made_again(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(on_ray, "RemoteWorker", dying(2, 1, tmp_path / "notes"))
@@ -107,7 +97,7 @@ def test_photos_of_a_killed_worker_are_made_again_by_another(
 @pytest.mark.parametrize(
     ("where", "line"), [("make", "photos/3.png: at this photo a worker died"), ("begin", "as it started a worker died")]
 )
-def test_what_kills_every_worker_ends_the_build_which_goes_on_later(
+def test_what_kills_every_worker_ends_the_build(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, line: str
 ) -> None:
     with monkeypatch.context() as patch:
@@ -122,7 +112,7 @@ def test_what_kills_every_worker_ends_the_build_which_goes_on_later(
 # What cannot be -----------------------------------------------------------------------------------
 
 
-def test_an_address_where_nobody_answers_and_a_cluster_without_room_are_a_line(
+def test_a_silent_address_and_a_full_cluster_are_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refused(on(address, place, tmp_path / "out", "--workers", 3), f"--ray {address}: room for 2 of 3 workers")
@@ -155,7 +145,7 @@ def test_a_worker_takes_a_gpu_only_where_a_network_uses_one() -> None:
     def gpus(
         base: str, device: str = "auto", inpainter: str = "geometry", here: float = 1.0, alive: bool = True
     ) -> int:
-        options = DatasetOptions(BaseSettings(base, device=device), ViewChoices(), inpainter=inpainter)
+        options = DatasetOptions(BaseSettings(base, device=device), inpainter=inpainter)
         without = {"Alive": True, "Resources": {"CPU": 4.0}}
         return on_ray.gpus_of(options.processes, [without, {"Alive": alive, "Resources": {"CPU": 4.0, "GPU": here}}])
 

@@ -269,7 +269,7 @@ READERS: dict[str, Reader] = {
     "keyframes": Reader([_keyframes], lambda folder: load_path(_only(folder))),
     "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),
     "recipes": Reader([_recipe], lambda folder: load_recipe(Recipe, _only(folder))),
-    "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images")),
+    "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", print)),
     "datasets": Reader([_dataset], _read_dataset),
     "weights": Reader([_checkpoint, _safetensors], _read_weights),
     "clips": Reader(

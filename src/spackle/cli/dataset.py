@@ -36,8 +36,10 @@ def dataset_build(
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
     ] = None,
-    sample: Annotated[int | None, typer.Option(help="So many photos, chosen at random; default: all.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the choice and of the paths.")] = 0,
+    sample: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Number of photos, chosen at random; default: all.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the choice and of the paths.")] = 0,
     base: Annotated[
         str, typer.Option(help="What turns a photo into Gaussians: sharp, rgbd, depth, lite or hf:NAME.")
     ] = "sharp",
@@ -46,7 +48,7 @@ def dataset_build(
     ] = None,
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: PrecisionOption = "auto",
-    views: Annotated[int, typer.Option(help="Views of a photo, its own among them.")] = 20,
+    views: Annotated[int, typer.Option(min=2, max=100, help="Views of a photo, its own among them.")] = 20,
     trajectory: Annotated[str | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
     disparity: Annotated[
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
@@ -66,7 +68,7 @@ def dataset_build(
         typer.Option(metavar="ADDRESS", help="Workers on a Ray cluster: auto, local, HOST:PORT or ray://HOST:PORT."),
     ] = None,
     threads: Annotated[int, typer.Option(help="Threads of each process; SHARP's last bits depend on them.")] = 2,
-    shard_size: Annotated[int, typer.Option(help="Photos of a tar file.")] = 50,
+    shard_size: Annotated[int, typer.Option(min=1, max=1_000_000, help="Photos of a tar file.")] = 50,
     device: DeviceOption = "auto",
     verbose: VerboseOption = False,
 ) -> None:
@@ -74,15 +76,17 @@ def dataset_build(
     from spackle.bases.open import BaseSettings
     from spackle.dataset.build import build_dataset
     from spackle.dataset.options import DatasetOptions
-    from spackle.dataset.views import ViewChoices
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)
     options = DatasetOptions(
         settings,
-        ViewChoices(seed, views, trajectory, disparity),  # type: ignore[arg-type]  # a kind, by its parser
         images=images,
         sample=sample,
+        seed=seed,
+        views=views,
+        trajectory=trajectory,  # type: ignore[arg-type]  # a kind, by its parser
+        disparity=disparity,
         inpainter=inpainter,
         inpainter_weights=inpainter_weights,
         inpainter_side=inpainter_side,
@@ -119,8 +123,8 @@ def dataset_verify(location: DatasetArgument) -> None:
 def dataset_preview(
     location: DatasetArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder for the two files.")],
-    photos: Annotated[int, typer.Option(help="How many photos.")] = 3,
-    views: Annotated[int, typer.Option(help="How many views of each.")] = 6,
+    photos: Annotated[int, typer.Option(min=1, help="Number of photos.")] = 3,
+    views: Annotated[int, typer.Option(min=1, help="Number of views of each.")] = 6,
 ) -> None:
     """Write sheet.png (base, mask, target) and trajectory.mp4 (base beside target)."""
     from spackle.dataset.inspect import preview_dataset

@@ -28,17 +28,16 @@ FPS = 8
 
 
 def show_info(location: str, console: Console) -> None:
-    """Counts, sizes, holes and configuration."""
+    """Print counts, sizes, holes and configuration."""
     manifest = load_manifest(location)
     samples = manifest.samples
-    state = "complete" if manifest.complete else "not finished"
     lines = [
-        one_line(f"{location}: {state}"),
+        one_line(f"{location}: {'complete' if manifest.complete else 'not finished'}"),
         f"{counted(len(samples), 'photo')}, {manifest.views} views, {counted(len(manifest.shards), 'shard')}",
+        f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo",
     ]
-    lines.append(f"{decimal(manifest.size)}, {decimal(manifest.size // max(1, len(samples)))} a photo")
-    if passed := sum(len(shard.passed_over) for shard in manifest.shards):
-        lines.append(f"{passed} photos gave no sample: manifest.json says why")
+    if skipped := sum(len(shard.passed_over) for shard in manifest.shards):
+        lines.append(f"{skipped} photos gave no sample: manifest.json says why")
     if samples:
         holes = np.mean([sample.holes for _, sample in samples], axis=0)
         lines.append("holes of each view: " + " ".join(f"{share:.1%}" for share in holes))
@@ -65,8 +64,6 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
 
     InputError for a dataset that is unfinished or damaged, or a folder that cannot be written to.
     """
-    if min(photos, views) < 1:
-        raise InputError("--photos and --views must be at least 1")
     files = DatasetFiles(location)
     if not len(files):
         raise InputError(f"{location}: holds no photos")
@@ -88,12 +85,9 @@ def _spread(total: int, count: int) -> list[int]:
 def _block(group: PhotoGroup, views: int) -> Tensor:
     """Rows of base, mask and target, with a column for each view."""
     columns = []
-    for index in _spread(group.views, views):
-        view = group.view(index)
-        mask = view.mask[..., None].expand(-1, -1, 3).float()
-        columns.append(
-            _stack([thumbnail(picture, THUMBNAIL) for picture in (view.rendering.rgb, mask, view.target)], 0)
-        )
+    for view in map(group.view, _spread(group.views, views)):
+        pictures = view.rendering.rgb, view.mask[..., None].expand(-1, -1, 3).float(), view.target
+        columns.append(_stack([thumbnail(picture, THUMBNAIL) for picture in pictures], 0))
     return _stack(columns, 1)
 
 

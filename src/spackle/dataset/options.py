@@ -10,47 +10,47 @@ from typing import Any
 import spackle
 from spackle.bases.depth_map import find_depth
 from spackle.bases.open import NETWORKS, BaseSettings, kind_of
-from spackle.camera_path import MAX_DISPARITY
-from spackle.dataset.completion import COMPLETIONS, Completion
+from spackle.camera_path import MAX_DISPARITY, TrajectoryKind
 from spackle.dataset.photos import PhotoFile
-from spackle.dataset.views import ViewChoices
+from spackle.dataset.views import COMPLETIONS, Completion
 from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.files import digest_of, fingerprint
 from spackle.inpaint import INPAINTERS
+from spackle.residual import MASK_THRESHOLD
 from spackle.workers import Workers
-
-MAX_VIEWS = 100  # two digits name a view
-MAX_PHOTOS = 1_000_000  # six digits name a photo
 
 
 @dataclasses.dataclass(frozen=True)
 class DatasetOptions:
-    """The choices of `spackle dataset build`."""
+    """The choices of `spackle dataset build`; the command line keeps its numbers within their bounds."""
 
     base: BaseSettings
-    choices: ViewChoices
-    images: Path | None = None  # where the photos of a COCO JSON lie
-    sample: int | None = None  # so many photos; all where None
+    images: Path | None = None  # folder of the photos of a COCO JSON
+    sample: int | None = None  # number of photos; all where None
+    seed: int = 0  # of the choice and of the paths
+    views: int = 20  # of a photo, its own among them, as in the paper
+    trajectory: TrajectoryKind | None = None  # drawn for each photo where None
+    disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
     inpainter: str = "geometry"  # of `COMPLETIONS`
     inpainter_weights: Path | None = None  # a file or a folder, for one with a network
-    inpainter_side: int | None = None  # pixels of the long side at which that works
+    inpainter_side: int | None = None  # long side in pixels at which its network works
     workers: int = 1  # processes
-    ray: str | None = None  # the cluster where they are; this machine where None
+    ray: str | None = None  # address of their cluster; this machine where None
     threads: int = 2  # of each
     shard_size: int = 50  # photos
 
     @property
-    def paints_by_network(self) -> bool:
+    def inpaints_by_network(self) -> bool:
         return self.inpainter in INPAINTERS and INPAINTERS[self.inpainter].network
 
     @property
     def processes(self) -> Workers:
-        network = self.base.kind.network or self.paints_by_network
+        network = self.base.kind.network or self.inpaints_by_network
         return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
 
     def check(self) -> None:
-        """InputError for an option that cannot be used, whatever the photos; inpainters check theirs themselves."""
+        """InputError for options that do not go together; inpainters check theirs themselves."""
         kind_of(self.base.name)  # a dataset says of which base it is, so no `auto`
         self.base.check()
         depth = self.base.depth
@@ -61,23 +61,15 @@ class DatasetOptions:
         if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
             raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
         check_name("--inpainter", self.inpainter, COMPLETIONS)
-        for option, given in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
-            if given is not None and not self.paints_by_network:
-                line = f"--inpainter-{option} {given}: the {self.inpainter} inpainter has no network"
+        for option, value in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
+            if value is not None and not self.inpaints_by_network:
+                line = f"--inpainter-{option} {value}: the {self.inpainter} inpainter has no network"
                 raise InputError(f"{line}: leave the option out")
-        low, high = self.choices.disparity
+        low, high = self.disparity
         if not 0 < low <= high <= MAX_DISPARITY:
             raise InputError(
                 f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
             )
-        for name, value, least, most in (
-            ("--views", self.choices.views, 2, MAX_VIEWS),
-            ("--seed", self.choices.seed, 0, 2**31 - 1),
-            ("--sample", 1 if self.sample is None else self.sample, 1, MAX_PHOTOS),
-            ("--shard-size", self.shard_size, 1, MAX_PHOTOS),
-        ):
-            if not least <= value <= most:
-                raise InputError(f"{name} must be between {least} and {most}, got {value}")
         self.processes.check()
 
     def depth_of(self, photo: PhotoFile) -> Path | None:
@@ -102,19 +94,28 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completi
 
     Threads are part of it: SHARP's last bits depend on their number. Workers are not.
     """
-    base, choices = options.base, options.choices
-    inputs = digest_of([options.inputs_of(photo) for photo in photos])
+    base = options.base
     weights = {name: weights_digest(file) for name, file in completion.files.items()}
     return {
         "spackle": spackle.__version__,
-        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
+        "photos": {
+            "count": len(photos),
+            "sample": options.sample,
+            "sha256": digest_of([options.inputs_of(photo) for photo in photos]),
+        },
         "base": {
             "name": base.public_name,
             "weights": base_digest(base.files),
             "precision": base.precision,
             "device": base.device,
         },
-        "views": dataclasses.asdict(choices) | {"disparity": list(choices.disparity), "trajectory": choices.trajectory},
+        "views": {
+            "seed": options.seed,
+            "views": options.views,
+            "trajectory": options.trajectory,
+            "disparity": list(options.disparity),
+            "threshold": MASK_THRESHOLD,
+        },
         "inpainter": {"name": completion.name, "version": completion.version}
         | ({"weights": weights} if weights else {}),
         "shard_size": options.shard_size,

@@ -39,11 +39,11 @@ class DatasetFiles:
         return group
 
     def groups(self, places: Sequence[Place], skip: Callable[[InputError], None] | None = None) -> Iterator[PhotoGroup]:
-        """Likewise of several photos, with one shard open at a time; `skip` is told of what is damaged, if given."""
-        for shard, own in itertools.groupby(places, key=lambda place: place[0]):
+        """Likewise of several photos, with one shard open at a time; `skip` gets what is damaged, if given."""
+        for shard, pairs in itertools.groupby(places, key=lambda place: place[0]):
             with contextlib.ExitStack() as stack:
                 file: IO[bytes] | None = None
-                for _, sample in own:
+                for _, sample in pairs:
                     try:
                         file = file or stack.enter_context(open_in(self.location, shard.file))
                         group = read_sample(file, sample, f"{self.location}/{shard.file}")
@@ -110,36 +110,33 @@ class ViewDataset(IterableDataset[DatasetView]):
         if self.shuffle:
             np.random.default_rng([self.seed, self.epoch]).shuffle(shards)
         order = [(shard, sample) for shard in shards for sample in shard.samples]
-        mine = order[self.rank * parts + part :: self.ranks * parts]
+        reader = self.rank * parts + part
+        skip = self._skip if self.on_error == "skip" else None
         views = (
             (group.only(index, with_base=self.with_base), index)
-            for group in self.files.groups(mine, self._skip if self.on_error == "skip" else None)
+            for group in self.files.groups(order[reader :: self.ranks * parts], skip)
             for index in range(group.views)
         )
-        for group, index in self._shuffled(views, self.rank * parts + part) if self.shuffle else views:
+        for group, index in self._shuffled(views, reader) if self.shuffle else views:
             try:
-                found = group.view(index, with_base=self.with_base)
+                view = group.view(index, with_base=self.with_base)
             except InputError as error:
-                if self.on_error != "skip":
+                if skip is None:
                     raise
-                self._skip(error)
+                skip(error)
             else:
-                yield found
+                yield view
 
     def _skip(self, error: InputError) -> None:
         self.skipped += 1
         logging.getLogger(__name__).warning("left out: %s", one_line(str(error)))
 
     def _shuffled(self, views: Iterator[tuple[PhotoGroup, int]], reader: int) -> Iterator[tuple[PhotoGroup, int]]:
-        """A random one of those held back makes room for the next."""
+        """A random one of the views held back makes room for the next."""
         rng = np.random.default_rng([self.seed, self.epoch, reader])
-        held: list[tuple[PhotoGroup, int]] = []
+        held = list(itertools.islice(views, self.shuffle))
         for view in views:
-            if len(held) < self.shuffle:
-                held.append(view)
-                continue
             place = int(rng.integers(len(held)))
             yield held[place]
             held[place] = view
-        for place in rng.permutation(len(held)):
-            yield held[place]
+        yield from (held[place] for place in rng.permutation(len(held)))

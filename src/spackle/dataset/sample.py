@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -25,7 +24,7 @@ from torch.nn.functional import normalize
 from spackle.camera import Camera
 from spackle.color import to_bytes
 from spackle.dataset.views import PathChoice, ViewStack
-from spackle.errors import InputError
+from spackle.errors import reading
 from spackle.formats.camera_files import checked_camera, read_matrix
 from spackle.gaussians import Gaussians
 from spackle.image import check_pixels
@@ -104,7 +103,7 @@ class PhotoGroup:
     def of(key: str, data: bytes, where: str) -> PhotoGroup:
         """Take apart the stretch of a shard that belongs to a photo; InputError where that cannot be."""
         files: dict[str, bytes] = {}
-        try:
+        with reading(where, "not a photo of a dataset, or damaged: {reason}"):
             at = 0
             while at < len(data):  # plain members as `pack_sample` writes them: no links, nothing sparse
                 member = tarfile.TarInfo.frombuf(data[at : at + tarfile.BLOCKSIZE], "utf-8", "strict")
@@ -120,8 +119,6 @@ class PhotoGroup:
                 near, far = view["depth_range"]
                 if not (0 <= float(view["hole"]) <= 1 and SMALLEST_SCALE <= float(near) <= float(far) < math.inf):
                     raise ValueError("a view's holes or depths make no sense")
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError, tarfile.TarError) as error:
-            raise InputError(f"{where}: not a photo of a dataset, or damaged: {error}") from error
         return PhotoGroup(key, files, facts, where)
 
     @property
@@ -136,40 +133,34 @@ class PhotoGroup:
 
     def view(self, index: int, *, with_base: bool = False) -> DatasetView:
         """Decode one view; InputError where a file of it is missing or damaged."""
-        try:
+        with reading(f"{self.where}: view {index}", "cannot be read: {reason}"):
             facts = self.facts["views"][index]
             rgb, target = (decode_rgb(self._file(index, kind)) for kind in ("rgb", "target"))
             depth = decode_depth(self._file(index, "depth"), *facts["depth_range"])
-            rendering = Rendering(rgb, depth, decode_alpha(self._file(index, "alpha")))
-            found = DatasetView(
+            view = DatasetView(
                 key=self.key,
                 index=index,
                 kind=self.facts["trajectory"]["kind"],
                 photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
                 photo_camera=_camera(self.facts["photo_camera"], self.where),
                 camera=_camera(facts, self.where),
-                rendering=rendering,
+                rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
                 mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
                 target=target,
-                base=self.base() if with_base else None,
+                base=decode_gaussians(self.files[f"{self.key}.base.safetensors"]) if with_base else None,
             )
-            pictures = {"camera": (rgb, depth, rendering.alpha, found.mask, target), "photo_camera": (found.photo,)}
-            for camera, own in pictures.items():
-                size = getattr(found, camera).height, getattr(found, camera).width
-                if any(tuple(picture.shape[:2]) != size for picture in own):
-                    raise ValueError(f"a picture has another size than its {camera}")
-            return found
-        except (ValueError, KeyError, TypeError, IndexError) as error:
-            raise InputError(f"{self.where}: view {index} cannot be read: {error}") from error
+            for camera, pictures in (
+                (view.camera, (rgb, depth, view.rendering.alpha, view.mask, target)),
+                (view.photo_camera, (view.photo,)),
+            ):
+                if any(picture.shape[:2] != (camera.height, camera.width) for picture in pictures):
+                    raise ValueError("a picture has another size than its camera")
+            return view
 
     def only(self, index: int, *, with_base: bool = False) -> PhotoGroup:
         """The files that one view needs, so the bytes of the others are free again."""
         kept = (f"{self.key}.{index:02d}.", f"{self.key}.photo.", *([f"{self.key}.base."] if with_base else []))
         return dataclasses.replace(self, files={n: data for n, data in self.files.items() if n.startswith(kept)})
-
-    def base(self) -> Gaussians:
-        """The photo's Gaussians; ValueError or KeyError where they cannot be read."""
-        return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
     def _file(self, index: int, kind: str) -> bytes:
         return self.files[f"{self.key}.{index:02d}.{kind}.png"]
@@ -249,16 +240,13 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
 
 
 def decode_gaussians(data: bytes) -> Gaussians:
-    """What `encode_gaussians` wrote, as float32; ValueError where it is something else."""
-    try:
-        arrays = load(data)
-        low, high = arrays["scale_logs"].tolist()
-        scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
-        opacities = arrays["opacities"].astype(np.float64) / DEEPEST
-        columns = (arrays["means"], arrays["quats"], scales, opacities, arrays["colors"])
-        gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns))
-    except (SafetensorError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"no Gaussians: {error}") from error
+    """What `encode_gaussians` wrote, as float32; of strangers' bytes any exception."""
+    arrays = load(data)
+    low, high = arrays["scale_logs"].tolist()
+    scales = np.exp(low + arrays["scales"].astype(np.float64) / DEEPEST * max(high - low, 1e-12))
+    opacities = arrays["opacities"].astype(np.float64) / DEEPEST
+    columns = (arrays["means"], arrays["quats"], scales, opacities, arrays["colors"])
+    gaussians = Gaussians(*(torch.from_numpy(np.ascontiguousarray(column)).float() for column in columns))
     if not gaussians.finite:
         raise ValueError("Gaussians that are not finite")
     return gaussians
@@ -271,13 +259,10 @@ def _png(pixels: NDArray[Any]) -> bytes:
 
 
 def _pixels(data: bytes, axes: int) -> NDArray[Any]:
-    """The pixels of a PNG; ValueError where it is none."""
-    try:
-        with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-            check_pixels(*image.size, len(data), "a picture")
-            pixels = np.array(image)
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"no picture: {error}") from error
+    """The pixels of a PNG."""
+    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+        check_pixels(*image.size, len(data), "a picture")
+        pixels = np.array(image)
     if pixels.ndim != axes:
         raise ValueError(f"a picture with {pixels.ndim} axes instead of {axes}")
     return pixels

@@ -2,102 +2,87 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
+
+from pydantic import BaseModel, Field, model_validator
 
 from spackle.dataset.sample import END, PhotoGroup
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import atomic_path, digest_of
 from spackle.progress import Step
 
 NAME = "manifest.json"
 FORMAT = 1  # of shards and manifest; a reader of another one refuses
-MAX_BYTES = 1 << 40  # of a shard
+Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
+Share = Annotated[float, Field(ge=0, le=1)]
 
 
 def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
     """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if it cannot."""
     place = f"{str(location).rstrip('/')}/{name}"
-    try:
+    package = "an address needs a package (pip install fsspec), and its protocol perhaps another"
+    with (
+        reading(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
+        reading(place, "cannot be read: {reason}", OSError),
+        reading(place, f"not there: is {location} a dataset of `spackle dataset build`?", FileNotFoundError),
+    ):
         if "://" not in place:
             return open(os.path.join(location, name), "rb")
         import fsspec
 
         file: IO[bytes] = fsspec.open(place, "rb").open()
         return file
-    except FileNotFoundError as error:
-        raise InputError(f"{place}: not there: is {location} a dataset of `spackle dataset build`?") from error
-    except OSError as error:
-        raise InputError(f"{place}: cannot be read: {error.strerror or reason_in_a_line(error)}") from error
-    except (ImportError, ValueError) as error:
-        raise InputError(
-            f"{place}: cannot be opened ({reason_in_a_line(error)}): an address needs a package (pip install fsspec), "
-            "and its protocol perhaps another"
-        ) from error
 
 
-def _check(name: str, good: bool) -> None:
-    if not good:
-        raise ValueError(f"{name} makes no sense")
-
-
-@dataclasses.dataclass(frozen=True)
-class SampleEntry:
+class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     """A photo in a shard."""
 
-    key: str
+    key: str = Field(pattern="^[0-9A-Za-z]+$")
     photo: str  # its name in its folder
-    offset: int  # of its first byte in the shard
-    size: int
+    offset: Bytes  # of its first byte in the shard
+    size: Bytes
     sha256: str  # of those bytes
-    holes: tuple[float, ...]  # HAR of each view
-
-    def __post_init__(self) -> None:
-        """TypeError or ValueError for what no sample can have."""
-        _check("photo", isinstance(self.photo, str))
-        _check("key", isinstance(self.key, str) and self.key.isascii() and self.key.isalnum())
-        _check("size", all(type(n) is int and 0 <= n <= MAX_BYTES for n in (self.offset, self.size)))
-        _check("sha256", isinstance(self.sha256, str))
-        _check("holes", all(type(hole) in (int, float) and 0 <= hole <= 1 for hole in self.holes))
+    holes: tuple[Share, ...]  # HAR of each view
 
 
-@dataclasses.dataclass(frozen=True)
-class ShardEntry:
+class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     """One tar file."""
 
-    file: str
-    size: int
+    file: str = Field(pattern=r"^shard-[0-9]{6}\.tar$")
+    size: Bytes
     sha256: str
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
 
-    def __post_init__(self) -> None:
-        """TypeError or ValueError for what no shard can have, such as a file elsewhere."""
-        _check("file", isinstance(self.file, str) and re.fullmatch(r"shard-[0-9]{6}\.tar", self.file) is not None)
-        ends = list(accumulate((sample.size for sample in self.samples), initial=0))
-        _check("offset", [sample.offset for sample in self.samples] == ends[:-1])
-        _check("size of a shard", type(self.size) is int and self.size == ends[-1] + len(END))
-        _check("sha256", isinstance(self.sha256, str))
-        _check("passed_over", all(isinstance(line, str) for line in self.passed_over))
+    @model_validator(mode="after")
+    def _filled(self) -> ShardEntry:
+        *offsets, end = accumulate((sample.size for sample in self.samples), initial=0)
+        if [sample.offset for sample in self.samples] != offsets or self.size != end + len(END):
+            raise ValueError("samples that do not fill their shard")
+        return self
 
 
 Place = tuple[ShardEntry, SampleEntry]
 
 
-@dataclasses.dataclass(frozen=True)
-class Manifest:
+class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
     """A dataset, finished or not."""
 
-    config: Mapping[str, Any]  # everything that decides what is in it
+    config: dict[str, Any]  # everything that decides what is in it
     shards: tuple[ShardEntry, ...]
     complete: bool
+
+    @model_validator(mode="after")
+    def _even(self) -> Manifest:
+        if len({len(sample.holes) for _, sample in self.samples}) > 1:
+            raise ValueError("photos with different numbers of views")
+        return self
 
     @property
     def samples(self) -> list[Place]:
@@ -117,46 +102,32 @@ class Manifest:
     @property
     def digest(self) -> str:
         """SHA-256 over everything that is in it."""
-        return digest_of(self._plain())
+        return digest_of(self._content())
 
     def save(self, folder: Path) -> None:
         """Write manifest.json, whole or not at all."""
-        text = json.dumps(self._plain() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
+        text = json.dumps(self._content() | {"sha256": self.digest}, indent=1, sort_keys=True, allow_nan=False)
         with atomic_path(folder / NAME, durable=True) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
-    def _plain(self) -> dict[str, Any]:
+    def _content(self) -> dict[str, Any]:
         counts = {"photos": len(self.samples), "views": self.views, "bytes": self.size}
-        content = dataclasses.asdict(self) | {"format": FORMAT, "counts": counts}
-        plain: dict[str, Any] = json.loads(json.dumps(content))  # no tuples
-        return plain
+        return self.model_dump(mode="json") | {"format": FORMAT, "counts": counts}
 
 
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
     """Read the manifest of a dataset; InputError where it is missing, damaged, or of another format."""
     where = f"{str(location).rstrip('/')}/{NAME}"
-    with open_in(location, NAME) as file:
+    with open_in(location, NAME) as file, reading(where, "damaged, or no manifest of a dataset: {reason}"):
         text = file.read()
-    try:
         content = json.loads(text)
         if content["format"] != FORMAT:
             raise InputError(f"{where}: format {content['format']!r} is not known here, which reads {FORMAT}")
         recorded = content.pop("sha256")
-        shards = tuple(_shard(shard) for shard in content["shards"])
-        manifest = Manifest(dict(content["config"]), shards, bool(content["complete"]))
-        _check("holes", len({len(sample.holes) for _, sample in manifest.samples}) <= 1)
-        if digest_of(content) != recorded or manifest.digest != recorded:
+        manifest = Manifest.model_validate_json(text)
+        if not digest_of(content) == manifest.digest == recorded:
             raise ValueError("its digest does not fit")
-    except InputError:
-        raise
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(f"{where}: damaged, or no manifest of a dataset: {error}") from error
-    return manifest
-
-
-def _shard(content: Mapping[str, Any]) -> ShardEntry:
-    samples = [SampleEntry(**{**sample, "holes": tuple(sample["holes"])}) for sample in content["samples"]]
-    return ShardEntry(**{**content, "samples": tuple(samples), "passed_over": tuple(content["passed_over"])})
+        return manifest
 
 
 def shard_name(number: int) -> str:
@@ -178,23 +149,27 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
                 group = PhotoGroup.of(key, data, str(path))
             except InputError as error:
                 raise InputError(f"{error}: delete it, and the same command makes it again") from error
-            digest = hashlib.sha256(data).hexdigest()
-            samples.append(SampleEntry(key, group.facts["photo"]["name"], offset, len(data), digest, group.holes))
+            entry = {"key": key, "photo": group.facts["photo"]["name"], "offset": offset, "size": len(data)}
+            samples.append(SampleEntry(**entry, sha256=hashlib.sha256(data).hexdigest(), holes=group.holes))
             file.write(data)
             whole.update(data)
             offset += len(data)
         file.write(END)
         whole.update(END)
-    return ShardEntry(target.name, offset + len(END), whole.hexdigest(), tuple(samples), tuple(passed_over))
+    return ShardEntry(
+        file=target.name,
+        size=offset + len(END),
+        sha256=whole.hexdigest(),
+        samples=tuple(samples),
+        passed_over=tuple(passed_over),
+    )
 
 
 def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
     """One photo's files out of an open shard; InputError where they differ from their digest."""
-    try:
+    with reading(where, "cannot be read: {reason}", OSError):
         file.seek(sample.offset)
         data = file.read(sample.size)
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read: {error.strerror or error}") from error
     if hashlib.sha256(data).hexdigest() != sample.sha256:
         raise InputError(
             f"{where}: sample {sample.key} ({sample.photo}) is damaged: `spackle dataset verify` says more"
@@ -209,12 +184,10 @@ def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Ste
         yield "the dataset is not finished: the command that builds it goes on"
     for shard in manifest.shards:
         try:
-            with open_in(location, shard.file) as file:
+            with open_in(location, shard.file) as file, reading(shard.file, "cannot be read: {reason}", OSError):
                 yield from (f"{shard.file}: {line}" for line in _shard_problems(file, shard))
         except InputError as error:
             yield str(error)
-        except OSError as error:
-            yield f"{shard.file}: cannot be read: {error.strerror or error}"
         done += shard.size
         progress(done, manifest.size)
 

@@ -1,10 +1,15 @@
-"""The views that a dataset has of a photo: a controlled camera path, drawn with the base (paper, appendix)."""
+"""The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
+
+Targets are drawn from one completed scene, left open, or painted by an inpainter.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,44 +17,34 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, known_inverse_depth
 from spackle.render import Renderer
-from spackle.residual import MASK_THRESHOLD, hole_mask
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, hole_mask
 
-VIEWS = 20  # the paper's, the photo's own view among them
-DISPARITY = (0.1, 0.6)  # from a small move to the widest in the paper's figures
 APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
 SPARE = 6  # frames of a path that may coincide with others
-
-
-@dataclasses.dataclass(frozen=True)
-class ViewChoices:
-    """What decides which views a photo gets."""
-
-    seed: int = 0
-    views: int = VIEWS  # of a photo, its own among them
-    trajectory: TrajectoryKind | None = None  # drawn for each photo where None
-    disparity: tuple[float, float] = DISPARITY  # drawn between these, see `spackle.camera_path.max_offset`
-    threshold: float = MASK_THRESHOLD
+COMPLETIONS = ("geometry", *INPAINTERS, "none")  # values of --inpainter
 
 
 @dataclasses.dataclass(frozen=True)
 class PathChoice:
-    """Where the camera goes."""
+    """A camera path around the photo's eye."""
 
     kind: TrajectoryKind
     disparity: float
 
 
-def draw_path(choices: ViewChoices, photo_sha256: str) -> PathChoice:
-    """The path of a photo: the same for the same seed and the same photo's file, whatever else the dataset holds."""
-    digest = hashlib.sha256(f"{choices.seed}:{photo_sha256}".encode()).digest()
-    rng = np.random.default_rng(list(digest))
+def draw_path(kind: TrajectoryKind | None, disparity: tuple[float, float], seed: int, photo_sha256: str) -> PathChoice:
+    """A photo's path, drawn where `kind` is None: the same for the same seed and file, whatever the dataset holds."""
+    rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
     drawn = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
-    return PathChoice(choices.trajectory or drawn, float(rng.uniform(*choices.disparity)))
+    return PathChoice(kind or drawn, float(rng.uniform(*disparity)))
 
 
-def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int = VIEWS) -> list[Camera]:
+def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int) -> list[Camera]:
     """The photo's own view (`camera`, of the views' size), then others along the path: `views` in all, no two alike.
 
     Frames at the photo's eye and at the end of a closed path repeat others, so the path gets more frames instead.
@@ -66,7 +61,7 @@ def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, view
             break
     if len(cameras) < views:
         raise ValueError(f"{path.kind} at a disparity of {path.disparity:g} has no {views} different views")
-    while len(cameras) > views:  # the least interesting one
+    while len(cameras) > views:  # without the one nearest to the photo's
         del cameras[1 + int(np.argmin([_distance(view, camera) for view in cameras[1:]]))]
     return cameras
 
@@ -77,7 +72,7 @@ def _distance(one: Camera, other: Camera) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class ViewStack:
-    """A photo's Gaussians and what V cameras see of them."""
+    """A photo's Gaussians, rendered from V cameras."""
 
     base: Gaussians
     photo_camera: Camera
@@ -85,18 +80,72 @@ class ViewStack:
     rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
     depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
     alpha: Tensor  # [V, H, W] opacity
-    mask: Tensor  # [V, H, W] bool: uncovered
+    mask: Tensor  # [V, H, W] bool: uncovered (eq. 4)
 
 
 @torch.no_grad()
-def render_views(
-    base: Gaussians,
-    photo_camera: Camera,
-    cameras: Sequence[Camera],
-    renderer: Renderer,
-    threshold: float = MASK_THRESHOLD,
-) -> ViewStack:
-    """Draw the base from each camera; a pixel with less opacity than `threshold` is uncovered (eq. 4)."""
+def render_views(base: Gaussians, photo_camera: Camera, cameras: Sequence[Camera], renderer: Renderer) -> ViewStack:
+    """Render the base from each camera."""
     drawn = [renderer.render(base, camera) for camera in cameras]
     rgb, depth, alpha = (torch.stack([getattr(view, name) for view in drawn]) for name in ("rgb", "depth", "alpha"))
-    return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha, threshold))
+    return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha))
+
+
+@dataclasses.dataclass(frozen=True)
+class Completion:
+    """A way to targets [V, H, W, 3] sRGB: new colours where a stack's mask is, elsewhere its rgb, bit for bit."""
+
+    name: str
+    version: str  # another version may give other pixels
+    complete: Callable[[ViewStack], Tensor]
+    notice: str = ""  # as of `Inpainter`
+    files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+
+
+def open_completion(name: str, options: InpainterOptions, renderer: Renderer) -> Completion:
+    """One of `COMPLETIONS`; InputError where its package or its weights are missing."""
+    if name == "none":  # for somebody else to complete
+        return Completion(name, "1", lambda views: views.rgb)
+    if name == "geometry":
+        return Completion(name, "1", partial(render_completed, renderer=renderer))
+    inpainter = get_inpainter(name, options)
+    return Completion(name, inpainter.version, partial(paint, inpainter), inpainter.notice, inpainter.files)
+
+
+@torch.no_grad()
+def render_completed(views: ViewStack, renderer: Renderer) -> Tensor:
+    """Each hole as one completed scene shows it, filled by seeds alone in the widest view: the same in all views."""
+    aux = Completer(views.base, views.photo_camera, renderer, texture=None).complete_scene(views.cameras, exact=True)
+    targets = []
+    for camera, target, hole in zip(views.cameras, views.rgb, views.mask, strict=True):
+        if bool(hole.any()):
+            target = torch.where(hole[..., None], _covered(renderer.render([views.base, aux], camera)), target)
+        targets.append(target)
+    return torch.stack(targets)
+
+
+def _covered(drawn: Rendering) -> Tensor:
+    """The colours [H, W, 3] of a view; the few pixels that are still uncovered get those of pixels around."""
+    hole = hole_mask(drawn.alpha)
+    inverse_depth = known_inverse_depth(drawn.depth, hole)
+    known = inverse_depth > 0
+    if not bool(hole.any()) or not bool(known.any()):
+        return drawn.rgb
+    return far_fill(inverse_depth, drawn.rgb.permute(2, 0, 1), known)[1].permute(1, 2, 0)
+
+
+def paint(inpainter: Inpainter, views: ViewStack) -> Tensor:
+    """The views with their holes painted, given in the order of the path."""
+    order = path_order(views.cameras)
+    inverse_depth = known_inverse_depth(views.depth, views.mask)
+    targets = torch.empty_like(views.rgb)
+    targets[order] = inpainter.paint(views.rgb[order], views.mask[order], inverse_depth[order])
+    return targets
+
+
+def path_order(cameras: Sequence[Camera]) -> list[int]:
+    """Views as a flight along the path meets them: the first one, the photo's, stands where the detour is least."""
+    eyes = torch.stack([camera.position.double() for camera in cameras])
+    others = list(range(1, len(cameras)))
+    orders = [[*others[:place], 0, *others[place:]] for place in range(len(cameras))]
+    return min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))

@@ -21,16 +21,16 @@ import torch
 
 from spackle.errors import InputError
 
-IN_HAND = 2  # jobs of a worker: the one it works on, and the next
+QUEUED = 2  # jobs of a worker: the one it works on, and the next; results that are not yet taken use memory
 MAX_WORKERS = 1024
 
 
 class Job(Protocol):
-    """What to do with a photo; it is pickled."""
+    """A photo to work on; it is pickled."""
 
     @property
     def path(self) -> Path:
-        """The photo, for messages."""
+        """The photo's file, for messages."""
 
 
 J = TypeVar("J", bound=Job)
@@ -44,7 +44,7 @@ class PhotoWorker(Protocol[J_contra, R_co]):
 
     @property
     def setup(self) -> Mapping[str, Any]:
-        """What decides its results besides the jobs, ready for JSON: the same wherever it works."""
+        """What decides its results besides the jobs, ready for JSON: the same on every machine."""
 
     def inputs(self, job: J_contra) -> object:
         """The contents of the files that a job reads, as they lie on this machine."""
@@ -55,11 +55,11 @@ class PhotoWorker(Protocol[J_contra, R_co]):
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """How many processes work, and where."""
+    """The number of processes, and where they work."""
 
     count: int = 1
     threads: int = 2  # of each
-    ray: str | None = None  # the cluster where they are; this machine where None
+    ray: str | None = None  # address of their cluster; this machine where None
     gpu: bool = False  # each takes one, on a cluster that has any
 
     def check(self) -> None:
@@ -71,7 +71,7 @@ class Workers:
 
 @contextlib.contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Compute with so many threads during the block."""
+    """Compute with this number of threads during the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -87,14 +87,13 @@ def at_work_here(
     """As `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
     if workers.count == 1 or len(jobs) < 2:
         with threads_of_torch(workers.threads):
-            worker = open_worker()
-            yield (worker.make(job) for job in jobs)
+            yield map(open_worker().make, jobs)
         return
     count = min(workers.count, len(jobs))
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(workers.threads, open_worker))
     try:
-        yield results_of((pool.submit(_make, job) for job in jobs), IN_HAND * count, stop)
+        yield results_of((pool.submit(_make, job) for job in jobs), QUEUED * count, stop)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
 import os
 import signal
@@ -12,20 +11,20 @@ import subprocess
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, Generic
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import differences
-from spackle.workers.local import IN_HAND, J, PhotoWorker, R, Workers, at_work_here
+from spackle.workers.local import QUEUED, J, PhotoWorker, R, Workers, at_work_here
 
 ANSWER_S = 30.0  # for a cluster to answer
 START_S = 600.0  # for a worker to start where there is none, on a cluster that has room for it
 RETRIES = 3  # of a photo whose worker died
-STARTING = -1  # in place of a job's index, for deaths before the first job
 Log = Callable[[str], None]
 
 
@@ -54,12 +53,12 @@ def cluster(workers: Workers) -> Iterator[Any]:
 
 def _connect(ray: Any, address: str, cpus: int) -> None:
     """Connect to a cluster, or start one of our own (`local`) with this number of CPUs."""
-    own: dict[str, Any] = {"num_cpus": cpus, "include_dashboard": False} if address == "local" else {}
-    reason = None if own else _silence(address)
+    local: dict[str, Any] = {"num_cpus": cpus, "include_dashboard": False} if address == "local" else {}
+    reason = None if local else _silence(address)
     if reason is None:
         before = signal.getsignal(signal.SIGTERM)
         try:
-            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **own)
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **local)
             with contextlib.suppress(AttributeError):  # of each death it prints a page, and we say a line
                 ray._private.worker._worker_logs_enabled = False
             return
@@ -82,8 +81,8 @@ def _silence(address: str) -> str | None:
         done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=ANSWER_S)
     except subprocess.TimeoutExpired:
         return f"no answer within {ANSWER_S:g} seconds"
-    said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-    return reason_in_a_line(said[-1]) if done.returncode else None
+    lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+    return reason_in_a_line(lines[-1]) if done.returncode else None
 
 
 def _check_room(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> None:
@@ -101,15 +100,14 @@ def _check_room(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> None:
 
 def gpus_of(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> int:
     """GPUs of each worker: 1 if it can use one and any node has one, else 0."""
-    there = any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes)
-    return int(there and workers.gpu)
+    return int(workers.gpu and any(node["Alive"] and node["Resources"].get("GPU", 0) >= 1 for node in nodes))
 
 
 class RemoteWorker:
     """A `PhotoWorker` on a node, which has to see the same files as the main process."""
 
     def __init__(self, open_worker: Callable[[], PhotoWorker[Any, Any]], threads: int, folder: str) -> None:
-        self.open_worker = open_worker
+        self.open_worker, self.node = open_worker, f"node {socket.gethostname()}"
         torch.set_num_threads(threads)
         with contextlib.suppress(OSError):  # without this folder of the main process, its relative paths fail later
             os.chdir(folder)
@@ -118,20 +116,20 @@ class RemoteWorker:
         """Set up; InputError if version or weights differ from the main process's."""
         try:
             self.worker = self.open_worker()
-            own = self.worker.setup
+            setup = self.worker.setup
         except InputError as error:
-            raise InputError(f"node {socket.gethostname()}: {error}") from error
-        if lines := differences(expected, own):
+            raise InputError(f"{self.node}: {error}") from error
+        if lines := differences(expected, setup):
             raise InputError(
-                f"node {socket.gethostname()}: would give other results ({'; '.join(lines)}): "
+                f"{self.node}: would give other results ({'; '.join(lines)}): "
                 "install the same version and the same weights on every node"
             )
 
-    def make(self, job: Any, seen: object) -> Any:
+    def make(self, job: Any, expected: object) -> Any:
         """As `PhotoWorker.make`; InputError also if the node sees another photo or depth map."""
-        if self.worker.inputs(job) != seen:
+        if self.worker.inputs(job) != expected:
             raise InputError(
-                f"{job.path}: node {socket.gethostname()} does not find this photo or its depth map, or others in "
+                f"{job.path}: {self.node} does not find this photo or its depth map, or others in "
                 "their place: they must lie at the same paths on every node, on a disk that all share"
             )
         return self.worker.make(job)
@@ -152,100 +150,70 @@ def at_work(
     """
     if ray is None:
         return at_work_here(workers, open_worker, jobs, stop)
-    return _at_work_on(ray, workers, open_worker, jobs, log)
+    return contextlib.closing(_results(ray, workers, open_worker, jobs, log))
 
 
-@contextlib.contextmanager
-def _at_work_on(
+def _results(
     ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J], log: Log
-) -> Iterator[Iterator[R]]:
-    """As `at_work`, on the cluster; logs dead workers. InputError also for a node unlike the others."""
-    pool = WorkerPool(ray, workers, open_worker, jobs, log)
+) -> Generator[R, None, None]:
+    """As `at_work`, on the cluster; InputError also for a node unlike the others.
+
+    A worker that dies is logged and replaced, and its jobs are queued again; InputError after `RETRIES` deaths at one
+    photo. Ray's `ActorPool` does not name the call that failed.
+    """
+    here, queue, deaths = open_worker(), deque(jobs), Counter[Path | None]()  # deaths by photo; None as workers start
+    gpus = gpus_of(workers, ray.nodes())
+    kind = ray.remote(num_cpus=workers.threads, num_gpus=gpus, max_restarts=0)(RemoteWorker)
+    queued: dict[Any, list[J]] = {}  # of each worker that has started; it works on the first
+    calls: dict[Any, tuple[Any, J | None]] = {}  # worker and job of each awaited answer; no job as it starts
+    missing = min(workers.count, len(jobs))
     try:
-        yield pool.results()
-    finally:
-        for worker in pool.workers:
-            ray.kill(worker.actor)
-
-
-@dataclasses.dataclass(eq=False)
-class _Process(Generic[J]):
-    """A process on a node."""
-
-    actor: Any
-    ready: bool = False
-    jobs: dict[int, J] = dataclasses.field(default_factory=dict)  # in hand; it works on the first
-
-
-class WorkerPool(Generic[J, R]):
-    """Workers with few jobs each, replaced when they die; Ray's `ActorPool` does not name the call that failed."""
-
-    def __init__(
-        self, ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J], log: Log
-    ) -> None:
-        """Start workers on `ray`, which is connected to a cluster."""
-        self.ray, self.options, self.open_worker, self.log = ray, workers, open_worker, log
-        self.left, self.deaths = deque(enumerate(jobs)), Counter[int]()  # deaths by the index of the job
-        self.here = open_worker()  # for what the others are compared with
-        gpus = gpus_of(workers, ray.nodes())
-        self.kind = ray.remote(num_cpus=workers.threads, num_gpus=gpus, max_restarts=0)(RemoteWorker)
-        self.workers: list[_Process[J]] = []
-        self.calls: dict[Any, tuple[_Process[J], int]] = {}  # awaited answers, in the order of their questions
-        for _ in range(min(workers.count, len(jobs))):
-            self._start_worker()
-
-    def results(self) -> Iterator[R]:
-        """Results as they come."""
-        while self.left or any(worker.jobs for worker in self.workers):
-            self._hand_out()
-            started = any(worker.ready for worker in self.workers)
-            done, _ = self.ray.wait(list(self.calls), timeout=None if started else START_S)
+        while queue or any(queued.values()):
+            for _ in range(missing):
+                worker = kind.remote(open_worker, workers.threads, os.getcwd())
+                calls[worker.begin.remote(here.setup)] = worker, None
+            missing = 0
+            for count in range(QUEUED):
+                for worker, mine in queued.items():
+                    if queue and len(mine) == count:
+                        mine.append(job := queue.popleft())
+                        calls[worker.make.remote(job, here.inputs(job))] = worker, job
+            done, _ = ray.wait(list(calls), timeout=None if queued else START_S)
             if not done:
                 raise InputError(
-                    f"--ray {self.options.ray}: no worker could start within {START_S:g} seconds: others keep the "
+                    f"--ray {workers.ray}: no worker could start within {START_S:g} seconds: others keep the "
                     "cluster busy, or its nodes have gone: start again when it has room; the same command goes on"
                 )
-            worker, index = self.calls.pop(done[0])
+            worker, finished = calls.pop(done[0])
             try:
-                answer = self.ray.get(done[0])
-            except self.ray.exceptions.RayTaskError as error:
+                answer = ray.get(done[0])
+            except ray.exceptions.RayTaskError as error:
                 raise error.cause from error
-            except self.ray.exceptions.RayError as error:  # the process has died, or its node
-                self._replace(worker, reason_in_a_line(error))
+            except ray.exceptions.RayError as error:  # the process has died, or its node
+                ray.kill(worker)  # it may only be out of reach
+                calls = {call: pair for call, pair in calls.items() if pair[0] is not worker}
+                lost = queued.pop(worker, [])
+                queue.extendleft(reversed(lost))
+                _count_death(deaths, lost[0].path if lost else None, workers, reason_in_a_line(error), log)
+                missing = 1
                 continue
-            if worker.ready:
-                del worker.jobs[index]
-                yield answer
+            if finished is None:
+                queued[worker], deaths[None] = [], 0
             else:
-                worker.ready, self.deaths[STARTING] = True, 0
+                queued[worker].remove(finished)
+                yield answer
+    finally:
+        for worker in {worker for worker, _ in calls.values()} | set(queued):
+            ray.kill(worker)
 
-    def _start_worker(self) -> None:
-        worker = _Process[J](self.kind.remote(self.open_worker, self.options.threads, os.getcwd()))
-        self.workers.append(worker)
-        self.calls[worker.actor.begin.remote(self.here.setup)] = worker, STARTING
 
-    def _hand_out(self) -> None:
-        """Give each worker few jobs at a time: results that are not yet taken use memory."""
-        for have in range(IN_HAND):
-            for worker in self.workers:
-                if self.left and worker.ready and len(worker.jobs) == have:
-                    index, job = self.left.popleft()
-                    worker.jobs[index] = job
-                    self.calls[worker.actor.make.remote(job, self.here.inputs(job))] = worker, index
-
-    def _replace(self, worker: _Process[J], why: str) -> None:
-        """Start another worker and queue the jobs of this one again; InputError after `RETRIES` deaths."""
-        self.ray.kill(worker.actor)  # it may only be out of reach
-        self.workers.remove(worker)
-        self.calls = {call: other for call, other in self.calls.items() if other[0] is not worker}
-        index, job = next(iter(worker.jobs.items()), (STARTING, None))
-        self.deaths[index] += 1
-        where = f"--ray {self.options.ray}: as it started" if job is None else f"{job.path}: at this photo"
-        if self.deaths[index] > RETRIES:
-            raise InputError(
-                f"{where} a worker died for the {self.deaths[index]}th time ({why}): most likely for want of memory: "
-                "take fewer --workers on a node; the same command goes on"
-            )
-        self.log(f"{where} a worker died, and another takes its place ({why})")
-        self.left.extendleft(reversed(worker.jobs.items()))
-        self._start_worker()
+def _count_death(deaths: Counter[Path | None], photo: Path | None, workers: Workers, why: str, log: Log) -> None:
+    """Log a worker's death; InputError where it is one too many."""
+    deaths[photo] += 1
+    where = f"--ray {workers.ray}: as it started" if photo is None else f"{photo}: at this photo"
+    if deaths[photo] > RETRIES:
+        raise InputError(
+            f"{where} a worker died for the {deaths[photo]}th time ({why}): most likely for want of memory: "
+            "take fewer --workers on a node; the same command goes on"
+        )
+    log(f"{where} a worker died, and another takes its place ({why})")

@@ -11,58 +11,67 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange
-from spackle.dataset.completion import open_completion, paint
-from spackle.dataset.views import PathChoice, ViewStack, path_cameras, render_views
+from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.dataset.views import APART, PathChoice, ViewStack, open_completion, paint, path_cameras, render_views
 from spackle.inpaint import InpainterOptions
 from spackle.render import get_renderer
 from spackle.residual import Completer
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("views", [2, 3, 20])
+def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind, views: int) -> None:
+    camera = Camera.from_focal(80.0, 96, 72)
+    cameras = path_cameras(PathChoice(kind, 0.4), camera, DepthRange(2.0, 3.0), views)
+    assert len(cameras) == views
+    assert cameras[0] is camera
+    eyes = torch.stack([view.position.double() for view in cameras])
+    assert float(torch.nn.functional.pdist(eyes).min()) > APART
+    with pytest.raises(ValueError, match="different views"):
+        path_cameras(PathChoice(kind, 0.0), camera, DepthRange(2.0, 3.0), views)
 
 
 def completed(name: str, stack: ViewStack) -> Tensor:
     return open_completion(name, InpainterOptions(), get_renderer()).complete(stack)
 
 
+def stack_of(*rights: float) -> ViewStack:
+    scene = box_before_wall()
+    views = [scene.camera, *(shifted(scene.camera, right) for right in rights)]
+    return render_views(scene.base(), scene.camera, views, get_renderer())
+
+
 @pytest.mark.parametrize("name", ["geometry", "opencv", "none"])
 def test_completion_touches_the_holes_alone(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")
-    scene = box_before_wall()
-    base = scene.base()
-    views = [scene.camera, shifted(scene.camera, 0.4), shifted(scene.camera, -0.3)]
-    stack = render_views(base, scene.camera, views, get_renderer())
+    stack = stack_of(0.4, -0.3)
     targets = completed(name, stack)
     assert torch.equal(targets[~stack.mask], stack.rgb[~stack.mask])
     assert bool((targets[stack.mask].amax(-1) > 0.2).all()) == (name != "none")
-    seen = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
-    assert torch.equal(completed(name, seen), stack.rgb)
+    whole = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
+    assert torch.equal(completed(name, whole), stack.rgb)
 
 
 class Numbering:
-    """Paints every hole with its view's place in what it is given, and keeps that."""
+    """Paints every hole with its view's place in the input, and keeps that."""
 
     def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
-        self.given = rgb, hole, inverse_depth
+        self.inputs = rgb, hole, inverse_depth
         return torch.where(hole[..., None], torch.arange(len(rgb)).float().view(-1, 1, 1, 1), rgb)
 
 
-def test_an_inpainter_is_given_the_views_in_the_order_of_the_path() -> None:
-    scene = box_before_wall()
-    views = [scene.camera, *(shifted(scene.camera, right) for right in (0.3, -0.3, -0.4))]
-    stack = render_views(scene.base(), scene.camera, views, get_renderer())
+def test_an_inpainter_gets_the_views_in_the_order_of_the_path() -> None:
+    stack = stack_of(0.3, -0.3, -0.4)
     inpainter, order = Numbering(), [1, 0, 2, 3]
     targets = paint(inpainter, stack)  # type: ignore[arg-type]  # no inpainter in all respects
-    rgb, hole, inverse_depth = inpainter.given
+    rgb, hole, inverse_depth = inpainter.inputs
     assert torch.equal(rgb, stack.rgb[order])
     assert torch.equal(hole, stack.mask[order])
     assert not bool(inverse_depth[hole].any())
     torch.testing.assert_close(inverse_depth[~hole] * stack.depth[order][~hole], torch.ones(int((~hole).sum())))
-    assert [target[mask].unique().tolist() for target, mask in zip(targets, stack.mask, strict=True)] == [
-        [],
-        [0],
-        [2],
-        [3],
-    ]
+    places = [target[mask].unique().tolist() for target, mask in zip(targets, stack.mask, strict=True)]
+    assert places == [[], [0], [2], [3]]
 
 
 FAR = 5.0  # metres of a wall that the photo's camera faces
