@@ -134,13 +134,12 @@ def test_a_completed_view_behind_the_photos_guard_shows_the_photo_as_the_base_do
 
 TWINS = {
     "_numba.py": "the decorators",
-    "bases/blending.py": "test_silhouettes.py",
     "bases/cleanup.py": "test_cleanup.py",
     "bases/edges.py": "test_cleanup.py",
     "bases/quadtree.py": "test_quadtree.py",
     "bases/sharp/unproject.py": "test_sharp_unproject.py",
     "bases/silhouettes.py": "test_silhouettes.py",
-    "bases/sky.py": "test_sky.py",
+    "bases/splats.py": "test_silhouettes.py",
     "evaluation/naive_renderer.py": "test_suite.py",
     "fill.py": "test_fill.py",
     "inpaint/exemplar.py": "test_exemplar.py",

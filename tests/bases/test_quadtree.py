@@ -9,6 +9,7 @@ import pytest
 import torch
 from scenes import psnr
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from spackle.bases.quadtree import BEND, LEVELS, Quadtree, Tiles
 from spackle.bases.splats import STEEPEST, layered_gaussians
@@ -32,52 +33,36 @@ def ground(height: int = 27, width: int = 38) -> tuple[Tensor, Tensor, Tensor, T
     return picture, inverse, torch.tensor([0.001, 0.002]).expand(height, width, 2), free
 
 
-def plain_lost(picture: np.ndarray, top: int, left: int, height: int, width: int, limits: tuple[int, int]) -> float:
-    """Of one tile, see `Quadtree`; rows and columns beyond `limits` are in no whole block."""
-    total = 0.0
-
-    def mean(row: int, column: int) -> np.ndarray:
-        row = min(max(row, 0), limits[0] // height - 1) * height
-        column = min(max(column, 0), limits[1] // width - 1) * width
-        return picture[row : row + height, column : column + width].mean((0, 1))
-
-    for y, x in itertools.product(range(height), range(width)):
-        v, u = (y + 0.5) / height - 0.5, (x + 0.5) / width - 0.5
-        expected = sum(
-            (abs(v) if i else 1 - abs(v))
-            * (abs(u) if j else 1 - abs(u))
-            * mean(top // height + i * (1 if v > 0 else -1), left // width + j * (1 if u > 0 else -1))
-            for i, j in itertools.product((0, 1), repeat=2)
-        )
-        total += float(((picture[top + y, left + x] - expected) ** 2).mean())
-    return total
+def losses(picture: Tensor, height: int, width: int) -> Tensor:
+    """[H/height, W/width] what tiles of one size lose, by PyTorch's bilinear interpolation of their means."""
+    rows, columns = picture.shape[0] // height * height, picture.shape[1] // width * width
+    inside = picture[:rows, :columns].permute(2, 0, 1)[None].double()
+    smooth = interpolate(avg_pool2d(inside, (height, width)), size=(rows, columns), mode="bilinear")
+    return avg_pool2d((inside - smooth).square().mean(1), (height, width))[0] * height * width
 
 
-def test_what_blocks_lose_is_what_a_plain_sum_says() -> None:
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_blocks_lose_what_interpolated_means_miss(level: int) -> None:
     picture, inverse, slope, free = ground()
-    tree = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST)
-    pixels, depth = picture.double().numpy(), inverse.double().numpy()
-    blocked = []
-    for level, lost in enumerate(tree.lost, 1):
-        side, (rows, columns) = 2**level, lost.shape[:2]
-        limits = rows * side, columns * side
-        assert (rows, columns) == (27 // side, 38 // side)
-        for row, column in itertools.product(range(rows), range(columns)):
-            top, left, half = row * side, column * side, side // 2
-            around = np.s_[max(top - side, 0) : top + 2 * side, max(left - side, 0) : left + 2 * side]
-            center = depth[top : top + side, left : left + side].mean()
-            y, x = np.indices(depth.shape)[(slice(None), *around)]
-            plane = center + 0.001 * (x - left - half + 0.5) + 0.002 * (y - top - half + 0.5)
-            if not free.numpy()[around].all() or (abs(depth[around] - plane) > float(BEND) * center).any():
-                assert torch.isinf(lost[row, column]).all()
-                blocked.append(level)
-                continue
-            flat = [plain_lost(pixels, top + i, left, half, side, limits) for i in (0, half)]
-            tall = [plain_lost(pixels, top, left + i, side, half, limits) for i in (0, half)]
-            expected = [plain_lost(pixels, top, left, side, side, limits), sum(flat), sum(tall)]
-            np.testing.assert_allclose(lost[row, column], expected, rtol=1e-3, atol=1e-6)
-    assert set(blocked) == {1, 2, 3}
-    assert any(torch.isfinite(lost).any() for lost in tree.lost)
+    lost = Quadtree(picture, inverse, slope, free, LEVELS, STEEPEST).lost[level - 1]
+    side, (rows, columns) = 2**level, lost.shape[:2]
+    assert (rows, columns) == (27 // side, 38 // side)
+    whole = picture[: rows * side, : columns * side]
+    flat, tall = losses(whole, side // 2, side), losses(whole, side, side // 2)
+    expected = torch.stack([losses(whole, side, side), flat[::2] + flat[1::2], tall[:, ::2] + tall[:, 1::2]], dim=-1)
+    depth, blocked = inverse.double().numpy(), torch.zeros(rows, columns, dtype=torch.bool)
+    for row, column in itertools.product(range(rows), range(columns)):
+        top, left, half = row * side, column * side, side // 2
+        around = np.s_[max(top - side, 0) : top + 2 * side, max(left - side, 0) : left + 2 * side]
+        center = depth[top : top + side, left : left + side].mean()
+        y, x = np.indices(depth.shape)[(slice(None), *around)]
+        plane = center + 0.001 * (x - left - half + 0.5) + 0.002 * (y - top - half + 0.5)
+        off = (abs(depth[around] - plane) > float(BEND) * center).any()
+        blocked[row, column] = bool(off) or not bool(free[around].all())
+    assert bool(blocked.any())
+    assert not bool(blocked.all())
+    assert torch.equal(torch.isinf(lost), blocked[..., None].expand(-1, -1, 3))
+    torch.testing.assert_close(lost[~blocked].double(), expected[~blocked], rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("worth", [1e-6, 1e-3, 0.02, 10.0])
@@ -144,11 +129,11 @@ def test_no_grid_shows_where_tiles_of_several_sizes_meet(slant: float, rise: flo
     assert len(base) < (0.5 if slant else 0.35) * height * width
     own = CPU.render(base, camera)
     assert psnr(own.rgb, photo) > 42
-    away = torch.nn.functional.max_pool2d(speck[None, None].float(), 7, 1, 3)[0, 0] == 0
+    away = max_pool2d(speck[None, None].float(), 7, 1, 3)[0, 0] == 0
     assert float((own.rgb - photo).abs().amax(-1)[away].max()) < (1.0 if rise == 0 else 1.5) / 255
     if rise == 0:
         for view in extremes(camera, 0.3, DepthRange.of(base)):
             seen = CPU.render(base, view)
-            inner = torch.nn.functional.max_pool2d((seen.alpha < 0.9)[None, None].float(), 9, 1, 4)[0, 0] == 0
+            inner = max_pool2d((seen.alpha < 0.9)[None, None].float(), 9, 1, 4)[0, 0] == 0
             off = (seen.rgb - 0.3).abs().amax(-1)[inner]
             assert float(off.quantile(0.9)) < 0.5 / 255

@@ -11,8 +11,7 @@ from plain_cleanup import plain_flood
 from scenes import Scene, motorcycle_base, slanted_plane, texture
 from torch import Tensor
 
-from spackle.bases import sky
-from spackle.bases.sky import push_sky
+from spackle.bases.cleanup import _flood, push_sky
 from spackle.camera import Camera
 
 
@@ -95,7 +94,7 @@ def test_the_flood_matches_growing_by_rings(seed: int) -> None:
     rgb = (0.5 + 0.03 * generator.standard_normal((15, 20, 3))).astype(np.float32)
     candidates = generator.random((15, 20)) < 0.8
     first = candidates[0] & (generator.random(20) < 0.5)
-    found = sky._flood(rgb, first, candidates)
+    found = _flood(rgb, first, candidates)
     assert found[5:].any()
     assert np.array_equal(found, plain_flood(rgb, first, candidates))
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.image import MAX_PIXELS, check_pixels, read_image
 
@@ -192,33 +192,24 @@ def _read_calib(path: StrPath) -> Calibration:
     pairs = (line.partition("=") for line in read_text(path).splitlines())
     entries = {name.strip(): value.strip() for name, _, value in pairs}
     number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-    try:
-        matrix = [float(n) for n in re.findall(number, entries["cam0"])]
-        focal, _, cx, _, _, cy, *_ = matrix
+    with reading(path, "not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs and baseline"):
+        focal, _, cx, _, _, cy, *_ = (float(n) for n in re.findall(number, entries["cam0"]))
         lens = Calibration(focal, cx, cy, float(entries.get("doffs", 0)), float(entries["baseline"]) / 1000)
         if "width" in entries and "height" in entries:
             lens = dataclasses.replace(lens, size=(int(entries["width"]), int(entries["height"])))
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{path}: not a Middlebury calibration: needs cam0=[f 0 cx; 0 f cy; 0 0 1], doffs and baseline"
-        ) from error
     return lens.check(path)
 
 
 def _read_scene(path: StrPath, disparity: str | None) -> Calibration | None:
     """A `scene.json`; None where it is about another file than `disparity`."""
-    try:
+    needs = "needs focal_px, cx, cy, doffs_px and baseline_m as JSON numbers"
+    with reading(path, f"not a scene description: {needs}"):
         scene = json.loads(read_text(path))
         if disparity is not None and scene.get("disparity") != disparity:
             return None
         focal, cx, cy, doffs, baseline = (float(scene[k]) for k in ("focal_px", "cx", "cy", "doffs_px", "baseline_m"))
         scale, invalid = float(scene.get("disparity_scale", 1)), float(scene.get("invalid", "inf"))
-        lens = Calibration(focal, cx, cy, doffs, baseline, scale, invalid)
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(
-            f"{path}: not a scene description: needs focal_px, cx, cy, doffs_px and baseline_m as JSON numbers"
-        ) from error
-    return lens.check(path)
+        return Calibration(focal, cx, cy, doffs, baseline, scale, invalid).check(path)
 
 
 def read_text(path: StrPath, kind: str = "calibration", at_most: int = MAX_TEXT_BYTES) -> str:
@@ -263,24 +254,15 @@ def grid_step(values: Array) -> float | None:
 
 def read_array(path: StrPath) -> tuple[Array, bool]:
     """The stored numbers [H, W] of any format, and whether they come from a PNG; InputError where it is none."""
-    try:
-        with open(path, "rb") as file:
-            magic = file.read(8)
-            file.seek(0)
-            if magic.startswith(b"\x89PNG"):
-                return read_image(path, lambda image: _png_values(image, path)), True
-            for starts, read in (
-                ((b"\x93NUMPY",), _read_npy),
-                ((b"PK\x03\x04",), _read_npz),
-                ((b"Pf", b"PF"), _read_pfm),
-            ):
-                if magic.startswith(starts):
-                    return read(file, path), False
-    except InputError:
-        raise
-    except Exception as error:  # NumPy and zip at work on a stranger's bytes raise anything
-        reason = reason_in_a_line(error)
-        raise InputError(f"{path}: cannot be decoded ({reason}): the file is damaged or cut off") from error
+    readers = {b"\x93NUMPY": _read_npy, b"PK\x03\x04": _read_npz, b"Pf": _read_pfm, b"PF": _read_pfm}
+    with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), open(path, "rb") as file:
+        start = file.read(8)
+        file.seek(0)
+        if start.startswith(b"\x89PNG"):
+            return read_image(path, lambda image: _png_values(image, path)), True
+        for magic, read in readers.items():
+            if start.startswith(magic):
+                return read(file, path), False
     raise InputError(f"{path}: not a depth map: give .npy, .npz or .pfm in metres, or a 16-bit .png in millimetres")
 
 

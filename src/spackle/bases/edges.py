@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle._numba import kernel
+from spackle._numba import inlined_kernel, kernel
 from spackle.surface import EDGE
 
 STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
@@ -260,6 +260,13 @@ def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
     return depth, known
 
 
+@inlined_kernel
+def color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
+    """Sum of the channels' differences between the pixels (y, x) and (v, u) of a photo [H, W, 3]."""
+    change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
+    return change + abs(rgb[y, x, 2] - rgb[v, u, 2])
+
+
 @kernel
 def _spread(cost: Any, source: Any, depths: Any, steps: Any, rgb: Any, pixels: Any) -> None:
     """For each open pixel the settled one, as y·W + x, that the cheapest path leads to, and what that costs.
@@ -277,8 +284,7 @@ def _spread(cost: Any, source: Any, depths: Any, steps: Any, rgb: Any, pixels: A
                 v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)
                 if v < 0 or u < 0 or v >= height or u >= width or cost[v, u] == np.inf:
                     continue
-                change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
-                change += abs(rgb[y, x, 2] - rgb[v, u, 2])
+                change = color_change(rgb, y, x, v, u)
                 climb = abs(depths[y, x] - depths[v, u]) / max(steps[y, x], np.float32(1e-12))
                 length = 1.0 if v == y or u == x else 1.4142135
                 total = np.float32(cost[v, u] + length + COLOR_COST * change + DEPTH_COST * climb)
@@ -311,8 +317,7 @@ def _vote(depths: Any, known: Any, rgb: Any, pixels: Any, result: Any) -> None:
             for u in range(left, right):
                 if not known[v, u]:
                     continue
-                change = abs(rgb[y, x, 0] - rgb[v, u, 0]) + abs(rgb[y, x, 1] - rgb[v, u, 1])
-                change = (change + abs(rgb[y, x, 2] - rgb[v, u, 2])) / SAME_COLOR
+                change = color_change(rgb, y, x, v, u) / SAME_COLOR
                 vote = 1 / (1 + change * change) ** 2
                 if (depths[v, u] > middle) == (depths[y, x] > middle):
                     balance += vote

@@ -7,17 +7,11 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from spackle.bases.cleanup import (
-    attach_flying_pixels,
-    fill_missing,
-    smooth_noise,
-    undo_quantisation,
-)
+from spackle.bases.cleanup import attach_flying_pixels, fill_missing, push_sky, smooth_noise, undo_quantisation
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import find_edges, sample, settle
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.quadtree import LEVELS
-from spackle.bases.sky import push_sky
 from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear

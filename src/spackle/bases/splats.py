@@ -1,21 +1,33 @@
-"""Gaussians of a photo whose every pixel has a depth: one for each or for a tile, two at silhouettes, and a backing."""
+"""Gaussians of a photo whose every pixel has a depth: one for each or for a tile, two at silhouettes, and a backing.
+
+Together they blend to what the photo shows.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.bases.blending import OPACITY, SPREAD_PX, Mixture, blended_opacities
+from spackle._numba import kernel
+from spackle.bases.edges import Floats
 from spackle.bases.quadtree import LEVELS, Quadtree, Tiles
 from spackle.bases.silhouettes import Layers, find_layers
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
+from spackle.device import run_chunks
 from spackle.gaussians import Gaussians
 from spackle.surface import surface_gaussians, surface_slope
 
+SPREAD_PX = 0.5  # standard deviation of a pixel's Gaussian
+# Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
+# behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
+OPACITY = np.float32(0.99)
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
 # close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
@@ -31,7 +43,7 @@ WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
 STEEPEST = 0.06  # change of the inverse depth across a tile
 STEEPEST_BACKING = 0.01  # and across one of the backing, which stands the farther behind the steeper it is
-SHOWN = 0.02  # of a difference in the backing is lost
+BACKING_SHARE = 0.02  # of a difference in the backing that shows
 LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 MOST = 1.5  # Gaussians a pixel
 FITS = 3  # corrections of the colours
@@ -39,11 +51,11 @@ UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: cor
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
-    """At most 1.5 Gaussians a pixel: first those of single pixels in row-major order, in what each shows most of.
+    """At most 1.5 Gaussians a pixel, which blend to the photo from its camera.
 
-    Tiles of up to 8×8 pixels follow, where the picture and the depth allow them; then, where a pixel beside a depth
-    step shows both surfaces, the Gaussians that stand for the rest; then the backing. From the photo's camera they mix
-    to what the photo shows.
+    First come those of single pixels in row-major order, on the surface that covers most of the pixel; then tiles of
+    up to 8×8 pixels, where the picture and the depth allow them; then the other surface of pixels that a depth step
+    divides; then the backing.
 
     Args:
         inverse_depth: [H, W], positive everywhere.
@@ -66,14 +78,14 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
         samples = _Samples.cat(parts)
         if len(samples.uv) <= MOST * single.numel():
             break
-    settled = single & _inner((ring == 0) | (ring > UNTOUCHED))
-    fitted = _fitted(samples, colors, single, settled[single], tiles)
+    corrected = _inner((ring == 0) | (ring > UNTOUCHED))[single]
+    fitted = _fitted(samples, colors, single, corrected, tiles)
     return surface_gaussians(camera, *(getattr(fitted, f.name) for f in dataclasses.fields(fitted)))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Samples:
-    """What Gaussians are made of, in the order of `surface_gaussians`."""
+    """N Gaussians, in the order of `surface_gaussians`."""
 
     uv: Tensor  # [N, 2] pixels
     depth: Tensor  # [N] inverse
@@ -84,21 +96,21 @@ class _Samples:
 
     @staticmethod
     def cat(parts: Sequence[_Samples]) -> _Samples:
-        """All of them, in order."""
+        """All in order."""
         return _Samples(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(_Samples)))
 
 
-def _fitted(samples: _Samples, colors: Tensor, single: Tensor, settled: Tensor, tiles: Sequence[Tiles]) -> _Samples:
-    """Correct the colours of single pixels and of tiles by what their mixture shows there instead of `colors`.
+def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor, tiles: Sequence[Tiles]) -> _Samples:
+    """Correct the colours of tiles and of some single pixels by how far their mixture is from `colors` there.
 
-    The photo's camera sees each pixel through the Gaussians around that are nearer. `settled` [single pixels] are
-    corrected.
+    The photo's camera sees each pixel through the nearer Gaussians around. `corrected` [number of single pixels] bool.
     """
     fitted = samples.color.clone()
-    mixture = Mixture(samples.uv, samples.depth, samples.spread, samples.opacity, *single.shape)
+    order = samples.depth.argsort(descending=True, stable=True)
+    spots = torch.cat([samples.uv, samples.spread, samples.opacity[:, None]], dim=-1)[order].numpy()
     for _ in range(FITS):
-        missing = colors - mixture.picture(fitted)
-        pixels = missing[single] * settled[:, None]
+        missing = colors - mixture(spots, fitted[order], *single.shape)
+        pixels = missing[single] * corrected[:, None]
         change = torch.cat([pixels, *(part.means(missing) for part in tiles)])
         fitted[: len(change)] = (fitted[: len(change)] + change).clamp(0, 1)
     return dataclasses.replace(samples, color=fitted)
@@ -120,13 +132,13 @@ class _Surface:
         return _Surface(*(torch.where(*images) for images in shaped))
 
     def pixels(self, where: Tensor, camera: Camera) -> _Samples:
-        """One for each of some pixels [H, W], in row-major order."""
+        """A Gaussian for each of some pixels [H, W], in row-major order."""
         uv = camera.pixel_centers()[where]
         depth, slope, color, opacity = self.depth[where], self.slope[where], self.color[where], self.opacity[where]
         return _Samples(uv, depth, slope, torch.full_like(uv, SPREAD_PX), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
-        """An opaque one for each tile, of so many of its sides; the surface has a cell for so many pixels a side."""
+        """An opaque Gaussian for each tile, `spread` of its sides wide; a cell of the surface is `pixels` wide."""
         depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
         opacity = torch.full_like(depth, float(OPACITY))
         sides = torch.tensor([tiles.width, tiles.height]) * (spread * pixels)
@@ -135,17 +147,17 @@ class _Surface:
 
 @dataclasses.dataclass(frozen=True)
 class _Pixels:
-    """What a photo's pixels show."""
+    """The surfaces of a photo's pixels."""
 
-    most: _Surface  # what a pixel shows most of
+    most: _Surface  # the one that covers most of a pixel
     rest: _Surface  # the other one, where `mixed`
     mixed: Tensor  # [H, W] bool
-    near: Tensor  # [H, W] bool: most is of the near one of both
+    near: Tensor  # [H, W] bool: `most` is the near one of both
     edge: Tensor  # [H, W] bool: a depth step is close
 
 
 def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
-    """Take a pixel as mixed where no less than `least` is of either surface; else it is all of one."""
+    """A pixel is mixed where either surface covers at least `least` of it; else one covers all."""
     ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
     mixed = torch.minimum(alpha, 1 - alpha) >= least
@@ -180,7 +192,7 @@ def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
     wanted = torch.where(has_far, ~has_near, ~_cells(behind).any(-1))
     flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
     tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
-    single, tiles = tree.cut(worth / SHOWN)
+    single, tiles = tree.cut(worth / BACKING_SHARE)
     surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
     kinds = (~has_near, BACKING_SPREAD, BACKING_SLOPE_GAP), (has_near, RIM_BACKING_SPREAD, RIM_BACKING_SLOPE_GAP)
     parts = [(part, LARGE_BACKING_SPREAD, BACKING_SLOPE_GAP) for part in tiles]
@@ -209,3 +221,84 @@ def _cells(image: Tensor) -> Tensor:
     height, width = (n // 2 for n in image.shape[:2])
     grid = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *image.shape[2:])
     return grid.transpose(1, 2).flatten(2, 3)
+
+
+WEIGHTS = np.exp(-0.5 / SPREAD_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
+SWEEPS = 6  # of `blended_opacities`
+FAINT, STOP = np.float32(1 / 255), np.float32(1e-4)  # the renderer's: alphas that it skips, light at which it stops
+REACH = np.float32(3.33)  # standard deviations at which an alpha becomes faint
+
+
+def blended_opacities(alpha: Floats, ring: NDArray[np.uint8]) -> Floats:
+    """Opacities [H, W] of near Gaussians that cover alpha [H, W] of the pixels, neighbours' light included.
+
+    Of full opacity each; `ring` [H, W] is 0 where a pixel is of one surface alone.
+    """
+    result = alpha.copy()
+    for _ in range(SWEEPS):
+        _thin(alpha, ring, result)
+    return result
+
+
+@kernel
+def _thin(alpha: Any, ring: Any, result: Any) -> None:
+    """One sweep, in place."""
+    height, width = alpha.shape
+    for y in range(height):
+        for x in range(width):
+            if ring[y, x] == 0 or alpha[y, x] <= 0 or alpha[y, x] >= 1:
+                continue
+            passes = np.float32(1)
+            for k in range(9):
+                v, u = min(max(y + k // 3 - 1, 0), height - 1), min(max(x + k % 3 - 1, 0), width - 1)
+                if k != 4 and ring[v, u] > 0:
+                    passes *= 1 - OPACITY * WEIGHTS[k] * result[v, u]
+            result[y, x] = min(max(1 - (1 - alpha[y, x]) / passes, np.float32(0)), np.float32(1))
+
+
+def mixture(spots: Floats, colors: Tensor, height: int, width: int) -> Tensor:
+    """The picture [H, W, 3] that the photo's camera sees of N Gaussians, blended as the renderer blends.
+
+    Args:
+        spots: [N, 5] centre x and y, standard deviation along x and y, all in pixels, and opacity; nearest first.
+        colors: [N, 3] linear RGB.
+        height: of the picture.
+        width: of the picture.
+    """
+    image = np.zeros((height, width, 3), np.float32)
+    run_chunks(lambda a, b: _mix(a, b, spots, colors.numpy(), image), height, grain=128)
+    return torch.from_numpy(image)
+
+
+@kernel
+def _mix(start: int, stop: int, spots: Any, colors: Any, image: Any) -> None:
+    """Rows start..stop, nearest first."""
+    width = image.shape[1]
+    half = np.float32(0.5)
+    passes = np.ones((stop - start, width), np.float32)
+    across = np.empty(width, np.float32)
+    for n in range(len(spots)):
+        u, v, spread_x, spread_y, opacity = spots[n]
+        top = max(int(np.ceil(v - REACH * spread_y - half)), start)
+        bottom = min(int(np.floor(v + REACH * spread_y - half)) + 1, stop)
+        if top >= bottom:
+            continue
+        left = max(int(np.ceil(u - REACH * spread_x - half)), 0)
+        right = min(int(np.floor(u + REACH * spread_x - half)) + 1, width)
+        for x in range(left, right):
+            away = (x + half - u) / spread_x
+            across[x] = np.exp(-half * away * away)
+        for y in range(top, bottom):
+            away = (y + half - v) / spread_y
+            down = opacity * np.exp(-half * away * away)
+            for x in range(left, right):
+                alpha, light = down * across[x], passes[y - start, x]
+                if alpha < FAINT:
+                    continue
+                after = light * (1 - alpha)
+                if after <= STOP:
+                    passes[y - start, x] = 0
+                    continue
+                passes[y - start, x] = after
+                for c in range(3):
+                    image[y, x, c] += alpha * light * colors[n, c]
