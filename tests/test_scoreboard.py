@@ -105,7 +105,7 @@ def test_a_mechanism_that_is_gone_is_an_error(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(LookupError, match="no_such_function"), scoreboard.switched_off("gone", scoreboard.FILL):
         pass
     with pytest.raises(LookupError, match="2 things"):
-        scoreboard.holders("SHOWN")  # the backing's, and the patches'
+        scoreboard.holders("COLOR_COST")  # of missing depth, and of edges
 
 
 @pytest.mark.slow
