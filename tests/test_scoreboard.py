@@ -121,5 +121,6 @@ def test_photos_are_completed_on_a_sheet(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_photo(tmp_path / f"{name}.png", 96, 64)
     scoreboard.main(["--photos", str(tmp_path), "--without", "texture", "-o", str(tmp_path / "sheet.jpg")])
-    width, height = Image.open(tmp_path / "sheet.jpg").size
+    with Image.open(tmp_path / "sheet.jpg") as sheet:
+        width, height = sheet.size
     assert (width, height) == (2 * 3 * 384, 2 * (scoreboard.PHOTO_HEIGHT + 4))
