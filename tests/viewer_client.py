@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import http.client
+import io
 import json
 import os
 import socket
@@ -12,14 +13,28 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
+
+from photos import picture
+from PIL import Image
 
 from spackle.viewer.guard import Limits
 from spackle.viewer.page import PageScene
 from spackle.viewer.server import Complete, ViewerServer
 from spackle.viewer.work import Tell
 
+Where = ViewerServer | str  # the latter: the page's address
 PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}
 QUICK = Limits(request=0.6, pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)
+
+
+def saved(kind: str) -> bytes:
+    """A small picture as a file of a format."""
+    Image.fromarray(picture()).save(file := io.BytesIO(), kind)
+    return file.getvalue()
+
+
+PHOTO = saved("PNG")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +50,9 @@ class Reply:
         return json.loads(self.body)
 
 
-def a_scene(name: str = "a", content: bytes = b"layer") -> PageScene:
-    return PageScene(
-        {"name": name, "layers": [{"name": "base", "file": "base.bin", "count": 1}]}, {"base.bin": content}
-    )
+def a_scene(name: str = "a", content: bytes = b"layer", **more: Any) -> PageScene:
+    layers = [{"name": "base", "file": "base.bin", "count": 1}]
+    return PageScene({"name": name, "layers": layers}, {"base.bin": content}, **more)
 
 
 def complete(photo: Path, name: str, tell: Tell) -> PageScene:
@@ -53,15 +67,20 @@ def serving(work: Complete = complete, limits: Limits = QUICK, **options: Any) -
         yield server
 
 
-def ask(server: ViewerServer, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
-    """A well-formed request."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=5)
+def ask(where: Where, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
+    """A well-formed request to a server, or below the page's address."""
+    url = urlsplit(where if isinstance(where, str) else f"http://127.0.0.1:{where.port}")
     if method == "POST":  # as every browser does
-        headers = {"Origin": f"http://127.0.0.1:{server.port}", **headers}
-    with contextlib.closing(connection):
-        connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+        headers = {"Origin": f"http://{url.netloc}", **headers}
+    with contextlib.closing(http.client.HTTPConnection(url.netloc, timeout=60)) as connection:
+        fields = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, url.path.rstrip("/") + path, body, fields)
         answer = connection.getresponse()
         return Reply(answer.status, dict(answer.headers), answer.read())
+
+
+def send(where: Where, content: bytes = PHOTO, name: str = "photo.png", **headers: str) -> Reply:
+    return ask(where, f"/photos?name={name}", "POST", content, **headers)
 
 
 def dial(server: ViewerServer, data: bytes = b"") -> socket.socket:
@@ -72,31 +91,37 @@ def dial(server: ViewerServer, data: bytes = b"") -> socket.socket:
 
 def answer_of(connection: socket.socket) -> bytes:
     """Everything until the server hangs up."""
-    parts = []
     with contextlib.suppress(ConnectionResetError):
-        while part := connection.recv(1 << 16):
-            parts.append(part)
-    return b"".join(parts)
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+    return b""
 
 
-def raw(server: ViewerServer, data: bytes) -> bytes:
-    """What the server says to these bytes, however wrong they are; it must hang up."""
+def raw(server: ViewerServer, data: bytes) -> tuple[int, bytes]:
+    """The status and the body that the server has for these bytes, however wrong they are; it must hang up."""
     with dial(server, data) as connection:
-        return answer_of(connection)
+        head, _, body = answer_of(connection).partition(b"\r\n\r\n")
+        return int(head.split()[1]), body
 
 
-def get(target: str, *headers: str, host: str = "localhost") -> bytes:
-    lines = [f"GET {target} HTTP/1.1", f"Host: {host}", "Connection: close", *headers]
+def request(target: str, *headers: str, method: str = "GET", host: str = "localhost") -> bytes:
+    """The head of a request."""
+    lines = [f"{method} {target} HTTP/1.1", f"Host: {host}", *headers]
     return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
 
 
-def send(server: ViewerServer, content: bytes, name: str = "photo.png", **headers: str) -> Reply:
-    return ask(server, f"/photos?name={name}", "POST", content, **headers)
+def get(target: str, *headers: str, host: str = "localhost") -> bytes:
+    return request(target, "Connection: close", *headers, host=host)
 
 
-def events(server: ViewerServer, job: str) -> list[Any]:
+def post(length: int, *headers: str, name: str = "a.png") -> bytes:
+    return request(
+        f"/photos?name={name}", "Origin: http://localhost", f"Content-Length: {length}", *headers, method="POST"
+    )
+
+
+def events(where: Where, job: str) -> list[Any]:
     """All that a job tells, heartbeats left out."""
-    body = ask(server, f"{job}/events").body.decode()
+    body = ask(where, f"{job}/events").body.decode()
     return [json.loads(block.removeprefix("data: ")) for block in body.split("\n\n") if block.startswith("data: ")]
 
 
@@ -107,17 +132,5 @@ def eventually(condition: Callable[[], object], within: float = 10.0) -> None:
         time.sleep(0.01)
 
 
-def uploads_of(server: ViewerServer) -> list[Path]:
-    return [Path(folder) / name for folder, _, names in os.walk(server.uploads.name) for name in names]
-
-
-def admitted(server: ViewerServer, path: str, within: float = 10.0) -> socket.socket:
-    """A connection with the answer 200: the server lets go of earlier ones only when it next writes to them."""
-    end = time.monotonic() + within
-    while True:
-        connection = dial(server, get(path))
-        if connection.recv(12, socket.MSG_PEEK).endswith(b"200"):
-            return connection
-        connection.close()
-        assert time.monotonic() < end, "it did not come"
-        time.sleep(0.01)
+def uploads_of(server: ViewerServer) -> list[str]:
+    return [name for _, _, names in os.walk(server.uploads.name) for name in names]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -19,6 +18,7 @@ from command import Run, refuses, report_of, run
 from photos import write_pair, write_photo
 from portraits import apple_jpeg, codes
 from scenes import box_before_wall
+from viewer_client import ask, events, send
 
 import spackle
 from spackle.app.view import Teller, ViewOptions, complete_for_page
@@ -77,33 +77,17 @@ def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
     return run_view
 
 
-def get(url: str, path: str, content: bytes | None = None) -> Any:
-    headers = {"Origin": "/".join(url.split("/")[:3])}
-    request = urllib.request.Request(url.rstrip("/") + path, content, headers)
-    with urllib.request.urlopen(request, timeout=20) as answer:
-        return json.load(answer)
-
-
-def hear(url: str, job: str) -> list[Any]:
-    """Everything that a job tells, until it ends."""
-    with urllib.request.urlopen(f"{url.rstrip('/')}{job}/events", timeout=60) as answer:
-        return [json.loads(line[6:]) for line in answer if line.startswith(b"data: ")]
-
-
 def counts(description: Any) -> dict[str, int]:
     return {layer["name"]: layer["count"] for layer in description["layers"]}
 
 
-def test_a_scene_of_ours_keeps_its_parts_and_its_camera_and_a_strangers_is_all_base_behind_a_usual_lens(
-    tmp_path: Path, visit: Callable[..., Run]
-) -> None:
+def test_a_scene_keeps_its_parts_and_its_camera(tmp_path: Path, visit: Callable[..., Run]) -> None:
     scene, path, count = box_before_wall(), tmp_path / "scene.ply", len(box_before_wall().base())
     seen: list[Any] = []
 
     def browse(url: str) -> None:
-        with urllib.request.urlopen(url, timeout=20) as page:
-            assert b"<html" in page.read()
-        seen.append(get(url, get(url, "/scene.json")["scene"]))
+        assert b"<html" in ask(url).body
+        seen.append(ask(url, ask(url, "/scene.json").json["scene"]).json)
 
     save_ply(scene.base(), path, camera=scene.camera, base_count=count - 10)
     result = visit(browse, path)
@@ -111,7 +95,7 @@ def test_a_scene_of_ours_keeps_its_parts_and_its_camera_and_a_strangers_is_all_b
     assert not any(line.startswith("warning") for line in result.lines)
     assert (seen[0]["name"], counts(seen[0])) == (tmp_path.name, {"base": count - 10, "aux": 10})
     assert seen[0]["camera"]["K"] == scene.camera.K.tolist()
-    save_ply(scene.base(), path)
+    save_ply(scene.base(), path)  # a stranger's: all base, behind a usual lens
     result = visit(browse, path, "--host", "0.0.0.0", end=signal.SIGTERM)
     assert (result.code, result.lines[0].startswith("warning: ")) == (130, True)  # open to the network
     assert visit(browse, path, "--fov", "90").code == 130
@@ -120,7 +104,7 @@ def test_a_scene_of_ours_keeps_its_parts_and_its_camera_and_a_strangers_is_all_b
         assert description["camera"]["K"][0] == pytest.approx([focal, 0, 640])
 
 
-def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_was_said_of_the_first(
+def test_a_photo_is_completed_as_predict_completes_it(
     tmp_path: Path, visit: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -133,11 +117,11 @@ def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_w
     seen: list[dict[str, Any]] = []
 
     def browse(url: str) -> None:
-        assert get(url, "/scene.json")["scene"] in (None, "/scenes/1.json")
-        told.append(hear(url, "/jobs/1"))
-        seen.append(get(url, told[0][-1]["ready"]))
-        told.append(hear(url, get(url, "/photos?name=my%20other.jpg", apple_jpeg(codes()))["job"]))
-        seen.append(get(url, get(url, "/scene.json")["scene"]))
+        assert ask(url, "/scene.json").json["scene"] in (None, "/scenes/1.json")
+        told.append(events(url, "/jobs/1"))
+        seen.append(ask(url, told[0][-1]["ready"]).json)
+        told.append(events(url, send(url, apple_jpeg(codes()), "my%20other.jpg").json["job"]))
+        seen.append(ask(url, ask(url, "/scene.json").json["scene"]).json)
 
     result = visit(browse, photo, *given)
     assert result.code == 130, result.err
@@ -150,16 +134,16 @@ def test_a_photo_is_completed_as_predict_completes_it_and_another_without_what_w
     assert any("Gaussians from rgbd" in line for line in first)
     assert any("--fov" in line for line in first)
     assert other[0].startswith("my other.jpg: base rgbd (the depth in the photo)")
-    assert not any("--fov" in line for line in other)
+    assert not any("--fov" in line for line in other)  # what was said of the first photo
     assert not any("upload." in line for line in result.lines)
     assert not list(tmp_path.glob("spackle-view-*"))
     # A photo that cannot be completed leaves the page to others.
-    result = visit(lambda url: told.append(hear(url, "/jobs/1")), photo, "--base", "rgbd")
+    result = visit(lambda url: told.append(events(url, "/jobs/1")), photo, "--base", "rgbd")
     assert told[-1][-1]["error"].startswith(f"{photo}: --base rgbd needs depth")
     assert (result.code, any(line.startswith("error: ") for line in result.lines)) == (130, True)
 
 
-def test_the_page_says_that_lite_is_rough_and_goes_no_farther_than_it_looks_right(tmp_path: Path) -> None:
+def test_the_page_says_that_lite_is_rough_and_stays_near(tmp_path: Path) -> None:
     photo = load_photo(write_pair(tmp_path)[0])
     completer = ViewOptions(settings := BaseSettings("lite")).completer(settings)
     description: Any = complete_for_page(photo, "p", completer, Teller(Reporter(), lambda event: None)).description

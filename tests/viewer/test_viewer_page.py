@@ -46,8 +46,7 @@ VIEW = ("swipe", 0.3, 1.0)  # far to the right, where there are holes
 def box() -> Scene:
     """A small scene, completed by the seeds."""
     prediction = box_before_wall(width=64, height=48, focal=53).lift()
-    path = scene_path(prediction.gaussians, prediction.camera, "swipe", 0.35, 4)
-    return complete(prediction, path, network=None)
+    return complete(prediction, scene_path(prediction.gaussians, prediction.camera, "swipe", 0.35, 4), network=None)
 
 
 @functools.cache
@@ -107,23 +106,21 @@ def test_the_description_holds_the_paths_of_the_trajectories(kind: TrajectoryKin
     np.testing.assert_allclose(still + disparity * moving, [view.position.tolist() for view in cameras], atol=1e-7)
 
 
-def test_the_description_is_plain_json_counts_its_layers_and_says_how_far_the_eye_goes() -> None:
+def test_the_description_is_plain_json_and_counts_its_layers() -> None:
     description: dict[str, Any] = json.loads(json.dumps(page_of_box().description, allow_nan=False))
-    layers = {layer["name"]: layer for layer in description["layers"]}
     assert description["name"] == "Box"
-    assert {name: layer["count"] for name, layer in layers.items()} == {"base": len(box().base), "aux": len(box().aux)}
-    sizes = {layer["file"]: layer["count"] * BYTES for layer in layers.values()}
+    counts = {layer["name"]: layer["count"] for layer in description["layers"]}
+    assert counts == {"base": len(box().base), "aux": len(box().aux)}
+    sizes = {layer["file"]: layer["count"] * BYTES for layer in description["layers"]}
     assert sizes == {name: len(data) for name, data in page_of_box().files.items()}
-    alone = page_scene("alone", box().base, Gaussians.empty(), box().camera)
-    assert alone.files["aux.splats"] == b""
-    for disparity, aux, free in (
-        (0.2, box().aux, 0.2),
-        (None, box().aux, 0.3),
-        (None, Gaussians.empty(), 0.6),
-        (5, box().aux, 1),
-    ):
-        orbit: Any = page_scene("a", box().base, aux, box().camera, disparity).description["orbit"]
-        assert (orbit["free"], orbit["limit"]) == (free, pytest.approx(1.3 * free))
+    assert page_scene("alone", box().base, Gaussians.empty(), box().camera).files["aux.splats"] == b""
+
+
+@pytest.mark.parametrize(("disparity", "filled", "free"), [(0.2, 1, 0.2), (None, 1, 0.3), (None, 0, 0.6), (5, 1, 1)])
+def test_the_eye_goes_as_far_as_the_scene_was_completed(disparity: float | None, filled: bool, free: float) -> None:
+    aux = box().aux if filled else Gaussians.empty()
+    orbit: Any = page_scene("a", box().base, aux, box().camera, disparity).description["orbit"]
+    assert (orbit["free"], orbit["limit"]) == (free, pytest.approx(1.3 * free))
 
 
 def test_the_built_page_belongs_to_its_sources() -> None:
@@ -141,21 +138,19 @@ def test_the_built_page_belongs_to_its_sources() -> None:
         assert f"\n{package} " in page_files()[name][1][:8000].decode()
 
 
-def test_the_single_file_runs_its_own_script_and_style_alone_whatever_the_name() -> None:
+def test_the_single_file_runs_its_own_script_and_style_alone() -> None:
     page = single_html(page_of_box(EVIL))
     assert page == single_html(page_of_box(EVIL))
     assert EVIL[:9].encode() + b"<b>" not in page
-    inside = re.search(rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page)
-    assert inside is not None
-    assert json.loads(inside[1])["description"]["name"] == EVIL
-    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page.decode())
-    assert policy is not None
-    assert policy[1].startswith("default-src 'none';")
-    assert "unsafe-inline" not in policy[1]
+    (inside,) = re.findall(rb'<script type="application/json" id="spackle-scene">(.*?)</script>', page)
+    assert json.loads(inside)["description"]["name"] == EVIL
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]+)"', page.decode())
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe-inline" not in policy
     for element in ("script", "style"):
         (text,) = re.findall(rf"<{element}>(.*?)</{element}>", page.decode(), re.DOTALL)
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-        assert f"'sha256-{digest}'" in policy[1]
+        assert f"'sha256-{digest}'" in policy
 
 
 @pytest.fixture(scope="module")
@@ -297,7 +292,7 @@ def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> Non
     assert glow[0] > 0.7 > 0.45 > glow[1]
 
 
-def test_the_page_shows_what_our_renderer_shows_and_the_base_before_the_divider(page: Any) -> None:
+def test_the_page_shows_what_our_renderer_shows(page: Any) -> None:
     for disparity in (0.0, 0.3):
         page.evaluate("(disparity) => spackle.setView('swipe', disparity, 1)", disparity)
         both = picture(page, 256, 192)
@@ -306,7 +301,7 @@ def test_the_page_shows_what_our_renderer_shows_and_the_base_before_the_divider(
     base = picture(page, 256, 192)
     page.evaluate("spackle.setLayers('both')")
     page.evaluate("spackle.setCompare(0.25)")
-    divided = picture(page, 256, 192)
+    divided = picture(page, 256, 192)  # the base before the divider
     torch.testing.assert_close(divided[:, :64], base[:, :64], rtol=0, atol=1.5 / 255)
     torch.testing.assert_close(divided[:, 64:], both[:, 64:], rtol=0, atol=1.5 / 255)
 
