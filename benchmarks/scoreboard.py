@@ -102,7 +102,6 @@ def all_covered(own: Any) -> Any:
 
 
 def no_edges(own: Any) -> Any:
-    """`find_edges` that sees none."""
     return lambda depth, known, focal: Edges(np.zeros_like(depth), np.zeros_like(known), np.zeros_like(known))
 
 
@@ -133,17 +132,21 @@ FILL: dict[str, dict[str, Replace]] = {
     "network": {"shipped_network": lambda own: lambda: None},
     "texture": {"open_texture": lambda own: lambda fill: None},
     "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
-    "GOOD_FIT 0.12": {"GOOD_FIT": lambda own: 0.12},
+    "GOOD_FIT 0.12": {"texture.GOOD_FIT": lambda own: 0.12},
     "sharpened": {"sharpened": first},
     "sky rule": NO_SKY,
     "beyond_border": {"fill_around": filled_from_around},
-    "beyond_border's colours": {**NO_SKY, "MIXED": lambda own: 10.0, "CARRIED": lambda own: 20.0},
+    "beyond_border's colours": {
+        **NO_SKY,
+        "beyond_border.MIXED": lambda own: 10.0,
+        "beyond_border.CARRIED": lambda own: 20.0,
+    },
     "shown beyond the border": {"texture.SHOWN": lambda own: 0.0},
     "in proportion": {"_in_proportion": lambda own: lambda fine, cues, *more: torch.ones_like(cues.alpha)},
-    "repeat count": {"OFTEN": lambda own: math.inf},
+    "repeat count": {"texture.OFTEN": lambda own: math.inf},
     "continued": {"continued": first},
     "widened": {"widened": first},
-    "ALIKE": {"ALIKE": lambda own: math.inf},
+    "ALIKE": {"seeds.ALIKE": lambda own: math.inf},
     "solid sources": {"_sources": all_covered},
 }
 MECHANISMS = (*FILL, *LIFT)
@@ -285,9 +288,8 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def table(rows: Rows) -> str:
     """A row a scene, and the mean."""
     measures = list(next(iter(rows.values())))
-    means = {m: change(m, rows, rows)[0] for m in measures}
-    every = [*rows.items(), ("mean", means)]
-    return markdown(["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every])
+    every = rows | {"mean": {m: change(m, rows, rows)[0] for m in measures}}
+    return markdown(["", *measures], [[n, *(text(m, r[m]) for m in measures)] for n, r in every.items()])
 
 
 def change(measure: str, before: Rows, now: Rows) -> tuple[float, float, int, int]:
