@@ -278,7 +278,7 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
     before = gpu.render(there.base, view)
     places = counted_waits(lambda: there.completed_view(view, [guard], rendering=before))
     yield f"{len(places)} waits: {', '.join(sorted(set(places)))}"
-    guards, empty_view = [guard.to(torch.device("cpu"))], before.to(torch.device("cpu"))
+    guards, empty_view = [guard], before.to(torch.device("cpu"))
     yield from rows(
         {
             "added time on the GPU": lambda _: there.completed_view(view, [guard], rendering=before),

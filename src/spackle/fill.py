@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from spackle._numba import kernel
 from spackle.device import run_chunks
@@ -49,21 +48,19 @@ def far_fill(
         sweeps: relaxation sweeps at each resolution.
 
     Returns:
-        Inverse depth [H, W] and values [C, H, W], float32; known pixels as they were.
+        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels as they were.
 
     Raises:
-        ValueError: where nothing is known; a GPU is not asked, and then fills with zeros.
+        ValueError: nothing is known.
     """
-    if inverse_depth.device.type != "cpu":
-        return dense_far_fill(inverse_depth.detach(), values.detach(), known, far_bias, sweeps)
     if not bool(known.any()):
         raise ValueError("nothing to fill from: no pixel is known")
     # Pixel by pixel what belongs together lies together: the hole's pixels are scattered through memory.
-    depths = inverse_depth.detach().float().clone(memory_format=torch.contiguous_format)
-    carried = values.detach().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
-    bias = torch.as_tensor(far_bias, dtype=torch.float32).expand(inverse_depth.shape).contiguous()
-    _fill_level(depths.numpy(), carried.numpy(), known.contiguous().numpy(), bias.numpy(), sweeps)
-    return depths, carried.permute(2, 0, 1)
+    depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
+    carried = values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous()
+    _fill_level(depths.numpy(), carried.numpy(), known.cpu().contiguous().numpy(), bias.numpy(), sweeps)
+    return depths.to(inverse_depth.device), carried.permute(2, 0, 1).to(inverse_depth.device)
 
 
 def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats, sweeps: int) -> None:
@@ -246,57 +243,3 @@ def _put(depths: Any, values: Any, holes: Any, samples: Any) -> None:
         depths[y, x] = samples[n, 0]
         for channel in range(values.shape[2]):
             values[y, x, channel] = samples[n, 1 + channel]
-
-
-def dense_far_fill(
-    inverse_depth: Tensor, values: Tensor, known: Tensor, far_bias: Tensor | float, sweeps: int
-) -> tuple[Tensor, Tensor]:
-    """`far_fill` for a GPU: whole images, one torch operation at a time, without waiting for it."""
-    field = torch.cat([inverse_depth[None], values])[None].float()
-    field = torch.where(known[None, None], field, 0)
-    bias = field.new_full((), far_bias) if isinstance(far_bias, (int, float)) else far_bias.to(field)
-    filled = _dense_level(field, known[None, None], bias.expand(known.shape)[None, None], sweeps)[0]
-    return filled[0], filled[1:]
-
-
-def _dense_level(field: Tensor, known: Tensor, bias: Tensor, sweeps: int) -> Tensor:
-    """Fill one level [1, 1 + C, H, W] from the next coarser one, then relax it."""
-    height, width = field.shape[-2:]
-    if height == width == 1:
-        return field
-    margins = (0, width % 2, 0, height % 2)
-    weight = _dense_far_weight(field[:, :1], known, bias)
-    mass = avg_pool2d(pad(weight, margins), 2)
-    # A coarse cell is the mean of its known samples, the far ones counting most.
-    coarse = avg_pool2d(pad(field * weight, margins), 2) / mass.clamp_min(1e-30)
-    coarse_bias = avg_pool2d(pad(bias, margins, mode="replicate"), 2)
-    coarse = _dense_level(coarse, mass > 0, coarse_bias, sweeps)
-    guess = interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False)
-    return _dense_relax(torch.where(known, field, guess[..., :height, :width]), known, bias, sweeps)
-
-
-def _dense_far_weight(inverse_depth: Tensor, known: Tensor, bias: Tensor) -> Tensor:
-    """Weights inverse_depth^-bias, scaled so that they stay within single precision."""
-    reference = torch.where(known, inverse_depth, torch.nan).nanmedian()
-    ratio = (inverse_depth / reference).clamp_min(1e-6)
-    exponent = (-bias * ratio.log()).clamp(-MAX_EXPONENT, MAX_EXPONENT)
-    return torch.where(known, exponent.exp(), 0)
-
-
-def _dense_relax(field: Tensor, known: Tensor, bias: Tensor, sweeps: int) -> Tensor:
-    """Jacobi sweeps on the unknown pixels; nothing flows across the image's border."""
-    rim = _around(known.to(field)) > 0
-    for _ in range(sweeps):
-        near = _around(field)
-        trust = (field[:, :1] / near[:, :1].clamp_min(1e-12)).clamp(1e-6, 1.0) ** bias
-        conductance = torch.where(rim, trust.clamp_min(MIN_TRUST), 1)
-        field = torch.where(known, field, (conductance * near).sum(0) / conductance.sum(0))
-    return field
-
-
-def _around(image: Tensor) -> Tensor:
-    """The four neighbours [4, C, H, W] of each pixel of [1, C, H, W]; at the border the pixel itself."""
-    height, width = image.shape[-2:]
-    wide = pad(image, (1, 1, 1, 1), mode="replicate")[0]
-    places = ((0, 1), (2, 1), (1, 0), (1, 2))
-    return torch.stack([wide[:, dy : dy + height, dx : dx + width] for dy, dx in places])

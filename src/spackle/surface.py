@@ -79,29 +79,11 @@ def surface_slope(inverse_depth: Tensor) -> Tensor:
     Args:
         inverse_depth: [H, W] float32 or float64, positive everywhere. No gradient goes through.
     """
-    if inverse_depth.device.type != "cpu":
-        return dense_slope(inverse_depth.detach())
-    image = inverse_depth.detach().contiguous().numpy()
+    image = inverse_depth.detach().cpu().contiguous().numpy()
     slopes = np.empty((*image.shape, 2), image.dtype)
     bounds = tuple(image.dtype.type(bound) for bound in (CREASE, EDGE, RAGGED))
     run_chunks(lambda start, stop: _slopes(start, stop, image, *bounds, slopes), len(image), GRAIN)
-    return torch.from_numpy(slopes)
-
-
-def dense_slope(image: Tensor) -> Tensor:
-    """`surface_slope` for a GPU: the whole grid, one torch operation at a time."""
-    slopes = []
-    for axis in (1, 0):
-        inner = image.diff(dim=axis)
-        zero = torch.zeros_like(image.narrow(axis, 0, 1))
-        ends = (inner.narrow(axis, 0, 1), inner.narrow(axis, -1, 1)) if inner.numel() else (zero, zero)
-        # At a border the one difference that there is stands for both.
-        backward, forward = torch.cat([ends[0], inner], axis), torch.cat([inner, ends[1]], axis)
-        smooth = (forward - backward).abs() <= CREASE * image
-        flatter = torch.where(backward.abs() < forward.abs(), backward, forward)
-        slope = torch.where(smooth, (forward + backward) / 2, flatter)
-        slopes.append(torch.where(slope.abs() <= torch.where(smooth, EDGE, RAGGED) * image, slope, 0))
-    return torch.stack(slopes, dim=-1)
+    return torch.from_numpy(slopes).to(inverse_depth.device)
 
 
 @kernel

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from far_device import FarDevice, far_device
 from sharp_weights import MICRO, micro_network, waves
 from torch import Tensor
 from torch._dynamo.utils import counters
@@ -24,7 +23,6 @@ from spackle.bases.sharp.layers import WINDOWS, TransformerBlock
 from spackle.bases.sharp.network import SharpNetwork, SharpOutput
 from spackle.image import Photo
 
-__all__ = ["far_device"]  # a fixture
 PHOTO = Photo(torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg"))
 
 
@@ -163,17 +161,3 @@ def test_a_graph_captured_in_inference_mode_serves_other_modes_too() -> None:
         graphed(waves(MICRO.side), 0.8, 35)
     with torch.no_grad():
         assert same(graphed(waves(MICRO.side).flip(-1), 1.3, 35), network(waves(MICRO.side).flip(-1), 1.3, 35))
-
-
-# --- a GPU is waited for once
-
-
-def test_between_photo_and_scene_a_gpu_is_waited_for_once(far_device: FarDevice) -> None:
-    network = micro_network()
-    expected, there = SharpBase(network).predict(PHOTO).gaussians, SharpBase(network.to("meta"))
-    far_device.waits.clear()
-    found = there.predict(PHOTO).gaussians
-    assert far_device.waits == ["aten._to_copy.default"]  # of the scene, in one copy
-    for tensor, other in zip(found.tensors, expected.tensors, strict=True):
-        assert tensor.is_contiguous()
-        torch.testing.assert_close(tensor, other, rtol=1e-4, atol=1e-4)

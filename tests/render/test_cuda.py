@@ -14,7 +14,6 @@ from typing import Any
 import gsplat_stand_in
 import pytest
 import torch
-from far_device import FarDevice, FarTensor, Watched, far_device
 from scenes import box_before_wall, same_bits, shifted
 from torch import Tensor
 
@@ -33,8 +32,6 @@ from spackle.render.cuda import (
     upper_covariances,
 )
 from spackle.render.protocol import ALPHA_MAX, Rendering
-
-__all__ = ["far_device"]  # a fixture
 
 CPU = CpuRenderer()
 SCENE = box_before_wall(width=45, height=35, focal=40)
@@ -150,23 +147,6 @@ def test_views_drawn_together_are_those_drawn_alone_bit_for_bit(gpu: GsplatRende
         agree(one, other)
     with pytest.raises(ValueError, match="one size"):
         gpu.render_batch([[BASE]] * 2, [SIDE, SIDE.resized(40, 40)])
-
-
-def test_the_host_waits_once_and_nothing_is_left_on_another_device(
-    far_device: FarDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cuda, "load_gsplat", lambda device: Watched(far_device))
-    gpu, tiles = GsplatRenderer("meta"), torch.ones(3, 3, dtype=torch.bool)
-    there = BASE.to("meta")
-    asking = Gaussians(*(t.detach().requires_grad_() for t in BASE.select(slice(0, 9)).to("meta").tensors))
-    far_device.waits.clear()
-    views = gpu.render_batch([[there, asking], [there]], [SIDE, SCENE.camera], tiles=[tiles, tiles])
-    torch.stack([view.rgb for view in views]).sum().backward()
-    assert far_device.waits == ["isect_tiles"]
-    assert all(isinstance(t.grad, FarTensor) for t in asking.tensors)
-    drawn = gpu.render(BASE, SIDE)  # one wait more: the images come back together
-    assert far_device.waits == ["isect_tiles"] * 2 + ["aten._to_copy.default"]
-    assert same_bits(drawn, gpu.render(there, SIDE).to(torch.device("cpu")))
 
 
 def test_covariances_are_single_precision_whatever_the_caller_has_set() -> None:

@@ -25,7 +25,7 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, extremes, trajectory
 from spackle.color import to_bytes
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer
+from spackle.render import CpuRenderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual import (
     Completer,
@@ -102,6 +102,58 @@ def test_no_aux_gaussian_of_a_scene_stands_before_the_photos_surface_and_it_repe
     assert bool((z[inside] > depth[y[inside], x[inside]] * 1.0005).all())
 
 
+FAR = torch.device("meta")
+
+
+class FarGaussians(Gaussians):
+    """Gaussians on the renderer's device, as far as a machine with one device can tell."""
+
+
+class FarRendering(Rendering):
+    """A view on the renderer's device."""
+
+
+class FarRenderer:
+    """Draws what lies on its device, and nothing else."""
+
+    device = FAR
+
+    def render(
+        self, sets: Gaussians | Sequence[Gaussians], camera: Camera, *, onto: Any = None, tiles: Any = None
+    ) -> FarRendering:
+        sets = [sets] if isinstance(sets, Gaussians) else sets
+        assert all(isinstance(part, FarGaussians) for part in sets)
+        assert onto is None or isinstance(onto, FarRendering)
+        return FarRendering(*CPU.render(sets, camera, tiles=tiles, onto=onto).tensors)
+
+    def touched_tiles(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        assert isinstance(gaussians, FarGaussians)
+        return touched_tiles(gaussians, camera)
+
+
+def test_images_travel_down_once_and_gaussians_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    subject, camera = box_view(0.3)
+    path = path_of(subject, "swipe", frames=3)
+    expected = [subject.complete_view(camera), subject.complete_scene(path)]
+    moved: list[object] = []
+
+    def to(value: Any, device: torch.device) -> Any:
+        kind = Gaussians if isinstance(value, Gaussians) else Rendering
+        far = {Gaussians: FarGaussians, Rendering: FarRendering}[kind]
+        if isinstance(value, far) == (device == FAR):
+            return value
+        moved.append(value)
+        return (far if device == FAR else kind)(*value.tensors)
+
+    for kind in (Gaussians, Rendering):
+        monkeypatch.setattr(kind, "to", to)
+    subject = dataclasses.replace(subject, renderer=FarRenderer())
+    for found, wanted in zip((subject.complete_view(camera), subject.complete_scene(path)), expected, strict=True):
+        assert same_bits(found, wanted)
+    assert len({id(value) for value in moved}) == len(moved) > 10
+    assert sum(value is subject.base for value in moved) == 1
+
+
 Wide = tuple[Completer, int, Rendering, Gaussians, Gaussians]
 
 
@@ -170,7 +222,9 @@ def test_what_lies_beneath_a_rim_covers_nothing_that_earlier_views_moved_away_be
     there = [completer.base, first]
     before = CPU.render(there, left)
     beneath: list[Gaussians] = []
-    new, without = completer._fill(left, guards, there, before, beneath=beneath)
+    stage = complete._Stage(there, CPU)
+    added, without = completer._fill(stage, stage.look(left), left, guards, beneath=beneath)
+    new = Gaussians.cat(added)
     hidden = [push_behind(rims, left.position, guards) for rims in beneath]
     assert sum(map(len, hidden)) > 1000
     both = CPU.render([*there, new, *hidden], left)

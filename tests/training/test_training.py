@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import json
 import math
@@ -18,7 +17,6 @@ from pathlib import Path
 import pytest
 import torch
 from command import Run, names_in, run
-from far_device import FarDevice, Watched, far_device
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
@@ -28,7 +26,7 @@ from training_runs import assert_same_weights, killed_at, one_thread, run_two, s
 from spackle.errors import InputError
 from spackle.files import hold
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer, GsplatRenderer, cuda, get_renderer
+from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet, load_residual
 from spackle.training.data import SampleFiles
 from spackle.training.method import Objective
@@ -38,7 +36,7 @@ from spackle.training.sample import Sample, load_sample, save_sample
 from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
-__all__ = ["far_device", "one_thread"]  # fixtures
+__all__ = ["one_thread"]  # a fixture
 
 RECIPE = """
 data: {photos: %s, views: 5, validation_views: 2, crops: 2, cells: 16}
@@ -331,30 +329,6 @@ def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path)
     first, last = trainer.progress.history
     assert last["loss"] < first["loss"]
     assert last["hole_psnr"] > first["hole_psnr"]
-
-
-def test_a_step_on_a_gpu_waits_for_it_once_and_gives_what_the_processor_gives(
-    far_device: FarDevice, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sample = sample_of(box_before_wall(width=96, height=80).base())
-    samples = [sample.crop(2, 3, 24, 24), sample.crop(10, 20, 24, 24)]
-    network = ResidualNet()
-    for weight in network.parameters():
-        torch.nn.init.normal_(weight, std=0.02)
-    objective = Objective(LossRecipe(features="none"), None, CpuRenderer(), torch.float32, torch.device("cpu"))
-    expected, _ = objective.total(complete_samples(network, samples, CpuRenderer()))
-    expected.backward()
-    monkeypatch.setattr(cuda, "load_gsplat", lambda device: Watched(far_device))
-    gpu = GsplatRenderer("meta")
-    there = copy.deepcopy(network).to("meta", memory_format=torch.channels_last)  # type: ignore[call-overload]
-    objective = dataclasses.replace(objective, renderer=gpu, device=torch.device("meta"))
-    far_device.waits.clear()
-    loss = objective.total(complete_samples(there, samples, gpu))[0]
-    loss.backward()
-    assert far_device.waits == ["isect_tiles"]
-    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
-    one, other = network.texture[-1].weight.grad, there.texture[-1].weight.grad.cpu()
-    assert float((one - other).norm() / one.norm()) < 1e-2
 
 
 @pytest.mark.parametrize("bad", [None, 3])

@@ -122,7 +122,7 @@ def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 def exemplar(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Exemplar:
-    """Fill a hole by patches, on the processor; the result is the same for any number of threads.
+    """Fill a hole by patches; the result is the same for any number of threads.
 
     Args:
         guess: [H, W, 3] sRGB; in the hole smooth colours, which decide the tone of what is looked for.

@@ -14,8 +14,6 @@ from spackle.color import bright_or_blue
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.filters import broadly_blurred
 from spackle.inpaint.exemplar import nearest_known
-from spackle.inpaint.exemplar_dense import dense_nearest_known
-from spackle.residual import dense
 from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.hole_features import Cues
 
@@ -43,7 +41,7 @@ def fill_around(
     """
     mask, bias = cues.mask, FAR_BIAS * inside
     beyond = mask & ~inside
-    if not dense.on_gpu(mask) and int(beyond.count_nonzero()) <= FEW * beyond.numel():
+    if int(beyond.count_nonzero()) <= FEW * beyond.numel():
         return far_fill(cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=bias)
     # A cell's point times its inverse depth, in the photo's frame: ray + shift * inverse depth.
     here, there = (view.world_to_camera.double() for view in (camera, photo_camera))
@@ -72,7 +70,7 @@ def fill_around(
     depths, mixed = far_fill(cues.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
     depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :4].movedim(-1, 0), mixed)
     others = beyond & ~led
-    if dense.on_gpu(mask) or bool(others.any()):
+    if bool(others.any()):
         refilled = far_fill(depths, colors, led | known, far_bias=bias)
         depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
     far = apart / mask.shape[1]
@@ -92,7 +90,6 @@ def _sky(rgb: Tensor, known: Tensor) -> Tensor:
 
 def _cells_to_known(mask: Tensor) -> Tensor:
     """[h, w] cells from each masked one to the nearest that is not."""
-    gpu = dense.on_gpu(mask)
-    near = dense_nearest_known(mask) if gpu else torch.from_numpy(nearest_known(mask.contiguous().numpy()))
-    rows, columns = (torch.arange(size, device=mask.device) for size in mask.shape)
+    near = torch.from_numpy(nearest_known(mask.contiguous().numpy()))
+    rows, columns = (torch.arange(size) for size in mask.shape)
     return torch.hypot((near[0] - rows[:, None]).float(), (near[1] - columns).float())

@@ -20,7 +20,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import Renderer, place_of, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
-from spackle.residual.hole_features import CELL, MASK_THRESHOLD, Cues, hole_area_ratio, in_cells
+from spackle.residual.hole_features import CELL, MASK_THRESHOLD, PROCESSOR, Cues, hole_area_ratio, in_cells
 from spackle.residual.network import ResidualNet, predict_deltas
 from spackle.residual.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
 from spackle.residual.rim_underlay import rim_underlay
@@ -41,7 +41,9 @@ SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone
 class Completer:
     """Everything that completion needs besides the view.
 
-    Base Gaussians are only ever read: what is returned comes on top of them.
+    Base Gaussians are only ever read: what is returned comes on top of them. The renderer draws and the network
+    computes on the renderer's device; everything else happens on the processor. Of a view its images travel there,
+    once each, and its new Gaussians back.
     """
 
     base: Gaussians
@@ -54,18 +56,16 @@ class Completer:
 
     @functools.cached_property
     def there(self) -> Completer:
-        """The same with base and network where the renderer computes, so that nothing travels but what comes of it."""
+        """The same with base and network on the renderer's device."""
         place = place_of(self.renderer)
-        if self.base.means.device.type == place.type:
+        if self.base.means.device.type == place.type == "cpu":
             return self
         network = None if self.network is None else copy.deepcopy(self.network).to(place)
         return dataclasses.replace(self, base=self.base.to(place), network=network)
 
     def photo_guard(self) -> OcclusionGuard:
         """What the photo itself shows: no completion may stand in front of that."""
-        if self.there is not self:
-            return self.there.photo_guard()
-        rendering = self.renderer.render(self.base, self.photo_camera)
+        rendering = self.renderer.render(self.there.base, self.photo_camera)
         return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
 
     def complete_view(
@@ -95,13 +95,10 @@ class Completer:
             rendering: base and aux from this view, where that is at hand.
         """
         guards = [self.photo_guard()] if guards is None else guards
-        if self.there is not self:
-            home, place = self.base.means.device, self.there.base.means.device
-            moved = [part if part is None else part.to(place) for part in (aux, rendering)]
-            new, view = self.there.completed_view(camera, [guard.to(place) for guard in guards], *moved)  # type: ignore[arg-type]
-            return new.to(home), view.to(home)
-        there = [self.base] if aux is None else [self.base, aux]
-        return self._fill(camera, guards, there, rendering or self.renderer.render(there, camera))
+        stage = _Stage([self.there.base] if aux is None else [self.there.base, aux], self.renderer)
+        added, view = self.there._fill(stage, stage.look(camera, rendering), camera, guards)
+        home = self.base.means.device
+        return Gaussians.cat(added).to(home), view.to(home)
 
     @torch.no_grad()
     def complete_scene(
@@ -127,71 +124,69 @@ class Completer:
         """
         if not cameras:
             return Gaussians.empty()
-        if self.there is not self:
-            return self.there.complete_scene(cameras, exact, progress, seen).to(self.base.means.device)
         order = farthest_first(cameras, self.photo_camera)
-        guards = {-1: self.photo_guard()}
+        guards, stage = {-1: self.photo_guard()}, _Stage([self.there.base], self.renderer)
         for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
-            view = self.renderer.render(self.base, cameras[index])
+            view = stage.look(cameras[index])
             guards[index] = OcclusionGuard.of(view, cameras[index], self.threshold)
-        settled, aux, filled = SettledFrames(len(cameras)), self._nothing, 0
+        settled, aux, filled = SettledFrames(len(cameras)), [Gaussians.empty()], 0
         waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
         enough = CLOSED_HAR if exact else QUIET_HAR
         for count, index in enumerate(order):
             if exact or not settled.known(index):
                 camera = cameras[index]
-                view = self.renderer.render([self.base, aux], camera) if count else view
+                view = stage.look(camera) if count else view
                 holes = hole_area_ratio(view.alpha, self.threshold)
                 # Nobody is spoken for where all are looked at.
                 reach = float(holes == 0) if exact else reach_of(holes, view.alpha, self.threshold)
                 if not reach:
                     others = [guard for of, guard in guards.items() if of != index]
-                    chosen = self._seeds_alone if holes < SEEDS_HAR and not exact else self._for_view(filled)
+                    subject = self.there
+                    chosen = subject._seeds_alone if holes < SEEDS_HAR and not exact else subject._for_view(filled)
                     beneath: list[Gaussians] | None = [] if len(cameras) > 1 else None
-                    new, view = chosen._fill(camera, others, [self.base, aux], view, enough, beneath)
+                    added, view = chosen._fill(stage, view, camera, others, enough, beneath)
+                    aux += added
                     waiting += [(index, rims) for rims in beneath or ()]
                     filled += 1
-                    aux = Gaussians.cat([aux, new])
                     if seen:
                         seen.clear()
                     guards[index] = OcclusionGuard.of(view, camera, self.threshold)
                     if filled >= OPPOSITE:
-                        aux = Gaussians.cat([aux, *_behind_others(waiting, cameras, guards)])
+                        hidden = _behind_others(waiting, cameras, guards)
+                        stage.add(*hidden)
+                        aux += hidden
                         waiting.clear()
                 elif seen is not None:
                     seen[index] = to_bytes(view.rgb)
                 settled.looked(index, reach)
             if progress:
                 progress(count + 1, len(order))
-        return Gaussians.cat([aux, *_behind_others(waiting, cameras, guards)])
+        return Gaussians.cat([*aux, *_behind_others(waiting, cameras, guards)]).to(self.base.means.device)
 
     def _fill(
         self,
+        stage: _Stage,
+        view: Rendering,
         camera: Camera,
         guards: Sequence[OcclusionGuard],
-        there: Sequence[Gaussians],
-        rendering: Rendering,
         enough: float = CLOSED_HAR,
         beneath: list[Gaussians] | None = None,
-    ) -> tuple[Gaussians, Rendering]:
-        """New aux Gaussians for a view, and the view with them; `beneath` gets what lies beneath its holes' rims."""
-        added = [self._nothing]
+    ) -> tuple[list[Gaussians], Rendering]:
+        """What fills the holes of the view that the stage shows, and the view with it.
+
+        `beneath` gets what lies beneath the holes' rims.
+        """
+        added = [Gaussians.empty()]
         for turn in range(PASSES):
             # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
-            new = (self._seeds_alone if turn else self)._propose(rendering, camera, guards, beneath)
+            new = (self._seeds_alone if turn else self)._propose(view, camera, guards, beneath)
             if not len(new):
                 break
             added.append(new)
-            tiles = touched_tiles(new, camera, self.renderer)  # the others keep what they show
-            rendering = self.renderer.render([*there, *added], camera, tiles=tiles, onto=rendering)
-            if hole_area_ratio(rendering.alpha, self.threshold) < enough:
+            view = stage.look_again(new)
+            if hole_area_ratio(view.alpha, self.threshold) < enough:
                 break
-        return Gaussians.cat(added), rendering
-
-    @property
-    def _nothing(self) -> Gaussians:
-        """No Gaussians, beside the base's."""
-        return Gaussians.empty(self.base.means.device)
+        return added, view
 
     @property
     def _seeds_alone(self) -> Completer:
@@ -212,7 +207,7 @@ class Completer:
         """
         cues = Cues.of(rendering, self.threshold)
         if not bool(cues.mask.any()):
-            return self._nothing
+            return Gaussians.empty()
         seeds, eye = make_seeds(cues, camera, self.photo_camera), camera.position
         chosen, deltas, picture, rim = seeds.select(cues.mask), None, None, None
         if self.network is None and self.texture is None:
@@ -245,6 +240,34 @@ class Completer:
                 filled[cues.mask] = torch.where(there, 1 / (depths * away), filled[cues.mask])
             beneath.append(rim_underlay(cues, dataclasses.replace(seeds, inverse_depth=filled), camera))
         return Gaussians.cat(parts)
+
+
+class _Stage:
+    """Sets of Gaussians on the renderer's device, and how a camera sees them.
+
+    Each set travels there once, and of each view the images travel back once.
+    """
+
+    def __init__(self, sets: Sequence[Gaussians], renderer: Renderer) -> None:
+        self._renderer, self._device = renderer, place_of(renderer)
+        self._sets = [part.to(self._device) for part in sets]
+
+    def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
+        """What a camera sees, on the processor; `rendering` where it has been drawn already."""
+        drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
+        self._camera, self._drawn = camera, drawn
+        return drawn.to(PROCESSOR)
+
+    def add(self, *sets: Gaussians) -> None:
+        """More Gaussians, which the next look sees."""
+        self._sets += [part.to(self._device) for part in sets]
+
+    def look_again(self, new: Gaussians) -> Rendering:
+        """Add Gaussians, and look from the last camera: only tiles that they touch are drawn."""
+        self.add(new)
+        tiles = touched_tiles(self._sets[-1], self._camera, self._renderer)
+        self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
+        return self._drawn.to(PROCESSOR)
 
 
 def _behind_others(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from torch.nn.functional import avg_pool2d, interpolate
 from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.residual import dense
 from spackle.residual.hole_features import CELL, GRAIN
 
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
@@ -22,7 +21,15 @@ CRISP = 0.12  # of a view's width: so far the network sees a rim as it is
 WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
 
 
-def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor) -> dense.Walk:
+class Walk(NamedTuple):
+    """For each masked cell, what its line meets; elsewhere the cell itself."""
+
+    found: Tensor  # [h, w, c] values at the far rim
+    mirrored: Tensor  # [h, w, c] values as far beyond the rim as the cell is before it, if that is the same surface
+    distance: Tensor  # [h, w] cells to the rim; 0 elsewhere, and where no line meets anything
+
+
+def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor) -> Walk:
     """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
 
     Args:
@@ -36,8 +43,6 @@ def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera
     there = eye.double()
     # Where the view sees that eye: homogeneous, for it may lie at infinity.
     epipole = (camera.K.to(there) @ camera.to_camera(there)).detach().cpu().numpy()
-    if dense.on_gpu(mask):
-        return dense.walk(uv, values, inverse_depth, mask, epipole.tolist(), SAME_DEPTH, SAME_EYE)
     places, colors, depths, closed = (image.contiguous().numpy() for image in (uv, values, inverse_depth, mask))
     grids = (colors.copy(), colors.copy(), np.zeros(closed.shape, np.float32))
     run_chunks(
@@ -45,7 +50,7 @@ def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera
         len(closed),
         GRAIN,
     )
-    return dense.Walk(*(torch.from_numpy(grid) for grid in grids))
+    return Walk(*(torch.from_numpy(grid) for grid in grids))
 
 
 def widened(values: Tensor, mask: Tensor, radius: Tensor) -> Tensor:

@@ -16,12 +16,12 @@ from spackle._numba import kernel
 from spackle.device import run_chunks
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
-from spackle.residual import dense
 
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
 CLOSEST, FAINTEST = np.float32(1e-6), np.float32(1e-6)  # depth and summed opacity that are divided by, at least
 GRAIN = 16  # rows of cells that a thread takes at a time
+PROCESSOR = torch.device("cpu")
 MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (paper, eq. 4)
 
 
@@ -33,14 +33,12 @@ def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
 def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
     """HAR = 1 − coverage (paper, section 4.2, eqs. 10 and 11): the share of hole pixels."""
     hole = hole_mask(alpha, threshold)
-    # Of what counts bits, numpy is the fastest by far.
-    count = int(np.count_nonzero(hole.numpy()) if hole.device.type == "cpu" else hole.count_nonzero())
-    return count / hole.numel()
+    return int(np.count_nonzero(hole.cpu().numpy())) / hole.numel()  # of what counts bits, numpy is the fastest by far
 
 
 @dataclasses.dataclass(frozen=True)
 class Cues:
-    """A view's cells, detached from whatever made them. Grid: ceil(H/2) × ceil(W/2)."""
+    """A view's cells, on the processor, detached from whatever made them. Grid: ceil(H/2) × ceil(W/2)."""
 
     rgb: Tensor  # [h, w, 3] sRGB of the covered part of the cell, without the black behind it
     inverse_depth: Tensor  # [h, w] farthest covered pixel's 1/z; 0 in a cell without any
@@ -50,10 +48,9 @@ class Cues:
     @staticmethod
     def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> Cues:
         """Gather the cells of a rendering; an odd last row or column stands for its twin too."""
-        if dense.on_gpu(rendering.alpha):
-            return Cues(*dense.cells_of(rendering, threshold, float(CLOSEST)))
+        rendering = rendering.to(PROCESSOR).detach()
         images = (rendering.rgb.flatten(1), rendering.depth, rendering.alpha)
-        view = [image.detach().float().contiguous().numpy() for image in images]
+        view = [image.float().contiguous().numpy() for image in images]
         rows, columns = (-(-size // CELL) for size in rendering.alpha.shape)
         rgb, mask = np.empty((rows, CHANNELS * columns), np.float32), np.empty((rows, columns), np.bool_)
         inverse_depth, alpha = (np.empty((rows, columns), np.float32) for _ in range(2))

@@ -145,18 +145,13 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
     maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
-    # Elsewhere the rim is the cell itself: a processor does not look there, but to look for holes would wait for a GPU.
-    masked = cues.mask.device.type == "cpu"
     grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
-    *colors, distance, mismatch = (grid[cues.mask] for grid in grids) if masked else grids
+    *colors, distance, mismatch = (grid[cues.mask] for grid in grids)  # elsewhere the rim is the cell itself
     own, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
     there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
-    if masked:
-        far = there.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-        far[cues.mask] = there
-    else:
-        far = torch.where(cues.mask[..., None], there, 0)
+    far = there.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
+    far[cues.mask] = there
     channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
@@ -165,18 +160,18 @@ def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 def predict_deltas(
     network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto", *, dense: bool = False
 ) -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's masked cells; other cells are undefined.
+    """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; other cells are undefined.
 
     The network looks only around the masked cells, see `spackle.residual.sparse`; on a processor it does not compute
     what only the others need, see `ResidualNet.deltas_at`.
 
     Args:
-        network: a `ResidualNet`.
+        network: a `ResidualNet`; its features travel to the device where it lies.
         cues, seeds, rim: of the same view.
         precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
         dense: deltas of all cells.
     """
-    device = cues.mask.device
+    device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
     chosen = torch.ones_like(cues.mask) if dense else cues.mask
     few = network if isinstance(network, ResidualNet) and device.type == "cpu" and not dense else None
@@ -185,11 +180,12 @@ def predict_deltas(
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE):
             there = outer.slices
-            features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there))
+            features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there)).to(device)
             own = torch.zeros_like(chosen[there])
             own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
-            found: Tensor = _rows(network(features))[own.view(-1)] if few is None else few.deltas_at(features, own)
-            field[there][own] = found.float()
+            chosen_rows = own.view(-1).to(device)
+            found: Tensor = _rows(network(features))[chosen_rows] if few is None else few.deltas_at(features, own)
+            field[there][own] = found.float().cpu()
     return field
 
 

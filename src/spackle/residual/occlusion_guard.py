@@ -19,8 +19,7 @@ from spackle.device import run_chunks
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
-from spackle.residual import dense
-from spackle.residual.hole_features import MASK_THRESHOLD
+from spackle.residual.hole_features import MASK_THRESHOLD, PROCESSOR
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
@@ -41,12 +40,9 @@ class OcclusionGuard:
     @staticmethod
     def of(rendering: Rendering, camera: Camera, threshold: float = MASK_THRESHOLD) -> OcclusionGuard:
         """The guard of a rendered view."""
-        seen = torch.where(rendering.alpha < threshold, 0, rendering.depth).detach().float()
+        view = rendering.to(PROCESSOR).detach()
+        seen = torch.where(view.alpha < threshold, 0, view.depth).float()
         return OcclusionGuard(camera, greatest_around(seen, WINDOW_PX))
-
-    def to(self, device: torch.device) -> OcclusionGuard:
-        """The same on another device."""
-        return OcclusionGuard(self.camera, self.depth.to(device))
 
 
 def push_behind(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Gaussians:
@@ -77,13 +73,7 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     """
     if not len(aux) or not guards:
         return torch.ones_like(aux.opacities)
-    eye = beside(eye, aux.means)
-    if dense.on_gpu(aux.means):
-        shown_by = [(guard.camera, guard.depth) for guard in guards]
-        factors = dense.free_factors(eye, aux, shown_by, STEPS, WINDOW_PX, REACH, MAX_REACH_PX, CLEARANCE)
-    else:
-        factors = _factors(aux, eye, guards)
-    return factors.to(aux.means)
+    return _factors(aux, beside(eye, aux.means), guards).to(aux.means)
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def rim_underlay(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
     rim = (Cells(cues.mask).grown(REACH_CELLS).grid & ~cues.mask)[EVERY]
     known, rgb = ~rim, seeds.rgb[EVERY].permute(2, 0, 1)
     if not bool(rim.any()) or not bool(known.any()):
-        return Gaussians.empty(cues.mask.device)
+        return Gaussians.empty()
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
     # At the rim, behind all that is seen or filled as far around as a blob reaches.
     shown = dataclasses.replace(cues, inverse_depth=seeds.inverse_depth)

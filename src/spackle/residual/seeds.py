@@ -20,8 +20,6 @@ from spackle.device import run_chunks
 from spackle.fill import far_fill
 from spackle.filters import broadly_blurred
 from spackle.inpaint.exemplar import TONE_CELLS, Exemplar, exemplar
-from spackle.inpaint.exemplar_dense import dense_exemplar
-from spackle.residual import dense
 from spackle.residual.beyond_border import fill_around
 from spackle.residual.epipolar_walk import CRISP, WIDENING, walk, widened
 from spackle.residual.hole_features import CELL, GRAIN, Cues
@@ -47,7 +45,6 @@ class Seeds:
 
     def select(self, cells: Tensor) -> Seeds:
         """The chosen cells, flat [n, ...]: of a boolean grid [h, w], or their numbers in its rows laid end to end."""
-        # Once for all fields, and without waiting for a GPU where they are numbers already.
         index = cells.flatten().nonzero()[:, 0] if cells.dtype == torch.bool else cells
         lead = self.inverse_depth.ndim - 1
         fields = (self.uv, self.inverse_depth, self.slope, self.rgb)
@@ -85,8 +82,6 @@ def make_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
 
 def _sources(cues: Cues) -> Tensor:
     """[h, w] bool: cells to start from. Specks are none: a stray far one would colour a whole hole."""
-    if dense.on_gpu(cues.mask):
-        return dense.sources_of(cues.mask, cues.inverse_depth)
     mask = cues.mask.contiguous().numpy()
     solid = np.empty(mask.shape, np.bool_)
     run_chunks(lambda start, stop: _solid(start, stop, mask, solid), len(mask), GRAIN)
@@ -114,8 +109,6 @@ def _solid(start: int, stop: int, mask: Any, solid: Any) -> None:
 
 def _inside(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
     """[h, w] bool: which cells' points lie in the photo's frame."""
-    if dense.on_gpu(inverse_depth):
-        return dense.inside_photo(inverse_depth, beside(cell_centers(camera), inverse_depth), camera, photo_camera)
     image = inverse_depth.contiguous().numpy()
     inside = np.empty(image.shape, np.bool_)
     lens, photo_lens = (view.K.detach().cpu().double().numpy() for view in (camera, photo_camera))
@@ -145,8 +138,6 @@ def _look(
 def placed_behind(filled: Tensor, chosen: Tensor, cues: Cues, radius: int) -> Tensor:
     """Filled inverse depth [h, w]; in the chosen cells ([h, w] bool) behind everything seen within `radius` cells."""
     share = np.float32(1.0 - BEHIND)
-    if dense.on_gpu(filled):
-        return dense.placed_behind(filled, chosen, cues.inverse_depth, radius, float(share))
     seen, cells = (image.contiguous().numpy() for image in (cues.inverse_depth, chosen))
     placed = filled.clone(memory_format=torch.contiguous_format)
     run_chunks(lambda start, stop: _place(start, stop, seen, cells, radius, share, placed.numpy()), len(cells), GRAIN)
@@ -213,9 +204,8 @@ class Rim:
         near = torch.where(unmirrored, far, near)
         beyond = cues.mask & ~_inside(seeds.inverse_depth, camera, photo_camera)
         tone = torch.where(cues.mask[..., None], rgb, cues.rgb)
-        find = dense_exemplar if dense.on_gpu(tone) else exemplar
         goes_on = (beyond & (apart < math.log(ALIKE)))[..., None]
-        patches = find(torch.where(goes_on, near, tone), cues.mask, depths)
+        patches = exemplar(torch.where(goes_on, near, tone), cues.mask, depths)
         toned = (patches.rgb - broadly_blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
         found = torch.where(beyond[..., None], toned, patches.rgb)
         return Rim(far, near, steps, found, patches.mismatch, beyond), patches

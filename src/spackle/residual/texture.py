@@ -17,9 +17,7 @@ from spackle.fill import FAR_BIAS, far_fill
 from spackle.filters import blurred, broadly_blurred
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.inpaint.exemplar import Exemplar, nearest_known
-from spackle.inpaint.exemplar_dense import dense_nearest_known
 from spackle.render.protocol import Rendering
-from spackle.residual.dense import on_gpu
 from spackle.residual.hole_features import CELL, Cues, from_cells, hole_mask, in_cells
 from spackle.residual.seeds import Rim, Seeds
 
@@ -90,7 +88,7 @@ def _in_proportion(fine: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
     every = (slice(None, None, COARSE),) * 2
     around = (others / seen.clamp_min(1e-6)).clamp_min(LEAST_ENERGY).log()
     known, bias = ~cues.mask[every], FAR_BIAS * ~rim.beyond[every]
-    if on_gpu(hole) or bool(known.any()):
+    if bool(known.any()):
         around = far_fill(seeds.inverse_depth[every], around[None], known, far_bias=bias)[1][0]
     share = (around.exp() / (own / masked.clamp_min(1e-6)).clamp_min(LEAST_ENERGY)).sqrt().clamp_max(1)
     factors = interpolate(share[None, None], scale_factor=COARSE, mode="bilinear")[0, 0]
@@ -112,7 +110,7 @@ class PaintedTexture:
         """See `Texture.colors`."""
         hole = hole_mask(rendering.alpha)
         views = (rendering.rgb[None], hole[None], known_inverse_depth(rendering.depth, hole)[None])
-        return from_cells(in_cells(self.painter.paint(*(view.cpu() for view in views))[0].to(hole.device)))
+        return from_cells(in_cells(self.painter.paint(*views)[0]))
 
 
 def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
@@ -127,10 +125,8 @@ def continued(structure: Tensor, cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
 
     Behind an object the nearest cell is the object's, and nothing is continued.
     """
-    gpu = on_gpu(cues.mask)
-    near = dense_nearest_known(cues.mask) if gpu else torch.from_numpy(nearest_known(cues.mask.numpy())).long()
-    sides = (torch.arange(size, device=near.device) for size in cues.mask.shape)
-    own = torch.stack(torch.meshgrid(*sides, indexing="ij"))
+    near = torch.from_numpy(nearest_known(cues.mask.numpy())).long()
+    own = torch.stack(torch.meshgrid(*(torch.arange(size) for size in cues.mask.shape), indexing="ij"))
     row, column = (place.clamp_min(0) for place in near)
     apart = (seeds.inverse_depth / cues.inverse_depth[row, column].clamp_min(1e-9)).log()
     fading = torch.exp((1 - torch.hypot(*(near - own).float())) / CONTINUED_CELLS - (apart / SAME_DEPTH).square())

@@ -47,8 +47,8 @@ def complete_samples(
     place = place_of(renderer)
     cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
-    samples = [sample.to(place) for sample in samples]
     features = torch.cat([network_input(sample.cues, sample.seeds, sample.rim) for sample in samples])
+    samples = [sample.to(place) for sample in samples]
     features = features.to(next(network.parameters()).device)
     with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
         deltas = network(features.contiguous(memory_format=torch.channels_last))
