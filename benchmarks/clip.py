@@ -21,10 +21,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from spackle.app.clip import ClipCompleter, CompletedView
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
+from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import flicker, pixel_grid, sample
 from spackle.color import srgb_to_linear
 from spackle.evaluation.motorcycle import load_motorcycle

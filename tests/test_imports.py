@@ -20,26 +20,25 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
 # they are named here; all others are values.
-SHARED = {"machine", "progress", "signals"}
-BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "formats", "downloads", "shared"}
+BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "formats", "downloads"}
+SCENE = {"pipeline", "scene", "views"}
 BELOW_DATASET = {*BELOW_SCENE, "scene"}
 ALLOWED: dict[str, set[str]] = {
     "values": set(),
     "downloads": {"values"},
     "formats": {"values"},
-    "shared": {"values", "downloads", "formats"},
     "render": {"values"},
-    "bases": {"values", "downloads", "shared"},
+    "bases": {"values", "downloads"},
     "inpaint": {"values", "downloads"},
     "residual": {"values", "render", "inpaint"},
     "clips": {"values", "render", "bases", "residual", "inpaint", "formats"},
     "viewer": {"values", "formats"},
     "scene": {*BELOW_SCENE, "viewer"},
-    "workers": {"values", "shared"},
+    "workers": {"values"},
     "dataset": {*BELOW_DATASET, "workers"},
     "training": {*BELOW_DATASET, "dataset"},
     "evaluation": {*BELOW_DATASET, "dataset", "training"},
-    "app": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "workers", "clips"},
+    "app": {*BELOW_DATASET, "evaluation"},
     "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "viewer", "app", "workers", "clips"},
 }
 
@@ -89,8 +88,8 @@ def module_of(path: Path) -> str:
 def room_of(module: str) -> str:
     """The room of a module of ours."""
     first = [*module.split(".")[1:], ""][0]
-    if first in SHARED:
-        return "shared"
+    if first in SCENE:
+        return "scene"
     return first if first in ALLOWED or (SOURCES / first).is_dir() else "values"
 
 

@@ -20,7 +20,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
-from spackle.scene import PATH_FRAMES
+from spackle.views import PATH_FRAMES
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")
 FORMATS = (".ply", ".spz", ".sog", ".glb", ".splat", ".html")

@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.gaussians import Gaussians as Gaussians
     from spackle.image import Photo as Photo
     from spackle.image import load_photo as load_photo
+    from spackle.pipeline import complete as complete
+    from spackle.pipeline import predict as predict
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
     from spackle.render.protocol import Rendering as Rendering
@@ -33,8 +35,6 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.residual import hole_area_ratio as hole_area_ratio
     from spackle.residual import hole_mask as hole_mask
     from spackle.scene import Scene as Scene
-    from spackle.scene import complete as complete
-    from spackle.scene import predict as predict
 
 __version__ = "0.1.0"
 
@@ -53,7 +53,8 @@ _NAMES = {
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("Completer", "hole_area_ratio", "hole_mask"),
-    "spackle.scene": ("Scene", "complete", "predict"),
+    "spackle.pipeline": ("complete", "predict"),
+    "spackle.scene": ("Scene",),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_HOMES)

@@ -88,6 +88,10 @@ class Reporter:
         """One line for everybody."""
         self.console.print(escape(one_line(line)), soft_wrap=True)
 
+    def warn(self, line: str) -> None:
+        """One line for everybody, about what could not be done as asked."""
+        self.log(line)
+
     def detail(self, line: str) -> None:
         """One line for those who asked for more."""
         if self.verbose:

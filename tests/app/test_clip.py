@@ -10,11 +10,11 @@ import torch
 from scenes import box_before_wall
 from torch import Tensor
 
-from spackle.app.clip import ClipCompleter, CompletedView
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
+from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import (
     DepthAlignment,
     Track,

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from spackle._numba import is_compiled
-from spackle.app import first_use
-from spackle.app.first_use import compiled_ahead
+from spackle.cli import first_use
+from spackle.cli.first_use import compiled_ahead
 from spackle.render import get_renderer
 from spackle.render.blend import blend_tiles
 
@@ -24,7 +24,7 @@ from numba.core.dispatcher import Dispatcher
 
 sys.path.insert(0, sys.argv[1])
 from scenes import box_before_wall, shifted
-from spackle.app.first_use import compile_kernels
+from spackle.cli.first_use import compile_kernels
 from spackle.render import get_renderer
 from spackle.residual import Completer
 

@@ -33,10 +33,10 @@ from spackle.downloads import known_weights
 from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
+from spackle.pipeline import FillOptions
 from spackle.residual import Completer, ResidualNet
 from spackle.residual.network import shipped_network
 from spackle.residual.texture import EXEMPLAR
-from spackle.scene import ResidualChoice
 
 
 def hashes(folder: Path) -> dict[str, object]:
@@ -159,7 +159,7 @@ def test_the_seeds_alone_can_be_had_and_fill_the_holes_where_no_weights_came_wit
     report = report_of(tmp_path / "asked" / "photo")
     assert report["residual"]["weights"] == "seeds"
     assert "no trained weights" in report["residual"]["note"]
-    monkeypatch.setattr("spackle.scene.SHIPPED", tmp_path / "none.safetensors")
+    monkeypatch.setattr("spackle.pipeline.SHIPPED", tmp_path / "none.safetensors")
     predicted(*write_pair(tmp_path), tmp_path / "without")
     seeds, without = (tmp_path / name / "photo" / "scene.ply" for name in ("asked", "without"))
     assert seeds.read_bytes() == without.read_bytes()
@@ -200,15 +200,15 @@ def test_lamas_weights_are_painted_with_where_they_are_and_missed_where_they_are
 ) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--fill", "lama", named="spackle weights get lama")
-    assert (ResidualChoice().fill, ResidualChoice(None, "network").fill) == ("exemplar", "network")
+    assert (FillOptions().texture, FillOptions(None, "network").texture) == ("exemplar", "network")
     (tmp_path / known_weights("lama").file).write_text("not LaMa's")
     choices = (
-        ResidualChoice(),
-        ResidualChoice(mode="view"),
-        ResidualChoice(None, "lama", "view"),
-        ResidualChoice("none"),
+        FillOptions(),
+        FillOptions(mode="view"),
+        FillOptions(None, "lama", "view"),
+        FillOptions("none"),
     )
-    assert [choice.fill for choice in choices] == ["lama", "exemplar", "lama", "none"]
+    assert [choice.texture for choice in choices] == ["lama", "exemplar", "lama", "none"]
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], named=known_weights("lama").file)
 
 
@@ -321,7 +321,7 @@ def test_a_report_vouches_for_its_files_alone(tmp_path: Path) -> None:
     assert {name: hashes(out / name) for name in "abc"} == whole
 
 
-@pytest.mark.parametrize("failing", ["save_views_video", "write_report"])
+@pytest.mark.parametrize("failing", ["save_views", "write_json"])
 def test_an_interrupted_run_leaves_the_old_set_whole(
     tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
@@ -330,7 +330,7 @@ def test_an_interrupted_run_leaves_the_old_set_whole(
 
     predicted(*pair, tmp_path)
     before = hashes(tmp_path / "photo")
-    monkeypatch.setattr(f"spackle.app.predict.{failing}", interrupted)
+    monkeypatch.setattr(f"spackle.cli.photo.{failing}", interrupted)
     assert run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path, "--disparity", "0.5", *SHORT).code == 130
     assert hashes(tmp_path / "photo") == before
     assert names_in(tmp_path / "photo") == FILES

@@ -18,7 +18,7 @@ from clips import moving, write_clip
 from command import SHORT, Run, names_in, predicted, refuses, report_of, run
 from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 
-from spackle.app.predict_all import Predictor
+from spackle.cli.photos import Predictor
 from spackle.errors import InputError
 from spackle.files import check_mark, mark, results_folder
 

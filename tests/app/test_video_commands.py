@@ -17,11 +17,11 @@ from scenes import box_before_wall, psnr
 from torch import Tensor
 
 import spackle
-from spackle.app.video import PathOptions, VideoOptions, cover
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, TrajectoryKind
 from spackle.render import CpuRenderer
 from spackle.stereo import Stereo
+from spackle.views import PathOptions, VideoOptions, cover
 
 CPU = CpuRenderer()
 CAMERA = Camera.from_focal(60, 64, 48)

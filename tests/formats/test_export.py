@@ -28,8 +28,8 @@ from plain_scenes import (
 from rich.console import Console
 from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
-from spackle.app.export import PAGE, export_scene
 from spackle.camera import Camera
+from spackle.cli.export_scene import PAGE, export_scene
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import load_ply, load_ply_camera, save_ply

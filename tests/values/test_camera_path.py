@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from scenes import box_before_wall
 from torch import Tensor
 
-from spackle.app.video import PathOptions
 from spackle.camera import Camera
 from spackle.camera_path import (
     TRAJECTORIES,
@@ -29,6 +28,7 @@ from spackle.camera_path import (
     view_matrix,
 )
 from spackle.gaussians import Gaussians
+from spackle.views import PathOptions
 
 PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
 RANGE = DepthRange(near=2.0, focus=4.0)

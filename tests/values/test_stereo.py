@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import box_before_wall
 
-from spackle.app.video import FrameMaker, VideoOptions
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange
 from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
-from spackle.scene import scene_path
 from spackle.stereo import DUBOIS_LEFT, DUBOIS_RIGHT, LAYOUTS, Stereo, anaglyph, default_ipd
+from spackle.views import FrameMaker, VideoOptions, scene_path
 
 CPU = CpuRenderer()
 CAMERA = Camera.from_focal(60, 64, 48)

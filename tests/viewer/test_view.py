@@ -21,8 +21,8 @@ from scenes import box_before_wall
 from viewer_client import ask, events, send
 
 import spackle
-from spackle.app.view import Teller, ViewOptions, complete_for_page
 from spackle.bases.open import ROUGH, BaseSettings
+from spackle.cli.view_page import Teller, ViewOptions, complete_for_page
 from spackle.formats import save_ply
 from spackle.image import film_to_pixels, load_photo
 from spackle.progress import Reporter
@@ -31,13 +31,13 @@ from spackle.progress import Reporter
 DEAF = """
 import time
 from spackle import cli
-from spackle.app.complete import PhotoCompleter
+from spackle.pipeline import Pipeline
 
 def for_ever(self, photo, reporter):
     with reporter.stage("base"):
         time.sleep(60)
 
-PhotoCompleter.complete = for_ever
+Pipeline.complete = for_ever
 cli.main()
 """
 
@@ -145,7 +145,7 @@ def test_a_photo_is_completed_as_predict_completes_it(
 
 def test_the_page_says_that_lite_is_rough_and_stays_near(tmp_path: Path) -> None:
     photo = load_photo(write_pair(tmp_path)[0])
-    completer = ViewOptions(settings := BaseSettings("lite")).completer(settings)
+    completer = ViewOptions(settings := BaseSettings("lite")).open(settings)
     description: Any = complete_for_page(photo, "p", completer, Teller(Reporter(), lambda event: None)).description
     assert (description["note"], description["orbit"]["free"]) == (ROUGH, 0.15)
 
@@ -163,7 +163,7 @@ def test_the_page_says_that_lite_is_rough_and_stays_near(tmp_path: Path) -> None
 def test_files_that_are_neither_scene_nor_photo(
     tmp_path: Path, name: str, content: bytes | None, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("spackle.app.view.announce", lambda *_, **__: pytest.fail("there is a page"))
+    monkeypatch.setattr("spackle.cli.view_page.announce", lambda *_, **__: pytest.fail("there is a page"))
     if content is not None:
         (tmp_path / name).write_bytes(content)
     elif name == "behind.ply":
@@ -174,7 +174,7 @@ def test_files_that_are_neither_scene_nor_photo(
 
 @pytest.mark.parametrize("kind", ["scene", "photo"])
 def test_bad_options(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spackle.app.view.announce", lambda *_, **__: pytest.fail("there is a page"))
+    monkeypatch.setattr("spackle.cli.view_page.announce", lambda *_, **__: pytest.fail("there is a page"))
     target = write_photo(tmp_path / "photo.png")
     if kind == "scene":
         target = tmp_path / "scene.ply"

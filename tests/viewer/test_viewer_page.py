@@ -29,11 +29,13 @@ from spackle.color import linear_to_srgb
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.gaussians import quat_to_matrix as matrices
+from spackle.pipeline import complete
 from spackle.render import CpuRenderer
-from spackle.scene import Scene, complete, scene_path
+from spackle.scene import Scene
 from spackle.viewer import PageScene, page_files, page_scene, single_html
 from spackle.viewer.page import BYTES, encode_layer
 from spackle.viewer.server import ViewerServer
+from spackle.views import scene_path
 
 WEB = Path(__file__).parents[2] / "web"
 EVIL = "</script><b>&\"'\ud800"

@@ -171,8 +171,8 @@ def bench(
     from spackle.evaluation.bench import bench as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.evaluation.suite import SuiteOptions, run_suite
+    from spackle.pipeline import FillOptions
     from spackle.progress import Reporter
-    from spackle.scene import ResidualChoice
 
     given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     source, numbers = _sorted_words(context, folder, root, disparity)
@@ -186,7 +186,7 @@ def bench(
             device=device,
             sharp=bases if {"--base", "--checkpoint"} & given else None,
             base_runs=base_runs,
-            residual=ResidualChoice(residual).file,
+            residual=FillOptions(residual).file,
             side=side,
         )
         end = run_suite(asked, output or Path("bench-suite"), reporter)

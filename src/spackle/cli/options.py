@@ -13,8 +13,8 @@ from typer.core import TyperOption
 from spackle.errors import InputError, check_name
 
 if TYPE_CHECKING:  # torch takes seconds to load
-    from spackle.app.video import PathOptions
     from spackle.camera_path import TrajectoryKind
+    from spackle.views import PathOptions
 
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 SPELLINGS = ["swipe", "shake", "rotate", "rotate-forward"]  # of trajectories
@@ -171,7 +171,7 @@ def path_options(
     Raises:
         InputError: --path or --cameras gives other views, to which an option would mean nothing.
     """
-    from spackle.app.video import PathOptions, VideoOptions, parse_size
+    from spackle.views import PathOptions, VideoOptions, parse_size
 
     given = {"--trajectory": trajectory, "--disparity": disparity}
     says = f"--path {path}: is a camera path of its own"

@@ -22,7 +22,7 @@ from spackle.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from spackle.app.video import PathOptions
+    from spackle.views import PathOptions
 
 
 @with_path_options
@@ -111,16 +111,23 @@ def predict(
 
     A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
-    from spackle.app.predict import PredictOptions
-    from spackle.app.predict_all import predict_all
     from spackle.bases.open import BaseSettings
+    from spackle.cli.photo import PredictOptions
+    from spackle.cli.photos import predict_all
+    from spackle.pipeline import FillOptions, Options
     from spackle.progress import Reporter
-    from spackle.scene import ResidualChoice
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
-    choice = ResidualChoice(residual, fill, mode)
-    lens, many = (focal_px, focal_mm, fov), (workers, threads, ray)
-    options = PredictOptions(settings, choice, path, render, mode, *lens, overwrite, keep_frame, *many)
+    options = PredictOptions(
+        Options(settings, path, FillOptions(residual, fill, mode)),
+        {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov},
+        render=render,
+        keep_frame=keep_frame,
+        overwrite=overwrite,
+        workers=workers,
+        threads=threads,
+        ray=ray,
+    )
     if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
@@ -133,7 +140,7 @@ def demo(
     verbose: VerboseOption = False,
 ) -> None:
     """Complete the Middlebury Motorcycle photo and compare with the true second photo (needs scikit-image)."""
-    from spackle.app.demo import run_demo
+    from spackle.cli.demo import run_demo
     from spackle.progress import Reporter
 
     run_demo(output, Reporter(verbose, as_json=as_json))

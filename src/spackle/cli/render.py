@@ -22,7 +22,7 @@ from spackle.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from spackle.app.video import PathOptions
+    from spackle.views import PathOptions
 
 
 @with_path_options
@@ -40,7 +40,7 @@ def render(
     verbose: VerboseOption = False,
 ) -> None:
     """Draw a saved scene along a camera path."""
-    from spackle.app.render import render_scene
+    from spackle.cli.render_scene import render_scene
     from spackle.progress import Reporter
 
     render_scene(
@@ -63,7 +63,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a scene in the formats that other viewers read."""
-    from spackle.app.export import export_scene
+    from spackle.cli.export_scene import export_scene
     from spackle.progress import Reporter
 
     export_scene(scene, output, Reporter(as_json=as_json))
@@ -99,9 +99,9 @@ def view(
     verbose: VerboseOption = False,
 ) -> None:
     """Look at a scene, or complete a photo and look at that, on a page of this machine. Ctrl-C ends it."""
-    from spackle.app.view import ViewOptions
-    from spackle.app.view import view as view_target
     from spackle.bases.open import BaseSettings
+    from spackle.cli.view_page import ViewOptions
+    from spackle.cli.view_page import view as view_target
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)

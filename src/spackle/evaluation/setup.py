@@ -26,9 +26,9 @@ from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
 from spackle.files import digest_of
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
+from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
-from spackle.scene import ResidualChoice
 from spackle.training.features import load_features
 
 BASE = BaseSettings("sharp")
@@ -157,7 +157,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)
-    network, direct, features, inpainter = ResidualChoice(options.residual).load(), None, None, None
+    network, direct, features, inpainter = FillOptions(options.residual).load(), None, None, None
     if "inpaint2d" in options.methods:
         inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
     if options.direct_ft is not None:
@@ -194,7 +194,7 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
 
 
 def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case]) -> dict[str, Any]:
-    base, file = options.base, ResidualChoice(options.residual).file
+    base, file = options.base, FillOptions(options.residual).file
     residual = {
         "weights": "seeds" if file is None else "shipped" if options.residual is None else "given",
         "sha256": None if file is None else weights_digest(file),

@@ -11,26 +11,25 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import spackle
-from spackle.app.clip import check_clip_options, predict_clip
-from spackle.app.complete import PhotoCompleter
-from spackle.app.first_use import compiled_ahead
-from spackle.app.predict import (
+from spackle.bases.open import BaseError
+from spackle.cli.clip import clip_options, predict_clip
+from spackle.cli.first_use import compiled_ahead
+from spackle.cli.photo import (
     REPORT,
     PredictOptions,
     earlier_report,
-    open_completer,
-    predict_one,
+    predict_photo,
     request_of,
     shared_digest,
     shared_files,
 )
-from spackle.bases.open import BaseError
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.downloads import weights_digest
 from spackle.errors import InputError
 from spackle.files import as_recorded, check_file, check_mark, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
+from spackle.pipeline import Pipeline
 from spackle.progress import Notes, Reporter
 from spackle.signals import asked_to_stop
 from spackle.workers import Workers, at_work, cluster, threads_of_torch
@@ -53,24 +52,19 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     found = find_photos(photos)
     workers = workers_for(options, len(found))
     if is_clip(photos):
-        check_clip_options(options.base, options.path, options.residual, options.render)
-        for option, value in (("--workers", options.workers if options.workers > 1 else None), ("--ray", options.ray)):
-            if value is not None:
-                raise InputError(f"{option} {value}: not for a clip: each frame needs the one before; leave it out")
-        if options.residual.wanted == "auto":  # and no inpainter is opened
-            options = dataclasses.replace(options, residual=dataclasses.replace(options.residual, wanted="network"))
-    completer = open_completer(options)
+        pipeline = Pipeline.open(clip_options(options))
+        check_file(photos, "clip")
+        with results_folder(output), compiled_ahead(pipeline.renderer, reporter.log):
+            predict_clip(photos, output / found[0].name, pipeline, options.lens, reporter)
+        return 0
+    pipeline = options.open()
     if not os.path.isdir(photos):
         check_file(photos, "photo")
-    if is_clip(photos):
-        with results_folder(output), compiled_ahead(completer.renderer, reporter.log):
-            predict_clip(photos, output / found[0].name, completer, options.lens, reporter)
-        return 0
-    predictor = Predictor(photos, output, options, shared_digest(options, completer.base), completer)
+    predictor = Predictor(photos, output, options, shared_digest(options, pipeline), pipeline)
     with (
         cluster(workers) as ray,
         results_folder(output, alone=os.path.isdir(photos) or ray is not None),
-        compiled_ahead(completer.renderer, reporter.log),
+        compiled_ahead(pipeline.renderer, reporter.log),
     ):
         left = predictor.left(found, reporter)
         if workers.count == 1 and ray is None:
@@ -88,7 +82,7 @@ def workers_for(options: PredictOptions, photos: int) -> Workers:
     Workers(options.workers, 1 if options.threads is None else options.threads).check()
     count = min(options.workers, photos)
     share = max(1, thread_count() // count) if options.ray is None else THREADS_ON_RAY
-    return Workers(count, options.threads or share, options.ray, gpu=options.base.device != "cpu")
+    return Workers(count, options.threads or share, options.ray, gpu=options.scene.base.device != "cpu")
 
 
 def _predict_by_workers(
@@ -139,7 +133,7 @@ class Predictor:
     output: Path
     options: PredictOptions
     shared: str  # by `shared_digest`, of the main process
-    completer: PhotoCompleter
+    pipeline: Pipeline
     verbose: bool = False
 
     @staticmethod
@@ -149,18 +143,18 @@ class Predictor:
         """For a worker; InputError for another folder than the one that was given the mark `word`."""
         if word is not None:
             check_mark(output, word)
-        return Predictor(photos, output, options, shared, open_completer(options), verbose)
+        return Predictor(photos, output, options, shared, options.open(), verbose)
 
     @property
     def setup(self) -> dict[str, str]:
         """Version, and digests of the files that all photos share."""
-        files = {**shared_files(self.options), **self.options.base.files}
+        files = {**shared_files(self.options.scene), **self.options.scene.base.files}
         return {"spackle": spackle.__version__, **{kind: weights_digest(file) for kind, file in files.items()}}
 
     def inputs(self, photo: NamedPhoto) -> str:
         """As `request_of`, also where a file is missing."""
         try:
-            return request_of(photo.path, self.options.base.depth, self.shared)
+            return request_of(photo.path, self.options.scene.base.depth, self.shared)
         except InputError:  # `predict` names it
             return "none"
 
@@ -189,8 +183,8 @@ class Predictor:
         """Whether a photo's results could be made; logs why not. InputError if that holds for all photos."""
         folder = self.output / photo.name
         try:
-            request = request_of(photo.path, self.options.base.depth, self.shared)
-            predict_one(photo.path, folder, self.options, self.completer, reporter, request)
+            request = request_of(photo.path, self.options.scene.base.depth, self.shared)
+            predict_photo(photo.path, folder, self.options, self.pipeline, reporter, request)
         except InputError as error:
             if photo.path == self.photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
                 raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,24 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 from torch import Tensor
 
-from spackle.app.first_use import compiled_ahead
-from spackle.bases.lift import lift
+from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, extremes
+from spackle.cli.first_use import compiled_ahead
+from spackle.cli.photo import save_views
 from spackle.evaluation.metrics import sharpness
 from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
 from spackle.files import results_folder, write_json
-from spackle.formats import save_ply, save_png, save_video
+from spackle.formats import save_ply, save_png
+from spackle.image import Photo
+from spackle.pipeline import Options, Pipeline, complete
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.residual.network import shipped_network
-from spackle.scene import Scene, complete, scene_path
+from spackle.scene import Scene
 from spackle.training.losses import hole_psnr
+from spackle.views import PathOptions
 
 FILES = ("base.ply", "scene.ply", "video.mp4", "comparison.png", "right_view.png", "right_photo.png", "report.json")
 DISPARITY = 0.3
@@ -39,42 +42,30 @@ def run_demo(output: Path, reporter: Reporter) -> dict[str, Any]:
 
     InputError where scikit-image is missing, or `output` cannot be written to.
     """
-    pair, renderer = load_motorcycle(), get_renderer()
+    pair, renderer, network = load_motorcycle(), get_renderer(), shipped_network()
+    options = Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY))
+    pipeline = Pipeline(options, open_base(options.base), network, renderer)
     with results_folder(output, FILES, alone=True), compiled_ahead(renderer, reporter.log):
         start = time.perf_counter()
-        with reporter.stage("base"):
-            prediction = lift(pair.left, pair.depth, pair.left_camera)
-        missing = float(prediction.notes["depth_filled"])
-        reporter.log(
-            f"Motorcycle: {len(prediction.gaussians):,} Gaussians, {missing:.1%} of the depth was missing and filled"
-        )
-        base, camera = prediction.gaussians, prediction.camera
-        cameras = scene_path(base, camera, "rotate-forward", DISPARITY)
-        sides = extremes(camera.even(), DISPARITY, DepthRange.of(base))
-        with reporter.stage("complete") as step:
-            seen: dict[int, Tensor] = {}
-            scene = complete(prediction, [*cameras, *sides], renderer=renderer, progress=step, seen=seen)
+        photo = Photo(pair.left, pair.left_camera.focal[0], "calibration", Path("Motorcycle"))
+        done = pipeline.complete(photo, reporter)
+        scene, views = done.scene, done.views
         with reporter.stage("write"):
             save_ply(scene.base, output / "base.ply", camera=scene.camera, base_count=len(scene.base))
-            scene.save(output / "scene.ply", disparity=DISPARITY)
+            scene.save(output / "scene.ply")
         with reporter.stage("video") as step:
-
-            def frames() -> Iterator[Tensor]:
-                for index, camera in enumerate(cameras):
-                    yield seen[index] if index in seen else scene.render(camera, renderer).rgb
-                    step(index + 1, len(cameras))
-
-            save_video(frames(), output / "video.mp4")
+            save_views(done, output / "video.mp4", renderer, step)
+        sides = [views.cameras[index] for index in views.measured.values()]
         holes = _compare_sides(scene, sides, pair, renderer, output / "comparison.png")
         with reporter.stage("truth"):
-            scores = _compare_truth(prediction, pair, renderer, output)
+            scores = _compare_truth(done.prediction, pair, renderer, output)
         report: dict[str, Any] = {
             "disparity": DISPARITY,
             "base_gaussians": len(scene.base),
             "aux_gaussians": len(scene.aux),
             "hole_area_ratio": holes,
             "right_camera": scores,
-            "residual": {"weights": "seeds" if shipped_network() is None else "shipped"},
+            "residual": {"weights": options.fill.weights},
             "seconds": {**reporter.seconds, "total": round(time.perf_counter() - start, 3)},
         }
         write_json(report, output / "report.json")

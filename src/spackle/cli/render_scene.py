@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spackle.app.video import FrameMaker, PathOptions, cover, video_problem
 from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
@@ -26,6 +25,7 @@ from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.scene import DEFAULT_SIZE
+from spackle.views import FrameMaker, PathOptions, cover, video_problem
 
 TOLERATED = 0.01  # holes of a frame that nobody need be told of
 

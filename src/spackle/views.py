@@ -1,4 +1,4 @@
-"""The cameras and the video that `predict` and `render` are asked for, and how a view becomes a frame."""
+"""The views of a scene: the camera path that is asked for, the video along it, the views whose holes are filled."""
 
 from __future__ import annotations
 
@@ -12,25 +12,51 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import USUAL_DISPARITY
+from spackle.bases.protocol import USUAL_DISPARITY, BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import MAX_DISPARITY, DepthRange, KeyframePath, PathError, TrajectoryKind
+from spackle.camera_path import (
+    MAX_DISPARITY,
+    DepthRange,
+    KeyframePath,
+    PathError,
+    TrajectoryKind,
+    extremes,
+    trajectory,
+)
 from spackle.color import DepthColors
 from spackle.errors import InputError
 from spackle.formats import load_cameras, load_path
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
-from spackle.scene import PATH_FRAMES, scene_path
 from spackle.stereo import Stereo, StereoLayout, default_ipd
 
 VideoFormat = Literal["mp4", "webm", "gif", "webp"]
 Show = Literal["color", "depth"]
 MAX_VIDEO_SIDE = 8192
-MAX_FRAMES = 10_000
+PATH_FRAMES, MAX_FRAMES = 60, 10_000  # of a path: as usual, and at most
+MEASURED_KEYFRAMES = 16  # keyframes at most whose holes are reported
 MAX_IPD = 1e6
 DEFAULT_FPS = 30
 COVERED = 0.5  # less opaque pixels have no depth that a person would call one
+
+
+def scene_path(
+    base: Gaussians,
+    camera: Camera,
+    kind: TrajectoryKind,
+    disparity: float,
+    frames: int = PATH_FRAMES,
+    looped: bool = False,
+) -> list[Camera]:
+    """Cameras around the photo's eye at the photo's size, both sides made even.
+
+    Every path but `swipe` ends where it began. `looped` leaves out that last camera: a video that starts again would
+    show the view twice in a row.
+    """
+    once = looped and kind != "swipe"
+    path = trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames + once)
+    return path[:frames]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,8 +147,8 @@ class PathOptions:
         views = None if self.cameras is None else load_cameras(self.cameras)
         return views, None if self.path is None else load_path(self.path)
 
-    def far(self, default: float) -> float:
-        """How far the camera goes: as a person says, or by default."""
+    def reach(self, default: float) -> float:
+        """The disparity of the path: the one that is given, or the default."""
         return default if self.disparity is None else self.disparity
 
     def fly(
@@ -130,12 +156,19 @@ class PathOptions:
     ) -> list[Camera]:
         """The cameras of a video: through keyframes or along the trajectory, at the photo's size made even.
 
-        `disparity` is for options without one. PathError where the keyframes lead nowhere, ValueError for a
-        path that this scene does not allow.
+        Args:
+            gaussians: the scene, whose depths set how far the path goes.
+            camera: the photo's.
+            keyframes: those of --path.
+            disparity: for options without one.
+
+        Raises:
+            PathError: the keyframes lead nowhere.
+            ValueError: this scene allows no such path.
         """
         if keyframes is None:
             looped, count = self.video.plays != 1, self.frames or PATH_FRAMES
-            return scene_path(gaussians, camera, self.trajectory, self.far(disparity), count, looped)
+            return scene_path(gaussians, camera, self.trajectory, self.reach(disparity), count, looped)
         count = self.frames or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
@@ -255,3 +288,61 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (1 <= width <= MAX_VIDEO_SIDE and 1 <= height <= MAX_VIDEO_SIDE):
         raise InputError(f"--size {text}: give width and height up to {MAX_VIDEO_SIDE}, such as 1280x720")
     return width, height
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedViews:
+    """The views whose holes are filled, and the frames that are made of them."""
+
+    cameras: list[Camera]
+    measured: dict[str, int]  # name → index: views whose holes are reported
+    frames: list[tuple[int, ...]]  # of the video: each a view, or the left eye's and the right eye's
+    stills: int  # this many views, the first ones, are also saved as pictures
+    maker: FrameMaker
+
+    @staticmethod
+    def of(path: list[Camera], others: dict[str, Camera], maker: FrameMaker, stills: bool) -> PlannedViews:
+        """The views of a path through the eyes of its frames, and other views by their names."""
+        middles = path if stills and maker.stereo else []  # the pictures show what is between the eyes
+        eyes = [maker.eyes(camera) for camera in path]
+        cameras = [*middles, *(eye for pair in eyes for eye in pair), *others.values()]
+        first, each = len(middles), len(eyes[0])
+        frames = [tuple(range(first + k * each, first + (k + 1) * each)) for k in range(len(path))]
+        last = len(cameras) - len(others)
+        measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(path))}
+        return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker)
+
+
+def plan_views(
+    prediction: BasePrediction,
+    path: PathOptions,
+    source: Path,
+    given: list[Camera] | None = None,
+    keyframes: KeyframePath | None = None,
+) -> PlannedViews:
+    """The given views; or a path, and where its holes are measured: at its two extremes, or at its keyframes.
+
+    InputError, naming `source`, the photo, where its depths and focal length allow no such path.
+    """
+    gaussians, camera = prediction.gaussians, prediction.camera
+    if given:
+        return PlannedViews.of(given, {}, FrameMaker.of(path.video, gaussians, given, source), stills=True)
+    try:
+        cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
+        others = _measured(path.reach(prediction.disparity), camera.even(), DepthRange.of(gaussians), keyframes)
+    except PathError as error:
+        raise InputError(f"{path.path}: {error}") from error
+    except ValueError as error:
+        raise InputError(f"{source}: no camera path: {error}: check the depth map and the focal length") from error
+    return PlannedViews.of(cameras, others, FrameMaker.of(path.video, gaussians, cameras, source), stills=False)
+
+
+def _measured(
+    disparity: float, camera: Camera, depths: DepthRange, keyframes: KeyframePath | None
+) -> dict[str, Camera]:
+    """The views whose holes are reported, by their names."""
+    if keyframes is None:
+        return dict(zip((f"{-disparity:g}", f"+{disparity:g}"), extremes(camera, disparity, depths), strict=True))
+    keys = keyframes.key_cameras(camera, depths)
+    step = math.ceil(len(keys) / MEASURED_KEYFRAMES)
+    return {f"keyframe {index}": keys[index] for index in range(0, len(keys), step)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import os
@@ -17,21 +16,21 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from spackle.app.complete import PhotoCompleter
-from spackle.app.export import page_of
-from spackle.app.video import PathOptions
 from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, ROUGH, BaseSettings
+from spackle.cli.export_scene import page_of
 from spackle.downloads import installed
 from spackle.errors import InputError, check_name
 from spackle.files import check_file
 from spackle.image import Photo, load_photo
+from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, Step
-from spackle.scene import ResidualChoice, Scene
+from spackle.scene import Scene
 from spackle.signals import asked_to_stop
 from spackle.viewer import PageScene, page_files
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell
+from spackle.views import PathOptions
 
 DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
@@ -56,9 +55,9 @@ class ViewOptions:
     keep_frame: bool = False  # a uniform frame around a photo is part of it
     token: bool = True  # only who knows the address gets in
 
-    def completer(self, base: BaseSettings) -> PhotoCompleter:
-        """Completes photos by a base; InputError for an option that cannot be used."""
-        return PhotoCompleter(base, ResidualChoice(), PathOptions(disparity=self.disparity))
+    def open(self, base: BaseSettings) -> Pipeline:
+        """The way of photos through a base; InputError for an option that cannot be used."""
+        return Pipeline.open(Options(base, PathOptions(disparity=self.disparity)))
 
 
 def is_scene(path: Path) -> bool:
@@ -105,24 +104,24 @@ def _first(
             scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
             page = with_downloads(page_of(scene, target), scene)
         return lambda server: server.show(page)
-    completer = options.completer(options.base)
+    pipeline = options.open(options.base)
     if depth is None:
-        uploads.completer = completer  # it holds the network
+        uploads.pipeline = pipeline  # it holds the network
     with reporter.stage("load"):
         photo = load_photo(target, focal_px=options.focal_px, fov=options.fov, keep_frame=options.keep_frame)
         if depth is not None:
-            completer.base.load(photo)  # what is wrong with a depth map is known before a page opens
+            pipeline.base.load(photo)  # what is wrong with a depth map is known before a page opens
 
     def complete_first(tell: Tell) -> PageScene:
-        return complete_for_page(photo, target.name, completer, Teller(reporter, tell))
+        return complete_for_page(photo, target.name, pipeline, Teller(reporter, tell))
 
     return lambda server: server.work(complete_first)
 
 
-def complete_for_page(photo: Photo, name: str, completer: PhotoCompleter, teller: Teller) -> PageScene:
+def complete_for_page(photo: Photo, name: str, pipeline: Pipeline, teller: Teller) -> PageScene:
     """A loaded photo to what the page shows; the terminal gets errors too."""
     try:
-        done = completer.complete(photo, teller)
+        done = pipeline.complete(photo, teller)
         note = ROUGH if done.choice.base == LiteBase.name else ""
         with teller.stage("page"):
             return with_downloads(done.scene.page(name, note), done.scene)
@@ -154,7 +153,7 @@ class Uploads:
         self._base = dataclasses.replace(base, name=name, depth=None, calib=None)
         self._base.check()
         PathOptions(disparity=options.disparity).check()
-        self.completer: PhotoCompleter | None = None
+        self.pipeline: Pipeline | None = None
 
     @property
     def bases(self) -> list[str]:
@@ -172,16 +171,16 @@ class Uploads:
         teller = Teller(self._reporter, tell, path, name)
         settings = self._chosen(base, depth)
         if settings is not self._base:
-            completer = self._options.completer(settings)
+            pipeline = self._options.open(settings)
         else:
-            completer = self.completer = self.completer or self._options.completer(settings)
+            pipeline = self.pipeline = self.pipeline or self._options.open(settings)
         if disparity:
-            completer = copy.copy(completer)
-            completer.path = PathOptions(disparity=_number(disparity))
-            completer.path.check()
+            chosen = PathOptions(disparity=_number(disparity))
+            chosen.check()
+            pipeline = dataclasses.replace(pipeline, options=dataclasses.replace(pipeline.options, path=chosen))
         with teller.stage("load"):
             photo = load_photo(path, keep_frame=self._options.keep_frame)
-        return complete_for_page(photo, name, completer, teller)
+        return complete_for_page(photo, name, pipeline, teller)
 
     def _chosen(self, base: str, depth: Path | None) -> BaseSettings:
         if depth is not None:

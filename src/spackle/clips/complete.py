@@ -1,0 +1,153 @@
+"""A clip's frames in their order: each one's view completed, with the depth and the colours of the frame before."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, TrajectoryKind, view_at
+from spackle.clips.temporal import (
+    CompletedFrame,
+    DepthAlignment,
+    Flow,
+    FrameMemory,
+    align_depth,
+    flicker,
+    pixel_grid,
+    propagate_colors,
+    sample,
+    track,
+)
+from spackle.device import Precision
+from spackle.gaussians import Gaussians
+from spackle.progress import timed
+from spackle.render import Renderer
+from spackle.render.protocol import Rendering
+from spackle.residual import Completer, ResidualNet, hole_mask
+from spackle.residual.occlusion_guard import OcclusionGuard
+
+FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
+
+
+@dataclasses.dataclass(frozen=True)
+class CompletedView:
+    """The completed view of a frame."""
+
+    camera: Camera
+    gaussians: tuple[Gaussians, Gaussians]  # the base's, and aux
+    view: Rendering  # of all of them
+    before: Rendering  # of the base's
+    alone: Rendering  # completed without the past
+    cut: bool = False  # nothing of the frame before was found again
+    flicker: dict[str, float] = dataclasses.field(default_factory=dict)  # what can be told of FIGURES
+
+    @property
+    def hole(self) -> Tensor:
+        """[H, W] bool: not covered by the base."""
+        return hole_mask(self.before.alpha)
+
+
+# Mean change from the frame before along the motion found, in sRGB of 0..1: of what both frames show, and of holes in
+# both, completed each frame by itself and as drawn.
+FIGURES = ("seen", "alone", "carried")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Past:
+    """What is kept of a frame for the next one."""
+
+    rgb: Tensor  # [H, W, 3] the input
+    inverse_depth: Tensor  # [H, W] as the base said it, 0 where unknown
+    alignment: DepthAlignment
+    depths: DepthRange  # of the path
+    memory: FrameMemory | None = None
+    drawn: CompletedView | None = None
+
+
+@dataclasses.dataclass
+class ClipCompleter:
+    """Takes the frames in their order and completes the view of each; one frame is kept in memory."""
+
+    trajectory: TrajectoryKind
+    disparity: float | None  # as the base has it where None
+    frames: int  # of the clip, and so of the path
+    renderer: Renderer
+    flow: Flow
+    align: bool = True  # align the base's depth with that of the frame before
+    fill: bool = True  # fill holes
+    network: ResidualNet | None = None
+    precision: Precision = "auto"
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # spent on each stage
+    _past: _Past | None = None
+    _count: int = 0
+
+    @torch.no_grad()
+    def add(self, rgb: Tensor, prediction: BasePrediction) -> CompletedView:
+        """The next frame: `rgb` [H, W, 3], sRGB at the size of the prediction's camera, and its prediction.
+
+        ValueError where depths and focal length allow no path.
+        """
+        with timed("depth", self.seconds):
+            base, guard, now, past = self._aligned(rgb, prediction)
+        even = prediction.camera.even()
+        disparity = prediction.disparity if self.disparity is None else self.disparity
+        camera = view_at(self.trajectory, even, disparity, now.depths, self._count, self.frames)
+        with timed("complete", self.seconds):
+            before, aux = self.renderer.render(base, camera), Gaussians.empty()
+            alone = before
+            if self.fill:
+                parts = (base, prediction.camera, self.renderer, self.network)
+                # Texture is found anew in each frame: it would flicker.
+                completer = Completer(*parts, texture=None, precision=self.precision)
+                aux, alone = completer.completed_view(camera, [guard], rendering=before)
+        drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
+        if self.fill:
+            with timed("carry", self.seconds):
+                memory_before = None if past is None else past.memory
+                frame = propagate_colors(base, aux, camera, self.renderer, (before, alone), memory_before, self.flow)
+                drawn, memory = _carried(drawn, frame, past), frame.memory
+        self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
+        self._count += 1
+        return drawn
+
+    def _aligned(
+        self, rgb: Tensor, prediction: BasePrediction
+    ) -> tuple[Gaussians, OcclusionGuard, _Past, _Past | None]:
+        """The base with its depth aligned to the past, the frame's occlusion guard, what to keep, the shot's past."""
+        seen = self.renderer.render(prediction.gaussians, prediction.camera)
+        known = ~hole_mask(seen.alpha) & (seen.depth > 0)
+        inverse_depth = torch.where(known, 1 / seen.depth.clamp_min(1e-6), 0.0)
+        past, alignment = self._past, DepthAlignment()
+        if past is not None:
+            found = track(rgb, past.rgb, self.flow)
+            if not found.same_shot():
+                past = None
+            elif self.align:
+                alignment = past.alignment.after(align_depth(inverse_depth, past.inverse_depth, found)).leaked()
+        base = alignment.of_gaussians(prediction.gaussians)
+        guard = OcclusionGuard.of(dataclasses.replace(seen, depth=alignment.of_depth(seen.depth)), prediction.camera)
+        depths = DepthRange.of(base)
+        if past is not None:
+            depths = past.depths.towards(depths, FOLLOW)
+        return base, guard, _Past(rgb, inverse_depth, alignment, depths), past
+
+
+def _carried(drawn: CompletedView, frame: CompletedFrame, past: _Past | None) -> CompletedView:
+    """What was drawn, with the colours of the past."""
+    drawn = dataclasses.replace(drawn, gaussians=(drawn.gaussians[0], frame.aux), view=frame.view)
+    if past is None or past.drawn is None or frame.flow is None:
+        return drawn
+    earlier, hole = past.drawn, drawn.hole
+    was = sample(earlier.hole[..., None].float(), pixel_grid(frame.flow) + frame.flow)[..., 0]
+    both, neither = hole & (was > 0.999), ~hole & (was < 0.001)
+    pairs = {
+        "seen": (drawn.view, earlier.view, neither),
+        "alone": (drawn.alone, earlier.alone, both),
+        "carried": (drawn.view, earlier.view, both),
+    }
+    figures = {name: flicker(one.rgb, other.rgb, frame.flow, chosen) for name, (one, other, chosen) in pairs.items()}
+    return dataclasses.replace(drawn, flicker={name: value for name, value in figures.items() if value is not None})

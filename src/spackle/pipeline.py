@@ -1,0 +1,346 @@
+"""The way from a photo to a completed scene: base, camera path, fill. Read `complete_photo` and `Pipeline.complete`.
+
+The command line, Python, the page, datasets and ComfyUI go this way or take its stages: `Pipeline.predict`,
+`spackle.views.plan_views`, `complete`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor
+
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.open import BaseSettings, Choice, OpenedBase, open_base, open_loaded
+from spackle.bases.protocol import Base, BasePrediction
+from spackle.camera import Camera
+from spackle.camera_path import KeyframePath, TrajectoryKind
+from spackle.device import Precision
+from spackle.downloads import installed
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, load_photo
+from spackle.inpaint import InpainterOptions, get_inpainter
+from spackle.progress import Reporter, Step, progress_line
+from spackle.render import Renderer, get_renderer
+from spackle.residual import Completer, ResidualNet
+from spackle.residual.network import SHIPPED, load_residual, shipped_network
+from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
+from spackle.scene import Scene
+from spackle.views import PathOptions, PlannedViews, plan_views
+
+LOG = logging.getLogger("spackle")
+Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
+Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # of the texture in holes
+Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one for each
+
+
+@dataclasses.dataclass(frozen=True)
+class FillOptions:
+    """What fills the holes."""
+
+    residual: str | None = None  # a file of weights, "seeds", "none", or None for the shipped weights if there are any
+    fill: Fill = "auto"
+    mode: Mode = "scene"
+
+    @property
+    def texture(self) -> Fill:
+        """Where the texture comes from, "auto" resolved; "none": holes stay open, also where `residual` is "none".
+
+        In view mode "auto" takes the exemplar: to inpaint each view would take seconds a view.
+        """
+        if self.residual == "none":
+            return "none"
+        return "exemplar" if self.mode == "view" and self.fill == "auto" else resolved(self.fill)
+
+    @property
+    def weights(self) -> str:
+        """For reports: "shipped", a file, "seeds" or "none"."""
+        return "none" if self.texture == "none" else self.residual or ("shipped" if SHIPPED.is_file() else "seeds")
+
+    @property
+    def file(self) -> Path | None:
+        """Where the weights lie; None without a network."""
+        named = {"shipped": SHIPPED, "seeds": None, "none": None}
+        return named[self.weights] if self.weights in named else Path(self.weights)
+
+    def load(self) -> ResidualNet | None:
+        """The network, if any; InputError for a file that cannot be used."""
+        return None if self.file is None else load_residual(self.file)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a photo becomes: its base, the camera path that it is completed for, what fills the holes."""
+
+    base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
+    path: PathOptions = dataclasses.field(default_factory=PathOptions)
+    fill: FillOptions = dataclasses.field(default_factory=FillOptions)
+
+
+@dataclasses.dataclass(frozen=True)
+class CompletedPhoto:
+    """A photo's scene, and what it was made of."""
+
+    photo: Photo  # at its full size
+    prediction: BasePrediction
+    choice: Choice
+    views: PlannedViews
+    scene: Scene  # its disparity is None for given views and keyframes
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of views that completion has drawn as they are, by index
+    saved_view: str | None = None  # in view mode: the view that `scene.aux` belongs to
+
+
+def complete_photo(photo: Photo, options: Options = Options(), reporter: Reporter | None = None) -> CompletedPhoto:
+    """A photo to its completed scene; for many photos keep a `Pipeline`, which loads networks once.
+
+    Raises:
+        InputError: an option, the photo, or its depth map cannot be used.
+    """
+    return Pipeline.open(options).complete(photo, reporter or LogReporter())
+
+
+@dataclasses.dataclass(frozen=True)
+class Pipeline:
+    """A base, a residual network and a renderer, opened once for many photos."""
+
+    options: Options
+    base: OpenedBase
+    network: ResidualNet | None
+    renderer: Renderer
+    given_views: list[Camera] | None = None  # those of --cameras, in place of a path
+    keyframes: KeyframePath | None = None  # those of --path
+
+    @staticmethod
+    def open(options: Options) -> Pipeline:
+        """Check the options and open what they name; InputError for an option that no photo can use."""
+        options.base.check()
+        options.path.check()
+        network = options.fill.load()
+        open_texture(options.fill.texture)  # fails before long work
+        given_views, keyframes = options.path.load()
+        renderer = get_renderer(options.base.device)
+        return Pipeline(options, open_base(options.base), network, renderer, given_views, keyframes)
+
+    def complete(self, photo: Photo, reporter: Reporter) -> CompletedPhoto:
+        """A photo at its full size to its completed scene; InputError for a photo or depth map that cannot be used."""
+        prediction, choice = self.predict(photo, reporter)
+        views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
+        with reporter.stage("complete") as step:
+            scene, pictures = self._fill(prediction, views, step)
+        if not scene.aux.finite:
+            source = self.options.path.cameras or photo.path
+            raise InputError(f"{source}: views too extreme to complete: check their K")
+        scene = dataclasses.replace(scene, disparity=self._disparity(prediction))
+        done = CompletedPhoto(photo, prediction, choice, views, scene, pictures)
+        return done if scene.by_view is None else _with_farthest_view(done)
+
+    def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, Choice]:
+        """The photo's Gaussians, and the base that made them; says which one, the focal length and the disparity."""
+        name = photo.path.name
+        if photo.frame is not None:
+            reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")
+        with reporter.stage("prepare"):
+            base = self.base.load(photo, log=reporter.warn)
+        with reporter.stage("base") as step:
+            prediction, choice = base.predict(step)
+        if choice.note:
+            reporter.log(f"{name}: {choice.note}")
+        disparity = self._disparity(prediction)
+        reporter.log(
+            f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
+            f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
+            + ("" if disparity is None else f", disparity {disparity:g} ({self.disparity_source(choice)})")
+        )
+        if missing := float(prediction.notes.get("depth_filled", 0)):
+            reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
+        if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
+            width, height = prediction.camera.width, prediction.camera.height
+            reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's {width}×{height}")
+        return prediction, choice
+
+    def disparity_source(self, choice: Choice) -> str:
+        """Who says how far the camera goes."""
+        return f"default of {choice.base}" if self.options.path.disparity is None else "--disparity"
+
+    def _disparity(self, prediction: BasePrediction) -> float | None:
+        """How far the camera goes; None where views or keyframes say it."""
+        given = self.given_views is not None or self.keyframes is not None
+        return None if given else self.options.path.reach(prediction.disparity)
+
+    def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, Mapping[int, Tensor]]:
+        seen: dict[int, Tensor] = {}
+        scene = complete(
+            prediction,
+            views.cameras,
+            mode=self.options.fill.mode,
+            exact=self.given_views is not None,
+            network=self.network,
+            fill=self.options.fill.texture,
+            renderer=self.renderer,
+            precision=self.options.base.precision,
+            progress=step,
+            seen=seen if views.maker.plain else None,
+        )
+        return scene, seen
+
+
+def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
+    """In view mode: with the aux Gaussians of the measured view that is farthest from the photo's, for one file."""
+    views, by_view = done.views, done.scene.by_view
+    assert by_view is not None
+    eye = done.prediction.camera.position.double()
+    far = {name: float((views.cameras[k].position.double() - eye).norm()) for name, k in views.measured.items()}
+    name = max(far, key=lambda name: far[name])
+    scene = dataclasses.replace(done.scene, aux=by_view[views.measured[name]])
+    return dataclasses.replace(done, scene=scene, saved_view=name)
+
+
+class LogReporter(Reporter):
+    """Tells the logger "spackle", and draws progress on one line of the standard error if asked to."""
+
+    def __init__(self, progress: bool = False) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def log(self, line: str) -> None:
+        LOG.info(line)
+
+    def warn(self, line: str) -> None:
+        LOG.warning(line)
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[Step]:
+        with progress_line(name, self._progress and name in ("base", "complete")) as step:
+            yield step
+
+
+def predict(
+    photo: str | os.PathLike[str] | Photo,
+    depth: str | os.PathLike[str] | DepthMap | None = None,
+    *,
+    base: Base | None = None,
+    kind: TrajectoryKind = "rotate-forward",
+    disparity: float | None = None,
+    network: ResidualNet | Shipped | None = "shipped",
+    fill: Fill = "auto",
+    renderer: Renderer | None = None,
+    keep_frame: bool = False,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
+    progress: bool = False,
+) -> Scene:
+    """A photo to a scene without holes along a camera path.
+
+    Args:
+        photo: a file, or a loaded photo.
+        depth: of the photo, a file or a loaded depth map.
+        base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`. Without it and without depth the
+            best one on this machine: the depth in the photo's file, else SHARP or Depth Anything where its weights
+            have been downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and
+            warned of what could not be used. A network is then loaded for this photo alone: for many, load a base once.
+        kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as the base has it: 0.15 for
+            lite, else 0.3.
+        network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
+        fill: see `open_texture`; "none" leaves the holes open.
+        renderer: the CPU's where None.
+        keep_frame: keep a uniform frame around a file's picture, which is otherwise cut off.
+        focal_px: focal length of a photo's file in pixels; by default the file's own, see `load_photo`.
+        focal_mm: its 35 mm film equivalent, in its place.
+        fov: horizontal field of view in degrees, in its place.
+        progress: show how far it is, on one line of the standard error.
+
+    Raises:
+        InputError: a photo or a depth map that cannot be used, or a base's name in place of a base.
+        ValueError: depth and base both given, or a lens for a photo that is loaded.
+    """
+    if depth is not None and base is not None:
+        raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
+    if isinstance(base, str):
+        raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
+    if isinstance(photo, Photo):
+        if (focal_px, focal_mm, fov) != (None, None, None):
+            raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
+        loaded = photo
+    else:
+        loaded = load_photo(photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame)
+    source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
+    options = Options(BaseSettings(depth=source), PathOptions(kind, disparity), FillOptions(fill=fill))
+    opened = open_base(options.base) if base is None else open_loaded(base)
+    chosen = shipped_network() if network == "shipped" else network
+    pipeline = Pipeline(options, opened, chosen, renderer or get_renderer())
+    return pipeline.complete(loaded, LogReporter(progress)).scene
+
+
+def complete(
+    prediction: BasePrediction,
+    cameras: Sequence[Camera],
+    *,
+    mode: Mode = "scene",
+    exact: bool = False,
+    network: ResidualNet | Shipped | None = "shipped",
+    fill: Fill = "auto",
+    renderer: Renderer | None = None,
+    precision: Precision = "auto",
+    progress: Callable[[int, int], None] | None = None,
+    seen: dict[int, Tensor] | None = None,
+) -> Scene:
+    """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `Completer.complete_scene`.
+
+    Args:
+        prediction: of a base.
+        cameras: the views.
+        mode: "view" fills each view by itself, and leaves `Scene.aux` empty.
+        exact: the views are these and no others between them; for scene mode.
+        network: see `predict`.
+        fill: see `predict`.
+        renderer: the CPU's where None.
+        precision: of the network.
+        progress: called with views done and their number.
+        seen: in scene mode gets pictures of some views, for which they need not be drawn again; see `complete_scene`.
+    """
+    base, camera = prediction.gaussians, prediction.camera
+    if fill == "none":
+        return Scene(base, Gaussians.empty(), camera)
+    chosen = shipped_network() if network == "shipped" else network
+    completer = Completer(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
+    if mode == "scene":
+        return Scene(base, completer.complete_scene(cameras, exact, progress, seen), camera)
+    guards, by_view = [completer.photo_guard()], []
+    for index, view in enumerate(cameras):
+        by_view.append(completer.complete_view(view, guards))
+        if progress:
+            progress(index + 1, len(cameras))
+    return Scene(base, Gaussians.empty(), camera, tuple(by_view))
+
+
+def resolved(fill: Fill) -> Fill:
+    """What "auto" means: "lama" where its weights have been downloaded, else "exemplar"."""
+    if fill != "auto":
+        return fill
+    with contextlib.suppress(InputError):  # a machine without a home folder
+        return "lama" if installed("lama") else "exemplar"
+    return "exemplar"
+
+
+def open_texture(fill: Fill) -> Texture | None:
+    """What gives the fill its texture: "lama" paints the widest views, "exemplar" takes it from the view itself.
+
+    "auto" is one of both, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
+    """
+    chosen = resolved(fill)
+    return _lama() if chosen == "lama" else EXEMPLAR if chosen == "exemplar" else None
+
+
+@functools.cache
+def _lama() -> Texture:
+    return PaintedTexture(get_inpainter("lama", InpainterOptions()))
