@@ -6,7 +6,6 @@ import contextlib
 import errno
 import hmac
 import io
-import json
 import os
 import re
 import socket
@@ -32,22 +31,15 @@ from spackle.viewer.guard import (
     own_names,
     refusal,
 )
-from spackle.viewer.page import PageScene
+from spackle.viewer.page import PageScene, as_json
 from spackle.viewer.work import Channel, Worker
 
 JSON = "application/json; charset=utf-8"
 Body = tuple[str, bytes]  # content type, bytes
+Content = bytes | Callable[[], bytes]  # or what makes them
 EVENTS = re.compile(r"/jobs/([1-9][0-9]{0,8})/events")
 FULL = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 DRAINED = 1 << 26  # bytes of a refused upload that are read, so that the client gets to read why
-
-
-def as_json(value: object) -> bytes:
-    """JSON in plain ASCII that means nothing to a reader of HTML, whatever names there are in it."""
-    text = json.dumps(value, allow_nan=False)
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text.encode("ascii")
 
 
 class Routes:
@@ -55,17 +47,16 @@ class Routes:
 
     def __init__(self, pages: Mapping[str, Body], limits: Limits, bases: Sequence[str]) -> None:
         self._lock = threading.Lock()
-        self._bodies: dict[str, Body] = dict(pages)
+        self._bodies: dict[str, tuple[str, Content]] = dict(pages)
         self._scenes: list[str] = []
         self._count = 0
         self._limits, self._bases = limits, list(bases)
-        self._downloads: dict[str, Callable[[], bytes]] = {}
 
     def get(self, path: str) -> Body | None:
         """Content type and bytes; None for an unknown path."""
         with self._lock:
-            body, make = self._bodies.get(path), self._downloads.get(path)
-        return ("application/octet-stream", make()) if make else body
+            kind, body = self._bodies.get(path, ("", b""))
+        return (kind, body if isinstance(body, bytes) else body()) if kind else None
 
     def add(self, scene: PageScene) -> str:
         """A scene becomes the one that is shown; the path of its description."""
@@ -73,17 +64,16 @@ class Routes:
             self._count += 1
             root = f"/scenes/{self._count}"
             downloads = {suffix: f"{root}/scene{suffix}" for suffix in scene.downloads}
-            self._downloads |= {place: scene.downloads[suffix] for suffix, place in downloads.items()}
             description = as_json(scene.description | ({"downloads": downloads} if downloads else {}))
             self._bodies[f"{root}.json"] = (JSON, description)
-            for name, content in scene.files.items():
+            made: dict[str, Content] = {f"scene{suffix}": make for suffix, make in scene.downloads.items()}
+            for name, content in (made | scene.files).items():
                 self._bodies[f"{root}/{name}"] = ("application/octet-stream", content)
             self._scenes.append(root)
             while len(self._scenes) > self._limits.kept_scenes:
                 old = self._scenes.pop(0)
                 for path in [path for path in self._bodies if path.startswith((f"{old}/", f"{old}.json"))]:
                     del self._bodies[path]
-                self._downloads = {p: make for p, make in self._downloads.items() if not p.startswith(f"{old}/")}
             return f"{root}.json"
 
     def state(self, worker: Worker) -> bytes:

@@ -20,6 +20,7 @@ from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
+from spackle.formats.columns import smallest_three
 from spackle.gaussians import Gaussians
 
 SAMPLES = 121  # of a path, between which the page goes straight
@@ -41,9 +42,7 @@ class PageScene:
 
     description: dict[str, object]  # what becomes JSON
     files: dict[str, bytes]  # the layers, by the names that the description gives them
-    downloads: Mapping[str, Callable[[], bytes]] = dataclasses.field(
-        default_factory=dict
-    )  # what a server makes: ".ply"
+    downloads: Mapping[str, Callable[[], bytes]] = dataclasses.field(default_factory=dict)  # ".ply" → what makes it
 
 
 def page_scene(
@@ -118,7 +117,8 @@ def encode_layer(gaussians: Gaussians) -> tuple[bytes, float, float]:
         planes[0:9, part] = bits.reshape(3, -1, 4)[:, :, 1:].transpose(0, 2, 1).reshape(9, -1)
         logs = scales[part].clamp(SMALLEST_SCALE, LARGEST_SCALE).log()
         planes[9:12, part] = _bytes((logs - low) / step)
-        planes[12:16, part] = _rotations(quats[part])
+        planes[12, part], others = smallest_three(torch.nn.functional.normalize(quats[part], dim=-1).numpy())
+        planes[13:16, part] = _bytes(torch.from_numpy(others) * (127 * math.sqrt(2)) + 128)
         planes[16:19, part] = _bytes(linear_to_srgb(colors[part]) * 255)
         planes[19, part] = _bytes(opacities[part, None] * 255)
     return planes.tobytes(), low, step
@@ -136,14 +136,12 @@ def _bytes(values: Tensor) -> NDArray[np.uint8]:
     return values.round().clamp(0, 255).to(torch.uint8).T.numpy()
 
 
-def _rotations(quats: Tensor) -> NDArray[np.uint8]:
-    """[4, rows]: which part is the largest, and the other three in their order."""
-    quats = torch.nn.functional.normalize(quats, dim=-1)
-    largest = quats.abs().argmax(dim=-1, keepdim=True)
-    quats = quats * torch.where(quats.gather(-1, largest) < 0, -1.0, 1.0)
-    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
-    small = quats.gather(-1, others) * (127 * math.sqrt(2)) + 128
-    return np.concatenate([largest.to(torch.uint8).T.numpy(), _bytes(small)])
+def as_json(value: object) -> bytes:
+    """JSON in plain ASCII that means nothing to a reader of HTML, whatever names there are in it."""
+    text = json.dumps(value, allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text.encode("ascii")
 
 
 def page_files() -> dict[str, tuple[str, bytes]]:
@@ -156,8 +154,7 @@ def single_html(scene: PageScene) -> bytes:
     """The page with a scene in it, which opens from a disk or a mail; nothing is ever fetched."""
     page, css, js = (_read(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
     held = {name: base64.b64encode(_gzipped(data)).decode() for name, data in scene.files.items()}
-    data = json.dumps({"description": scene.description, "files": held}, ensure_ascii=True, separators=(",", ":"))
-    data = data.replace("<", "\\u003c")  # nothing in a name may end the element
+    data = as_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
     policy = (  # only these scripts and styles run, and the page fetches nothing
