@@ -43,7 +43,7 @@ from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
 from spackle.residual import Completer, hole_area_ratio
 from spackle.residual.network import ResidualNet, shipped_network
 from spackle.training.losses import total_loss
-from spackle.training.residual_method import complete_samples
+from spackle.training.residual import complete_samples
 from spackle.training.sample import Sample
 
 REPOSITORY = Path(__file__).parents[1]

@@ -11,12 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import nn
 
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
-from spackle.training.method import Method
-from spackle.training.recipe import Recipe
-from spackle.training.trainer import Callbacks, Trainer
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,27 +49,13 @@ def started(arguments: Sequence[str], code: str, **environment: str) -> subproce
 
 
 def killed_at(number: int) -> str:
-    """What kills a run before a step, counted from 0; for `started`."""
+    """What kills a run in a step, counted from 0, before its weights change; for `started`."""
     return f"""
 import os
-from spackle.training.trainer import Trainer
-step = Trainer.step
-Trainer.step = lambda self, number: os.kill(os.getpid(), 9) if number == {number} else step(self, number)
+from spackle.training import train
+rate = train.learning_rate
+train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
 """
-
-
-def trained(recipe: Recipe, method: Method, network: nn.Module, folder: Path) -> tuple[Trainer, list[float]]:
-    """Train in this process; returns the trainer and the loss of each step."""
-    losses: list[float] = []
-    callbacks = Callbacks(
-        step=lambda step, numbers: losses.append(numbers["loss"]),
-        validated=lambda progress, sheet: None,
-        saved=lambda progress: None,
-        stop=lambda: False,
-    )
-    trainer = Trainer(recipe, method, network, torch.device("cpu"), folder, callbacks)
-    assert trainer.run() == "steps"
-    return trainer, losses
 
 
 def run_two(arguments: Sequence[str], code: str = "") -> None:

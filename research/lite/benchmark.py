@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from depth_loss import DepthScore, score_depth, vertical_ramp
 from frames import JUDGED_SIDE, Frame, Measured, of_camera, of_scenes, reduced
-from method import colored, ends, sheet
 from standing import StandingScore, labelled_scene, score_standing
 from synthetic_scenes import PhotoDraw
+from task import colored, ends
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -34,6 +34,7 @@ from spackle.formats import save_png
 from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.training.data import find_files
 from spackle.training.recipe import RgbdFolder
+from spackle.training.task import sheet
 
 GUESSES = ("constant", "ramp", "lite")
 STREETS, STREETS_SEED = 40, 202
@@ -51,7 +52,7 @@ def frames_of(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Frame]]
             known = case.depth()
             yield scene.name, [reduced(load_photo(case.photo).rgb, known.depth, known.valid, JUDGED_SIDE)]
     for folder, unit in zip(arguments.rgbd, arguments.unit, strict=True):
-        files: list[Measured] = of_camera(RgbdFolder(folder, 1.0, unit), arguments.last)[1]
+        files: list[Measured] = of_camera(RgbdFolder(folder=folder, focal_px=1.0, unit_m=unit), arguments.last)[1]
         yield folder.name, [file.read(JUDGED_SIDE) for file in files]
 
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.lite import network_size
-from spackle.training.recipe import Share
+from spackle.training.recipe import RecipePart, Share
 
 FARTHEST = 0.02  # of the median inverse depth: what is farther, sky above all, counts as this far
 NEAREST = 20.0
@@ -23,8 +23,7 @@ STEEPEST = 1.0  # likewise of a step between neighbours
 SCALES = (1, 2, 4, 8)  # strides at which steps are compared
 
 
-@dataclasses.dataclass(frozen=True)
-class DepthLossWeights:
+class DepthLossWeights(RecipePart):
     """How much each term counts."""
 
     factor: Share = 1.0

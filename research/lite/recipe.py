@@ -6,10 +6,11 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from depth_loss import DepthLossWeights
 from frames import Group, Measured, of_camera, of_scenes
+from pydantic import Field
 
 from spackle.bases.lite import STAGES, STRIDE, Size
 from spackle.errors import InputError
@@ -17,25 +18,23 @@ from spackle.image import PHOTO_SUFFIXES
 from spackle.training.data import find_files, short_digest
 from spackle.training.recipe import (
     FREE,
+    AnyRecipe,
     Count,
     OptimRecipe,
     Place,
-    Range,
+    RecipePart,
     RgbdFolder,
-    RunRecipe,
+    Seed,
     Share,
-    check_rates,
-    plain,
+    Whole,
 )
 
 RANDOM = Path("random")  # in place of the encoder's file: weights that have seen nothing, for tests and experiments
-WEIGHTS, RUN = DepthLossWeights(), RunRecipe()
-Side = Annotated[int, Range(STRIDE, 2048)]
-Scale = Annotated[float, Range(0.1, 2)]
+Side = Annotated[Whole, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]
+Scale = Annotated[float, Field(ge=0.1, le=2)]
 
 
-@dataclasses.dataclass(frozen=True)
-class LiteShares:
+class LiteShares(RecipePart):
     """How often a picture comes from each source; they need not add up to 1. One without data counts as 0."""
 
     made: Share = 0.4
@@ -44,8 +43,7 @@ class LiteShares:
     guessed: Share = 0.18  # where there is a teacher
 
 
-@dataclasses.dataclass(frozen=True)
-class LiteData:
+class LiteData(RecipePart):
     """Where photos with depth come from."""
 
     photos: Place = None  # a folder, with its subfolders: the surfaces of synthetic scenes are cut from them
@@ -56,47 +54,32 @@ class LiteData:
     guesses: Count = 1500  # of so many photos at most
     shares: LiteShares = LiteShares()
     size: tuple[Side, Side] = (256, 320)  # height and width of what is learned from; a fifth of the steps stand upright
-    scales: tuple[Scale, ...] = (1.0,)  # of that, one drawn for each step: the base looks at photos at several sizes
+    # Of that, one drawn for each step: the base looks at photos at several sizes.
+    scales: Annotated[tuple[Scale, ...], Field(min_length=1)] = (1.0,)
     cache: Place = None  # a folder for synthetic scenes and guesses; inside the output where None
-    seed: Annotated[int, Range(0, 2**31 - 2)] = (
-        0  # of the synthetic scenes alone, so that runs with other seeds learn from the same ones
-    )
-    validation: Annotated[float, Range(0, 0.9)] = (
-        0.2  # share of each folder of `rgbd`, the last frames by name: neighbours look alike
-    )
+    seed: Seed = 0  # of the synthetic scenes alone, so that runs with other seeds learn from the same ones
+    # Share of each folder of `rgbd` that judges, the last frames by name: neighbours look alike.
+    validation: Annotated[float, Field(ge=0, le=0.9)] = 0.2
     validation_stereo: Place = None  # scenes to be judged by; those of `stereo` are learned from, all of them
 
 
-@dataclasses.dataclass(frozen=True)
 class LiteOptim(OptimRecipe):
     """As for the other methods, and what the encoder, which comes with weights of its own, does otherwise."""
 
-    encoder_rate: Annotated[float, Range(0, 10)] = 0.2  # factor on the encoder's learning rate
-    frozen: Annotated[int, Range(0, len(STAGES["lite2"]))] = (
-        2  # the encoder's first stages stay as they are, and its stem with them; 0: all of it learns
-    )
+    encoder_rate: Annotated[float, Field(ge=0, le=10)] = 0.2  # factor on the encoder's learning rate
+    # The encoder's first stages stay as they are, and its stem with them; 0: all of it learns.
+    frozen: Annotated[Whole, Field(ge=0, le=len(STAGES["lite2"]))] = 2
 
 
-@dataclasses.dataclass(frozen=True)
-class LiteRecipe:
+class LiteRecipe(AnyRecipe):
     """All of a training run of the lite base."""
 
     data: LiteData = LiteData()
-    loss: DepthLossWeights = WEIGHTS
+    loss: DepthLossWeights = DepthLossWeights()
     optim: LiteOptim = LiteOptim()
-    run: RunRecipe = RUN
     network: Size = "lite2"  # how large the encoder is: EfficientNet-Lite0's or -Lite2's
     encoder: Path | None = None  # its .pth; None: of the installed package; "random": none
     init: Path | None = None  # weights of the whole network to start from
-
-    def check(self, file: str) -> None:
-        """InputError for values that are possible each, but make no run."""
-        check_rates(self.optim, file)
-        for side in self.data.size:
-            if side % STRIDE:
-                raise InputError(f"{file}: data.size {list(self.data.size)}: both sides must be multiples of {STRIDE}")
-        if not self.data.scales:
-            raise InputError(f"{file}: data.scales is empty: give one number at least, such as [1]")
 
 
 SCENES_VERSION = 5  # goes up whenever the same photos would make other scenes
@@ -173,7 +156,7 @@ class LiteFiles:
     @property
     def digest(self) -> str:
         """Twelve digits of all that is learned from and judged by."""
-        facts: dict[str, Any] = plain(self.data)
+        facts = self.data.model_dump(mode="json")
         for name in ("photos", "stereo", "validation_stereo", "cache", "rgbd", "teacher"):
             facts.pop(name)
         names = [_names(files) for files in (self.stereo, self.rgbd, *(group.files for group in self.groups))]

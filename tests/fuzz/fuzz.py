@@ -1,8 +1,8 @@
 """Feeds damaged files to the readers: `make fuzz N=5000`, or `python tests/fuzz/fuzz.py --replay CASE.json`.
 
 Each case follows from its reader's name and its number alone. A reader may raise `InputError` and nothing else, within
-10 s and 1.5 GB. All run in a child process whose memory the kernel bounds; a case that kills it is followed by another
-child for the cases behind it.
+10 s and 1.5 GB. All run in one child process whose memory the kernel bounds; the parent goes on behind a case that
+kills it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -39,17 +40,6 @@ VALUES: list[Any] = [None, True, 0, -1, 1.5, 1e300, 10**400, "", "../x", "a" * 5
 VALUES += [[], {}, [[]], ["a"], {"a": {}}]
 
 Files = dict[str, bytes]
-Case = tuple[str, int, dict[str, str] | None]  # reader, number, files in base64 where they do not follow from these
-
-
-class Result(NamedTuple):
-    """What a case came to."""
-
-    reader: str
-    number: int
-    problem: str | None
-    size: int  # bytes of memory that it took
-    files: dict[str, str]  # in base64
 
 
 def mutated(files: Files, rng: np.random.Generator) -> Files:
@@ -136,39 +126,42 @@ def _changed(content: Any, rng: np.random.Generator) -> Any:
     return content
 
 
-def child(work: Path, first: int, log: Path) -> None:
-    """Run the cases in a file from one of them on: a line of JSON in `log` before each, and one after it."""
+# The child ----------------------------------------------------------------------------------------
+
+
+def child(names: Sequence[str], first: int, count: int, log: Path) -> None:
+    """Run the cases, with a line of JSON in `log` before and after each."""
     from readers import READERS, contents
 
     warnings.simplefilter("ignore")
-    cases: list[Case] = json.loads(work.read_text())
     with tempfile.TemporaryDirectory() as place, open(log, "a", buffering=1) as out:
-        seeds: dict[str, list[Files]] = {name: [] for name, _, files in cases if files is None}
-        for name, made in seeds.items():  # also loads all that is needed, before memory is bounded
+        seeds: dict[str, list[Files]] = {name: [] for name in names}
+        for name in names:  # also loads all that is needed, before memory is bounded
             for number, make in enumerate(READERS[name].makers):
                 folder = Path(place, f"{name}-{number}")
                 folder.mkdir()
                 make(folder)
-                made.append(contents(folder))
-                _problem(name, made[-1], Path(place, "case"))
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + BYTES
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
-        faulthandler.register(signal.SIGPROF, chain=True)  # a traceback, then the end
-        for name, number, given in cases[first:]:
-            files = {file: base64.b64decode(data) for file, data in given.items()} if given else {}
-            files = files or case_of(name, number, seeds[name])
-            out.write(json.dumps({file: base64.b64encode(data).decode() for file, data in files.items()}) + "\n")
-            out.write(json.dumps(_bounded(name, files, Path(place, "case"))) + "\n")
+                seeds[name].append(contents(folder))
+                _problem(name, seeds[name][-1], Path(place, "case"))
+        _bound_memory()
+        for name in names:
+            began, most = time.perf_counter(), 0
+            for number in range(first, first + count):
+                files = case_of(name, number, seeds[name])
+                plain = {file: base64.b64encode(data).decode() for file, data in files.items()}
+                out.write(json.dumps([name, number, plain]) + "\n")
+                problem, took = _bounded(name, files, Path(place, "case"))
+                most = max(most, took)
+                out.write(json.dumps({"problem": problem}) + "\n")
+            seconds = time.perf_counter() - began
+            out.write(json.dumps({"reader": name, "megabytes": most / 1e6, "seconds": seconds}) + "\n")
 
 
-def case_of(name: str, number: int, seeds: Sequence[Files]) -> Files:
-    """The files of a case."""
-    from readers import sealed
-
-    rng = np.random.default_rng([zlib.crc32(name.encode()), number])
-    files = mutated(seeds[number % len(seeds)], rng)
-    return sealed(files) if rng.random() < 0.8 else files
+def _bound_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    faulthandler.register(signal.SIGPROF, chain=True)  # a traceback, then the end
 
 
 def _bounded(name: str, files: Files, folder: Path) -> tuple[str | None, int]:
@@ -189,6 +182,15 @@ def _memory(name: str) -> int:
     if name == "VmRSS":
         Path("/proc/self/clear_refs").write_text("5")  # sets VmHWM back
     return 1024 * int(found.split()[1])
+
+
+def case_of(name: str, number: int, seeds: Sequence[Files]) -> Files:
+    """The files of a case."""
+    from readers import sealed
+
+    rng = np.random.default_rng([zlib.crc32(name.encode()), number])
+    files = mutated(seeds[number % len(seeds)], rng)
+    return sealed(files) if rng.random() < 0.8 else files
 
 
 def _problem(name: str, files: Files, folder: Path) -> str | None:
@@ -218,30 +220,46 @@ def _problem(name: str, files: Files, folder: Path) -> str | None:
     return None
 
 
-def numbered(names: Sequence[str], count: int, first: int = 0) -> list[Case]:
-    """So many cases of each reader."""
-    return [(name, number, None) for name in names for number in range(first, first + count)]
+# The parent ---------------------------------------------------------------------------------------
 
 
-def tried(cases: Sequence[Case]) -> Iterator[Result]:
-    """Run cases in child processes."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    first = 0
+def fuzz(names: Sequence[str], count: int, first: int = 0) -> Iterator[tuple[str, int, str, dict[str, str]]]:
+    """Run `count` cases of each reader: of each failure its name, the number, what is wrong, and the files (base64)."""
     with tempfile.TemporaryDirectory() as place:
-        work, log = Path(place, "work"), Path(place, "log")
-        work.write_text(json.dumps(cases))
-        while first < len(cases):
+        waiting = [(list(names), first, count)]
+        while waiting:
+            now, start, many = waiting.pop()
+            log = Path(place, "log")
             log.write_bytes(b"")
-            command = [sys.executable, __file__, "--child", str(work), str(first), str(log)]
+            command = [sys.executable, __file__, "--child", json.dumps(now), str(start), str(many), str(log)]
+            environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
             done = subprocess.run(command, env=environment, stderr=subprocess.PIPE, text=True)
             lines = [json.loads(line) for line in log.read_text().splitlines()]
-            if done.returncode and not lines:
+            case: list[Any] = []
+            for line in lines:
+                if isinstance(line, list):
+                    case = line
+                elif "reader" in line:
+                    print(
+                        f"{line['reader']}: {many} cases, {line['seconds']:.1f} s, {line['megabytes']:,.0f} MB at most",
+                        file=sys.stderr,
+                    )
+                elif line["problem"]:
+                    yield case[0], case[1], line["problem"], case[2]
+            if done.returncode and not case:
                 raise RuntimeError(done.stderr)
-            if len(lines) % 2:  # it died in this case
-                lines.append((f"ended the process ({done.returncode}):\n{done.stderr[-2000:]}", 0))
-            for (name, number, _), files, (problem, took) in zip(cases[first:], lines[::2], lines[1::2], strict=False):
-                yield Result(name, number, problem, took, files)
-            first += len(lines) // 2
+            if done.returncode:  # it died in this case
+                name, number, files = case
+                yield name, number, f"ended the process ({done.returncode}):\n{done.stderr[-2000:]}", files
+                later = now[now.index(name) + 1 :]
+                waiting += [(later, start, many)] if later else []
+                waiting += [([name], number + 1, start + many - number - 1)] if number + 1 < start + many else []
+
+
+def replayed(*paths: Path) -> list[str]:
+    """What saved cases do in a process of their own, a line each."""
+    done = subprocess.run([sys.executable, __file__, "--replay", *paths], capture_output=True, text=True)
+    return (done.stdout + done.stderr).splitlines()
 
 
 def main() -> int:
@@ -250,32 +268,38 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--readers", nargs="*", help="only these")
     parser.add_argument("--replay", type=Path, nargs="+", help="cases that were written here before")
-    parser.add_argument("--child", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        work, first, log = given.child
-        child(Path(work), int(first), Path(log))
+        names, first, count, log = given.child
+        child(json.loads(names), int(first), int(count), Path(log))
         return 0
+    if given.replay:
+        import readers  # noqa: F401  # before memory is bounded
+
+        problems = []
+        with tempfile.TemporaryDirectory() as place:
+            _bound_memory()
+            for case in map(json.loads, map(Path.read_text, given.replay)):
+                files = {file: base64.b64decode(data) for file, data in case["files"].items()}
+                problems.append(_bounded(case["reader"], files, Path(place, "case"))[0])
+                print(problems[-1] or "as it should be", flush=True)
+        return any(problems)
     from readers import READERS
 
-    saved: list[Case] = [tuple(json.loads(path.read_text())) for path in given.replay or ()]
-    failed, most = 0, dict[str, int]()
-    for result in tried(saved or numbered(given.readers or list(READERS), given.n, given.first)):
-        most[result.reader] = max(result.size, most.get(result.reader, 0))
-        if result.problem:
-            failed += 1
-            print(f"{save(result)}: {result.problem}\n", file=sys.stderr)
-    for name, size in most.items():
-        print(f"{name}: {size / 1e6:,.0f} MB at most", file=sys.stderr)
+    failed = 0
+    for name, number, problem, files in fuzz(given.readers or list(READERS), given.n, given.first):
+        failed += 1
+        print(f"{save(name, number, files)}: {problem}\n", file=sys.stderr)
     print(f"{failed} failures", file=sys.stderr)
     return bool(failed)
 
 
-def save(result: Result) -> Path:
+def save(name: str, number: int, files: dict[str, str], folder: Path = FAILURES) -> Path:
     """Write a case for --replay."""
-    FAILURES.mkdir(exist_ok=True)
-    path = FAILURES / f"{result.reader}-{result.number}.json"
-    path.write_text(json.dumps((result.reader, result.number, result.files)))
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}-{number}.json"
+    path.write_text(json.dumps({"reader": name, "number": number, "files": files}))
     return path
 
 

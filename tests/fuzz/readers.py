@@ -6,9 +6,7 @@ import dataclasses
 import hashlib
 import io
 import json
-import shutil
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -97,12 +95,20 @@ def _pictures(name: str, mode: str = "RGB", **options: Any) -> Callable[[Path], 
     return lambda folder: Image.fromarray(picture()).convert(mode).save(folder / name, exif=exif, **options)
 
 
+def _grey16(folder: Path) -> None:
+    Image.fromarray((1000 * metres()).astype(np.uint16)).save(folder / "a.png")
+
+
 def _npz(folder: Path) -> None:
     np.save(folder / "a.npy", metres())
     (folder / "a.npy").rename(folder / "a.npz")  # `sealed` packs it
 
 
-def _file(name: str, data: bytes) -> Callable[[Path], object]:
+def _pfm(folder: Path) -> None:
+    (folder / "a.pfm").write_bytes(b"Pf\n64 48\n-1.0\n" + metres()[::-1].tobytes())
+
+
+def _portrait(name: str, data: bytes) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_bytes(data)
 
 
@@ -184,10 +190,14 @@ def _coco(folder: Path) -> None:
 def _dataset(folder: Path) -> None:
     from dataset_builds import build, write_inputs
 
-    with tempfile.TemporaryDirectory() as place:
-        inputs = write_inputs(Path(place, "in"), 2, 36, 32)
-        assert build(inputs, Path(place, "out"), "--views", 2, "--shard-size", 1).code == 0
-        shutil.copytree(Path(place, "out"), folder, dirs_exist_ok=True)
+    place = write_inputs(folder / "in", 2, 36, 32)
+    assert build(place, folder / "out", "--views", 2, "--shard-size", 1).code == 0
+    for path in (folder / "out").iterdir():
+        path.rename(folder / path.name)
+    (folder / "out").rmdir()
+    for path in sorted((folder / "in").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    (folder / "in").rmdir()
 
 
 def _read_dataset(folder: Path) -> None:
@@ -244,21 +254,13 @@ READERS: dict[str, Reader] = {
         ],
         lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
     ),
-    "depth": Reader(
-        [
-            lambda folder: write_depth(folder / "a.png"),
-            lambda folder: write_depth(folder / "a.npy"),
-            _file("a.pfm", b"Pf\n64 48\n-1.0\n" + metres()[::-1].tobytes()),
-            _npz,
-        ],
-        lambda folder: load_depth(_only(folder)),
-    ),
+    "depth": Reader([_grey16, _npz, _pfm, lambda f: np.save(f / "a.npy", metres())], lambda f: load_depth(_only(f))),
     "portraits": Reader(
         [
-            _file("a.jpg", portraits.apple_jpeg(portraits.codes())),
-            _file("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
-            _file("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
-            _file("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
+            _portrait("a.jpg", portraits.apple_jpeg(portraits.codes())),
+            _portrait("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
+            _portrait("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
+            _portrait("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
         ],
         lambda folder: load_photo_depth(_only(folder)),
     ),

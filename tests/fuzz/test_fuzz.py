@@ -12,39 +12,22 @@ import numpy as np
 import pytest
 from readers import READERS, sealed
 
-import spackle
+Failure = tuple[int, str, dict[str, str]]
 
 
 @pytest.fixture(scope="module")
-def failures() -> list[fuzz.Result]:
+def failures() -> dict[str, list[Failure]]:
     """Of all readers: one child is enough for them."""
-    return [result for result in fuzz.tried(fuzz.numbered(list(READERS), 300)) if result.problem]
+    found: dict[str, list[Failure]] = {name: [] for name in READERS}
+    for name, number, problem, files in fuzz.fuzz(list(READERS), 300):
+        found[name].append((number, problem, files))
+    return found
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_damaged_files_are_refused_in_time_and_in_memory(name: str, failures: list[fuzz.Result]) -> None:
-    for result in failures:
-        if result.reader == name:
-            pytest.fail(f"python tests/fuzz/fuzz.py --replay {fuzz.save(result)}: {result.problem}")
-
-
-@pytest.mark.parametrize("deadly", ["exit", "memory", "bug"])
-def test_what_a_reader_must_not_do_is_found(deadly: str, tmp_path: Path) -> None:
-    """By readers that do it at the second of three files."""
-    action = {"exit": "os._exit(3)", "memory": "bytearray(2_000_000_000)", "bug": "[][0]"}[deadly]
-    (tmp_path / "readers.py").write_text(
-        "import dataclasses, os\n@dataclasses.dataclass\nclass Reader:\n    makers: list\n    read: object\n"
-        f"def read(folder):\n    if (folder / 'deadly').exists():\n        {action}\n"
-        "READERS = {'r': Reader([], read)}\ndef contents(folder): return {}\n"
-    )
-    cases: list[fuzz.Case] = [("r", k, {"deadly" if k == 1 else "a": "AA=="}) for k in range(3)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fuzz, "__file__", str(tmp_path / "fuzz.py"))
-        (tmp_path / "fuzz.py").write_text(Path(fuzz.HERE, "fuzz.py").read_text())
-        patch.setenv("PYTHONPATH", str(Path(spackle.__file__).parents[1]))
-        results = list(fuzz.tried(cases))
-    assert [result.number for result in results] == [0, 1, 2]
-    assert [bool(result.problem) for result in results] == [False, True, False]
+def test_damaged_files_are_refused_in_time_and_in_memory(name: str, failures: dict[str, list[Failure]]) -> None:
+    for number, problem, files in failures[name]:
+        pytest.fail(f"python tests/fuzz/fuzz.py --replay {fuzz.save(name, number, files)}: {problem}")
 
 
 def gif(side: int) -> bytes:
@@ -74,7 +57,7 @@ def npz(side: int) -> bytes:
     return sealed({"a.npz": array})["a.npz"]
 
 
-def test_small_files_that_announce_much_stay_below_the_bound() -> None:
+def test_small_files_that_announce_much_stay_below_the_bound(tmp_path: Path) -> None:
     cases = [
         ("pictures", "a.gif", gif(9_999)),
         *(("pictures", "a.png", png(side, 2)) for side in (9_999, 5_600)),
@@ -83,7 +66,6 @@ def test_small_files_that_announce_much_stay_below_the_bound() -> None:
         ("depth", "a.npz", npz(5_600)),
     ]
     assert all(len(data) < 1_000_000 for _, _, data in cases)
-    coded: list[fuzz.Case] = [
-        (reader, number, {name: base64.b64encode(data).decode()}) for number, (reader, name, data) in enumerate(cases)
-    ]
-    assert [result.problem for result in fuzz.tried(coded)] == [None] * len(cases)
+    coded = [(reader, {name: base64.b64encode(data).decode()}) for reader, name, data in cases]
+    saved = [fuzz.save(reader, number, files, tmp_path) for number, (reader, files) in enumerate(coded)]
+    assert fuzz.replayed(*saved) == ["as it should be"] * len(cases)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from command import Run, names_in, report_of, run
@@ -18,16 +16,15 @@ from PIL import Image
 from safetensors.torch import save_file
 from sharp_weights import MICRO
 from torch import Tensor
-from training_runs import one_thread, run_two, state, trained
+from training_runs import one_thread, run_two, state
 
 from spackle.bases.sharp.base import TunableSharp
-from spackle.bases.sharp.checkpoint import PARTS, Owner, deterministic_weights, expected_shapes
+from spackle.bases.sharp.checkpoint import PARTS, deterministic_weights, expected_shapes
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.dataset import DatasetFiles
 from spackle.render import get_renderer
-from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, PseudoPhotos, render_photo
-from spackle.training.method import Objective
-from spackle.training.recipe import DataRecipe, LossRecipe, OptimRecipe, Recipe, RunRecipe
+from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, drawn_views, render_photo
+from spackle.training.recipe import Recipe, load_recipe
 
 pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture
@@ -120,45 +117,38 @@ def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, b
     assert torch.equal(batch.alpha < 0.95, batch.hole)
 
 
-def learn(place: Path, base: TunableSharp, folder: Path, steps: int, **optim: object) -> list[float]:
-    """The loss of each step on one photo."""
-    recipe = Recipe(
-        data=DataRecipe(validation_views=VIEWS),
-        loss=LossRecipe(features="none"),
-        optim=OptimRecipe(warmup=0, steps=steps, batch=VIEWS_AT_ONCE, **optim),  # type: ignore[arg-type]
-        run=RunRecipe(log_every=1, validate_every=1000, save_every=1000),
-    )
-    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, CPU)
-    owner = Owner(place / "sharp.safetensors", digest_of(place / "sharp.safetensors"))
-    photos = PseudoPhotos.of(recipe.data, place / "data", owner.sha256)
-    method = DirectFt(base, owner, dataclasses.replace(photos, learned=photos.learned[:1]), objective, 4, 0)
-    return trained(recipe, method, base.network.gaussian_decoder().let_learn(), folder)[1]
-
-
 def digest_of(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def weights_of(file: Path) -> dict[str, Tensor]:
+    """Of the whole network that a checkpoint, or a decoder with a link to one, stands for."""
+    return TunableSharp.load(file, torch.float32, CPU).network.state_dict()
+
+
 def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_path: Path) -> None:
-    base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
-    before = {name: tensor.clone() for name, tensor in base.network.state_dict().items()}
-    losses = learn(place, base, tmp_path, 8, lr=2e-3, min_lr=2e-3, ema=0.0)
+    """On one photo, seen again and again."""
+    options = ("data.views=1", "optim.steps=8", "optim.lr=2e-3", "optim.min_lr=2e-3", "optim.ema=0")
+    done = train(place, tmp_path / "out", *options)
+    losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
     assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
-    unused = "feature_model.decoder.fusions.4.resnet1."
-    for name, tensor in base.network.state_dict().items():
+    before, unused = weights_of(place / "sharp.safetensors"), "feature_model.decoder.fusions.4.resnet1."
+    for name, tensor in weights_of(tmp_path / "out" / "last.safetensors").items():
         stays = not name.startswith(PARTS) or name.startswith(unused)
         assert torch.equal(tensor, before[name]) == stays, name
     assert sum(not name.startswith(PARTS) for name in before) > 100
 
 
 def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: Path) -> None:
-    base = TunableSharp.load(place / "sharp.safetensors", torch.bfloat16, CPU)
-    before = base.network.prediction_head.texture_prediction_head.bias.detach().clone()
-    first, *_ = learn(place, base, tmp_path, 1, lr=1e-5, min_lr=1e-5)
-    moved = (base.network.prediction_head.texture_prediction_head.bias.detach() - before).abs()
-    assert 0 < float(moved.max()) < 2e-5  # bf16 has no such number beside 6
-    exact, *_ = learn(place, TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU), tmp_path, 1)
-    assert first == pytest.approx(exact, rel=0.02)
+    name, losses = "prediction_head.texture_prediction_head.bias", []
+    for precision in ("bf16", "fp32"):
+        options = ("optim.steps=1", "optim.lr=1e-5", "optim.min_lr=1e-5", f"optim.precision={precision}", "optim.ema=0")
+        done = train(place, tmp_path / precision, *options)
+        losses += [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+        weights = weights_of(tmp_path / precision / "last.safetensors")[name]
+        moved = (weights - weights_of(place / "sharp.safetensors")[name]).abs()
+        assert 0 < float(moved.max()) < 2e-5  # bf16 has no such number beside 6
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
 
 
 # Runs ---------------------------------------------------------------------------------------------
@@ -189,21 +179,24 @@ def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> 
 
 
 def test_a_photo_whose_loss_is_no_number_is_named(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    total = Objective.total
-    monkeypatch.setattr(Objective, "total", lambda self, batch: (total(self, batch)[0] * float("nan"), {}))
-    assert train(place, tmp_path / "out").code == 2
-    (named,) = (tmp_path / "out" / "bad_batch").glob("*.json")
-    facts = json.loads(named.read_text())
-    assert (facts["step"], facts["views"][0], len(facts["views"])) == (0, 0, VIEWS_AT_ONCE)
-    assert facts["photo"] in names_in(place / "photos")
+    total = DirectFt.total
+    monkeypatch.setattr(DirectFt, "total", lambda self, views: (total(self, views)[0] * float("nan"), {}))
+    done = train(place, tmp_path / "out")
+    assert done.code == 2
+    assert any(f"among {name}" in done.lines[-1] for name in names_in(place / "photos"))
 
 
-def test_each_step_has_the_photos_own_view_and_others_in_turn(place: Path) -> None:
-    photos = PseudoPhotos.of(DataRecipe(validation_views=1), place / "data", digest_of(place / "sharp.safetensors"))
-    assert sorted([*photos.learned, *photos.validation]) == list(range(PHOTOS))
-    drawn = [[view.index for view in photos.drawn(0, np.random.default_rng([0, step]))] for step in range(20)]
+def test_each_step_has_the_photos_own_view_and_others_in_turn() -> None:
+    drawn = [drawn_views([0, step], VIEWS) for step in range(20)]
     assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
     assert {view for views in drawn for view in views} == set(range(VIEWS))
+    assert drawn_views([0, 0], 2) == [0, 1]
+
+
+def test_a_photo_either_teaches_or_judges(place: Path) -> None:
+    recipe = load_recipe(Recipe, place / "recipe.yaml", ["data.validation_views=1"])
+    task = DirectFt(recipe, CPU, place / "sharp.safetensors")
+    assert sorted([*task.learned, *task.validation]) == list(range(PHOTOS))
 
 
 # What is refused ----------------------------------------------------------------------------------
@@ -212,12 +205,12 @@ def test_each_step_has_the_photos_own_view_and_others_in_turn(place: Path) -> No
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["data.pseudo=null"], "data.pseudo: missing, and --method direct-ft learns from nothing else"),
-        (["data.photos={place}/photos"], "data.photos: its samples have Gaussians that cannot change"),
+        (["data.pseudo=null"], "data: --method direct-ft learns from data.pseudo"),
+        (["data.photos={place}/photos"], "samples of other sources have Gaussians that cannot change"),
         (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
         (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
-        (["optim.batch=6"], "optim.batch=6: with --method direct-ft each process takes 4 views"),
+        (["optim.batch=6"], "optim.batch=6: --method direct-ft takes 4 views"),
         (["init=weights.safetensors"], "init=weights.safetensors: --method direct-ft starts from SHARP's checkpoint"),
     ],
 )

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from spackle.render import get_renderer
 from spackle.training.losses import (
     PAPER_WEIGHTS,
     alpha_loss,
@@ -23,8 +22,6 @@ from spackle.training.losses import (
     preserve_loss,
     total_loss,
 )
-from spackle.training.method import Objective, ViewBatch
-from spackle.training.recipe import LossRecipe
 
 RGB = torch.tensor([[[[0.1, 0.2, 0.3], [0.5, 0.5, 0.5]]]])  # [1, 1, 2, 3]: one row of two pixels
 TARGET = torch.tensor([[[[0.2, 0.2, 0.0], [1.0, 0.0, 0.9]]]])
@@ -189,19 +186,6 @@ def test_the_total_is_the_weighted_sum_of_its_terms(weights: dict[str, float]) -
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(values, rel=1e-5)
     assert loss.item() == pytest.approx(sum(weights[name] * value for name, value in values.items()), rel=1e-5)
     assert set(total_loss(rgb, alpha, target, base, LEFT)[1]) == {"color", "alpha", "preserve"}
-
-
-@pytest.mark.parametrize(("blur", "gram"), [(0.0, 1.0), (1.5, 0.25)])
-def test_the_options_of_a_recipe_reach_the_loss(blur: float, gram: float) -> None:
-    rgb, target = perceptual_example()
-    recipe = LossRecipe(features="none", dilation=1, feature_size=None, color_blur=blur, gram=gram)
-    objective = Objective(recipe, Pixels(1), get_renderer(), torch.float32, torch.device("cpu"))
-    hole = torch.tensor([[[True, True]]])
-    _, terms = objective.total(ViewBatch(rgb, torch.ones(1, 1, 2), rgb, target, hole))
-    assert terms["color"].item() == pytest.approx(color_loss(rgb, target, hole, blur).item())
-    expected = perceptual_loss(Pixels(1), rgb, target, hole, dilation=1, size=None, gram=gram)
-    assert terms["perceptual"].item() == pytest.approx(expected.item())
-    assert (color_loss(rgb, target, hole, blur) == color_loss(rgb, target, hole)) == (blur == 0)
 
 
 def test_distance_is_between_directions_of_feature_vectors() -> None:

@@ -11,8 +11,8 @@ import pytest
 from spackle.downloads import known_weights
 from spackle.errors import InputError
 from spackle.training.losses import PAPER_WEIGHTS
-from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe, plain
-from spackle.training.trainer import ema_decay, learning_rate, samples_of_step
+from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe
+from spackle.training.train import ema_decay, learning_rate, samples_of_step
 
 pytest.importorskip("yaml")
 PLAIN = "loss: {features: none}"
@@ -61,7 +61,7 @@ def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path:
     overrides = ["optim.steps=1e3", "data.rgbd.0.focal_px=600", "optim.lr=2e-4", "init=null", "run.log_every=7"]
     recipe = load_recipe(Recipe, written(tmp_path, text), overrides)
     assert recipe.data.photos == Path("some/photos")
-    assert recipe.data.rgbd == (RgbdFolder(Path("kitchen"), 600.0, 0.001),)
+    assert recipe.data.rgbd == (RgbdFolder(folder=Path("kitchen"), focal_px=600.0, unit_m=0.001),)
     assert recipe.data.disparity == (0.0, 0.1)
     assert recipe.loss.feature_size is None
     assert (recipe.optim.steps, recipe.optim.lr, recipe.optim.batch) == (1000, 2e-4, OptimRecipe().batch)
@@ -73,30 +73,38 @@ def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path:
 @pytest.mark.parametrize(
     ("text", "override", "named"),
     [
-        ("optim: {stepps: 3}", "", "optim.stepps is unknown; there are lr, min_lr"),
-        ("optim: {steps: many}", "", "optim.steps cannot be 'many'; it takes a whole number from 1 to"),
-        ("optim: {lr: .nan}", "", "optim.lr cannot be nan; it takes a number above 0, up to 1"),
-        ("optim: {precision: fp8}", "", "optim.precision cannot be 'fp8'; it takes auto, fp32, bf16"),
-        ("data: {photos: 3}", "", "data.photos cannot be 3; it takes a path, or null"),
-        ("data: {disparity: [0.1]}", "", "data.disparity cannot be [0.1]; it takes a list of two numbers, each from"),
-        ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px is missing"),
-        ("data: {rgbd: kitchen}", "", "data.rgbd cannot be 'kitchen'; it takes a list"),
-        ("[1, 2]", "", "the recipe cannot be [1, 2]; it takes keys data, loss, optim, run, init"),
-        ("a: [", "", "not YAML"),
-        ("a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{f'*a{k - 1},' * 9}]\n" for k in range(1, 40)), "", "aliases"),
-        ("a0: &a {x: 1}\n" + "".join(f"a{k}: &a {{<<: [*a, *a]}}\n" for k in range(40)), "", "aliases"),
-        ("optim: {steps: [" + "[" * 10 + "]" * 10 + "]}", "", "optim.steps cannot be [[[...]]]"),
-        ("optim: {steps: " + "[" * 60_000, "", "deeper than 20"),
-        (f"{'x' * 1000}: 1", "", f"{'x' * 60} is unknown"),
+        ("optim: {stepps: 3}", "", "recipe.yaml: optim.stepps: there is no such key; there are lr, min_lr"),
+        ("optim: {steps: many}", "", "recipe.yaml: optim.steps: input should be a valid integer"),
+        ("optim: {lr: .nan}", "", "optim.lr: input should be a finite number, not nan"),
+        ("optim: {precision: fp8}", "", "optim.precision: input should be 'auto', 'fp32' or 'bf16', not 'fp8'"),
+        ("data: {photos: 3}", "", "data.photos: input is not a valid path"),
+        ("data: {disparity: [0.1]}", "", "data.disparity.1: field required"),
+        ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px: field required"),
+        (
+            "data: {rgbd: [{folder: a, focal_px: 1, focal: 1}]}",
+            "",
+            "data.rgbd.0.focal: there is no such key; there are",
+        ),
+        ("data: {rgbd: kitchen}", "", "data.rgbd: input should be a valid tuple, not 'kitchen'"),
+        ("[1, 2]", "", "recipe.yaml: input should be a valid dictionary or instance of Recipe, not [1, 2]"),
+        ("a: [", "", "recipe.yaml: not YAML"),
+        (
+            "optim: {steps: [" + "[" * 10 + "]" * 10 + "]}",
+            "",
+            "optim.steps: input should be a valid integer, not [[",
+        ),
+        ("optim: {steps: " + "[" * 60_000, "", "recipe.yaml: not YAML"),
+        (f"{'x' * 1000}: 1", "", f"recipe.yaml: {'x' * 60}: there is no such key"),
         ("#" * 100_000, "", "too long for a recipe"),
         (PLAIN, "quick", "'quick': neither an option nor key=value"),
-        (PLAIN, "optim.steps.a=1", "optim.steps cannot be"),
-        ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd has 0 entries"),
-        ("{data: {disparity: [0.5, 0.1]}, loss: {features: none}}", "", "data.disparity"),
-        (PLAIN, "optim.min_lr=0.5", "optim.min_lr 0.5 is above optim.lr"),
-        (PLAIN, "loss.dilation=4", "loss.dilation 4 is even"),
-        ("loss: {features: resnet50}", "", "loss.features_path is missing"),
-        ("{loss: {features_path: a, feature_size: null}, data: {cells: 16}}", "", "crops of 16 cells are too small"),
+        (PLAIN, "optim.steps.a=1", "optim.steps: input should be a valid integer"),
+        (PLAIN, "optim.steps=1.5", "optim.steps: input should be a valid integer"),
+        ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd.0.folder=a: no place for it"),
+        ("{data: {disparity: [0.5, 0.1]}, loss: {features: none}}", "", "data.disparity: runs from 0.5 down to 0.1"),
+        (PLAIN, "optim.min_lr=0.5", "optim: min_lr 0.5 is above lr"),
+        (PLAIN, "loss.dilation=4", "loss.dilation: 4 is even"),
+        ("loss: {features: resnet50}", "", "recipe.yaml: loss.features_path: missing"),
+        ("{loss: {features_path: a, feature_size: null}, data: {cells: 16}}", "", "data.cells: too small for resnet50"),
     ],
 )
 def test_what_cannot_be_is_named_with_its_file_or_option(
@@ -114,7 +122,7 @@ def test_what_cannot_be_is_named_with_its_file_or_option(
 
 def test_runs_differ_by_what_is_learned_and_not_by_how_long_it_takes(tmp_path: Path) -> None:
     path = written(tmp_path)
-    one = plain(load_recipe(Recipe, path))
+    one = load_recipe(Recipe, path).model_dump(mode="json")
     same = ["optim.steps=9", "run.validate_every=2", "run.save_every=2", "data.cache=elsewhere", "data.photos=moved"]
     assert differences(one, load_recipe(Recipe, path, same)) == []
     other = load_recipe(Recipe, path, ["optim.lr=1e-3", "data.shares.pairs=0", "run.seed=1"])
@@ -146,5 +154,3 @@ def test_an_epoch_is_a_permutation_whatever_the_batch(count: int, batch: int) ->
     whole = samples_of_step(5, 100, 8, seed=1)
     parts = [samples_of_step(5, 100, 8, seed=1, rank=rank, ranks=4) for rank in range(4)]
     assert [pick for part in parts for pick in part] == whole
-    with pytest.raises(ValueError, match="divided"):
-        samples_of_step(0, 100, 8, seed=1, ranks=3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,9 @@ from spackle.training import composites
 from spackle.training.composites import composite
 from spackle.training.data import Supply
 from spackle.training.recipe import DataRecipe
-from spackle.training.residual_method import MIN_AUX, training_cells
+from spackle.training.residual import MIN_AUX, training_cells
 from spackle.training.sample import HALVED, HOLE_SHARE, Sample, load_sample, random_crops, save_sample
-from spackle.training.sources import frame_view, load_pair, reverse_view, right_view, stereo_view
+from spackle.training.sources import frame_photo, left_photo, load_pair, random_reverse_view, reverse_view, right_view
 
 CPU = CpuRenderer()
 RIM_PX = 2  # blobs are no pixels: what stands in front hides so much more or less than a line says
@@ -426,7 +427,8 @@ def test_frames_of_a_depth_camera_have_their_units(tmp_path: Path, unit_m: float
     Image.fromarray(picture(96, 72)).save(color, quality=95)
 
     def view() -> Sample:
-        return frame_view(np.random.default_rng(1), [color], 80.0, unit_m, (0.3, 0.6), CPU)
+        draw = partial(frame_photo, frames=[color], focal_px=80.0, unit_m=unit_m)
+        return random_reverse_view(np.random.default_rng(1), draw, (0.3, 0.6), CPU)
 
     sample = view()
     assert all(map(torch.equal, tensors_of(sample), tensors_of(view())))
@@ -491,7 +493,7 @@ def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tm
     assert not (sample.hole & ~grow(expected)).any()
     assert not (~sample.hole & ~grow(~expected)).any()
     assert sample.hole[26:46, 57:61].all()
-    sample = stereo_view(np.random.default_rng(0), [folder], (0.3, 0.6), CPU)
+    sample = random_reverse_view(np.random.default_rng(0), partial(left_photo, folders=[folder]), (0.3, 0.6), CPU)
     assert torch.equal(sample.target, pixels(folder / "left.png"))
     assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
     covered = ~grow(sample.hole)
@@ -504,7 +506,7 @@ def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tm
     ("changes", "said"),
     [
         ({"left": None}, "no stereo pair"),
-        ({"focal_px": 10**400}, "no stereo pair"),
+        ({"focal_px": 10**400}, "scene.json"),
         ({"right": "small.png"}, "the two photos differ in size"),
         ({"disparity": "narrow.npy"}, "narrow.npy is 20×72 but photo"),
     ],

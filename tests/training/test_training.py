@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -11,7 +10,6 @@ import resource
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -20,20 +18,17 @@ from command import Run, names_in, run
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from torch import nn
-from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state, trained
+from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state
 
-from spackle.errors import InputError
 from spackle.files import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet, load_residual
-from spackle.training.data import SampleFiles
-from spackle.training.method import Objective
-from spackle.training.recipe import LossRecipe, OptimRecipe, Recipe, RunRecipe
-from spackle.training.residual_method import ResidualMethod, complete_samples
+from spackle.training import train as training
+from spackle.training.losses import total_loss
+from spackle.training.recipe import OptimRecipe
+from spackle.training.residual import complete_samples
 from spackle.training.sample import Sample, load_sample, save_sample
-from spackle.training.trainer import Callbacks, Trainer
 
 pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture
@@ -117,15 +112,15 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
 def test_ctrl_c_leaves_a_checkpoint_and_the_run_goes_on_from_there(
     place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step = Trainer.step
+    rate = training.learning_rate
 
-    def interrupted(self: Trainer, number: int) -> list[dict[str, float]]:
-        if number == 1:
+    def interrupted(step: int, optim: OptimRecipe) -> float:
+        if step == 0:
             signal.raise_signal(signal.SIGINT)
-        return step(self, number)
+        return rate(step, optim)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", interrupted)
+        patch.setattr(training, "learning_rate", interrupted)
         done = train(place, tmp_path / "out")
     assert done.code == 130
     assert state(tmp_path / "out").progress.step == 2
@@ -275,8 +270,7 @@ def test_a_loss_that_is_no_number_keeps_what_made_it(
     done = train(place, tmp_path / "out", f"data.cache={cache}")
     assert done.code == 2
     assert f"out/bad_batch: step 0 gave numbers that are not finite {said}" in done.lines[-1]
-    kept = names_in(tmp_path / "out" / "bad_batch")
-    assert len([name for name in kept if name.endswith(".safetensors")]) == 2
+    assert sum(path.name in done.lines[-1] for path in cache.glob("*/train/*.safetensors")) == 2
     assert state(tmp_path / "out" / "bad_batch").progress.step == 0
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
@@ -297,71 +291,19 @@ def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
     assert not any(tensor.requires_grad for tensor in tensors_of(sample))
     assert not any(tensor.requires_grad for tensor in tensors_of(sample.crop(2, 3, 24, 24)))
     network = ResidualNet()
-    objective = Objective(LossRecipe(features="none"), None, get_renderer(), torch.float32, torch.device("cpu"))
-    batch = complete_samples(network, [sample], get_renderer())
-    objective.total(batch)[0].backward()
+    total_loss(**vars(complete_samples(network, [sample], get_renderer())))[0].backward()
     assert all(tensor.grad is None for tensor in base.tensors)
     assert network.geometry[-1].weight.grad.abs().sum() > 0
     assert network.texture[-1].weight.grad.abs().sum() > 0
     assert all(p.grad is not None for p in network.parameters())
 
 
-def one_sample(
-    folder: Path, method: type[ResidualMethod], steps: int, log_every: int, validate_every: int
-) -> tuple[Recipe, ResidualMethod]:
-    """A recipe and a method that learn from one sample, seen again and again."""
-    save_sample(sample_of(box_before_wall(width=96, height=80).base()), folder / "0.safetensors")
-    files = SampleFiles([folder / "0.safetensors"], [folder / "0.safetensors"], "one")
-    recipe = Recipe(
-        loss=LossRecipe(features="none"),
-        optim=OptimRecipe(lr=1e-3, min_lr=1e-4, warmup=0, steps=steps, batch=1, ema=0.5),
-        run=RunRecipe(log_every=log_every, validate_every=validate_every, save_every=100),
-    )
-    objective = Objective(recipe.loss, None, get_renderer(), torch.float32, torch.device("cpu"))
-    torch.manual_seed(0)
-    return recipe, method(files, objective, recipe.optim.batch)
-
-
-def test_the_loss_falls_on_a_sample_that_is_seen_again_and_again(tmp_path: Path) -> None:
-    trainer, found = trained(*one_sample(tmp_path, ResidualMethod, 12, 1, 6), ResidualNet(), tmp_path)
-    assert len(found) == 12
-    assert found[-1] < 0.5 * found[0]
-    first, last = trainer.progress.history
+def test_the_loss_falls_on_samples_that_are_seen_again(place: Path, tmp_path: Path) -> None:
+    options = ("optim.batch=4", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
+    done = train(place, tmp_path / "out", *options)
+    losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+    assert len(losses) == 12
+    assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
+    first, last = state(tmp_path / "out").progress.history
     assert last["loss"] < first["loss"]
     assert last["hole_psnr"] > first["hole_psnr"]
-
-
-@pytest.mark.parametrize("bad", [None, 3])
-def test_numbers_read_late_are_those_read_at_once_and_nothing_is_learned_from_a_bad_one(
-    tmp_path: Path, bad: int | None
-) -> None:
-    class Broken(ResidualMethod):
-        def loss(
-            self, network: nn.Module, step: int, items: Sequence[int]
-        ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-            loss, terms = super().loss(network, step, items)
-            return loss * (math.nan if step == bad else 1), terms
-
-    found: list[tuple[list[dict[str, float]], dict[str, torch.Tensor], Trainer]] = []
-    for late in (False, True):
-        folder = tmp_path / str(late)
-        folder.mkdir()
-        recipe, method = one_sample(folder, Broken, 7, 5, 7)
-        network, logged = ResidualNet(), list[dict[str, float]]()
-        callbacks = Callbacks(lambda _, n, to=logged: to.append(n), lambda *_: None, lambda _: None, lambda: False)  # type: ignore[misc]
-        optimizer = torch.optim.AdamW(network.parameters(), recipe.optim.lr, weight_decay=0.01, fused=True)
-        trainer = Trainer(recipe, method, network, torch.device("cpu"), folder, callbacks, optimizer=optimizer)
-        trainer.late = late
-        with contextlib.nullcontext() if bad is None else pytest.raises(InputError, match="step 3 gave numbers"):
-            trainer.run()
-        found.append(
-            (
-                logged,
-                dict(network.state_dict()) | {f"mean.{n}": t for n, t in trainer.average.state_dict().items()},
-                trainer,
-            )
-        )
-    (logs, weights, early), (late_logs, late_weights, trainer) = found
-    assert logs == late_logs
-    assert all(torch.equal(weights[name], late_weights[name]) for name in weights)
-    assert early.progress.step == trainer.progress.step == (7 if bad is None else bad)

@@ -12,7 +12,6 @@ import torch
 from depth_loss import DepthJudge, DepthLossWeights
 from frames import MINGLED_SCALE, Frame, Measured, mingled, warp_to_right
 from lite_data import write_data
-from method import LiteMethod, Prefetch
 from mixture import GuessedPhotos, Kept, Mixture, sure_inverse_depth
 from recipe import LiteData, LiteFiles
 from torch import nn
@@ -20,7 +19,6 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.bases.lite import LiteBase
 from spackle.errors import InputError
-from spackle.training.ranks import Ranks
 from spackle.training.recipe import RgbdFolder
 
 pytestmark = pytest.mark.slow  # not part of the package: `make test-slow` runs it
@@ -99,34 +97,16 @@ def test_of_two_frames_in_one_picture_the_nearer_one_shows() -> None:
     assert mingled(np.random.default_rng(0), back, unknown) is back
 
 
-def test_what_was_begun_ahead_is_what_would_have_been_made() -> None:
-    made: list[int] = []
-
-    def double(key: int) -> int:
-        made.append(key)
-        if key == 3:
-            raise InputError("three")
-        return 2 * key
-
-    prefetch = Prefetch(double)
-    assert prefetch.take(1, 2) == 2
-    assert prefetch.take(2, 3) == 4
-    assert prefetch.take(5, 6) == 10  # not the one that was expected
-    assert prefetch.take(6, 3) == 12
-    with pytest.raises(InputError, match="three"):
-        prefetch.take(3, 4)
-    assert sorted(made) == [1, 2, 3, 3, 5, 6]
-
-
 def test_the_last_frames_of_a_folder_judge_and_the_others_teach(place: Path) -> None:
-    data = LiteData(rgbd=(RgbdFolder(place / "kitchen", 60.0), RgbdFolder(place / "kitchen", 60.0, 0.002)))
+    camera = RgbdFolder(folder=place / "kitchen", focal_px=60)
+    data = LiteData(rgbd=(camera, camera.model_copy(update={"unit_m": 0.002})))
     files = LiteFiles.of(data)
     assert [file.path.name[0] for file in files.rgbd] == ["0", "1", "2", "3"] * 2
     assert {group.name: [file.path.name[0] for file in group.files] for group in files.groups} == {
         "kitchen": ["4", "5"],
         "kitchen-2": ["4", "5"],
     }
-    assert files.digest != LiteFiles.of(dataclasses.replace(data, validation=0.5)).digest
+    assert files.digest != LiteFiles.of(data.model_copy(update={"validation": 0.5})).digest
     (near, far) = (file.read(480).inverse_depth for file in (files.rgbd[0], files.rgbd[4]))
     torch.testing.assert_close(near, 2 * far)
     assert float(near.max()) == pytest.approx(1.0)  # 1/m
@@ -179,11 +159,11 @@ def test_another_teacher_is_another_run_wherever_it_lies(place: Path, tmp_path: 
     for name, content in (("one", b"1"), ("same", b"1"), ("two", b"2")):
         (tmp_path / name).write_bytes(content)
     teachers = [None, *(tmp_path / name for name in ("one", "same", "two"))]
-    none, one, same, two = (LiteFiles.of(dataclasses.replace(data, teacher=teacher)) for teacher in teachers)
+    none, one, same, two = (LiteFiles.of(data.model_copy(update={"teacher": teacher})) for teacher in teachers)
     assert one.digest == same.digest
     assert len({files.digest for files in (none, one, two)}) == 3
     assert (len(none.guessed), len(one.guessed)) == (0, 3)
-    fewer = LiteFiles.of(dataclasses.replace(data, teacher=tmp_path / "one", guesses=2))
+    fewer = LiteFiles.of(data.model_copy(update={"teacher": tmp_path / "one", "guesses": 2}))
     assert [file.name for file in fewer.guessed] == [one.guessed[0].name, one.guessed[1].name]
     assert len(fewer.photos) == 3
 
@@ -233,13 +213,3 @@ def test_a_network_that_knows_the_depth_has_a_perfect_score(place: Path) -> None
     # The depth of pixels at outlines is between those of both sides.
     assert found["abs_rel"] < 0.1 < found["ramp_abs_rel"]
     assert found["delta"] > 0.9
-
-
-def test_processes_share_a_step_between_them() -> None:
-    mixture = Mixture([Kept([frame(n) for n in range(3)])], [1.0], (64, 64), 0)
-    judge = DepthJudge(DepthLossWeights(), 64 * 64, torch.float32, torch.device("cpu"))
-    methods = [
-        LiteMethod(mixture, {}, judge, 4, Ranks(rank, count), 0, "") for count in (1, 2) for rank in range(count)
-    ]
-    assert [method.at_once for method in methods] == [4, 2, 2]
-    assert [method.items for method in methods] == [4, 4, 4]

@@ -11,11 +11,11 @@ import torch
 from depth_loss import DepthLossWeights, depth_loss, score_depth, vertical_ramp
 from frames import Frame, Turning, relit, turned
 from lite_data import f32
-from method import VIRIDIS, colored
 from numpy.typing import NDArray
 from photos import picture
 from plain_trace import plain_trace
 from ray_tracer import BOX, CYLINDER, ELLIPSOID, SHEET, Solid, trace
+from task import VIRIDIS, colored
 from torch import Tensor
 from torch.nn.functional import batch_norm, conv2d, pad, relu6
 from weights import load_encoder

@@ -90,9 +90,7 @@ def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> 
     assert found["abs_rel"] == pytest.approx((found["kitchen/abs_rel"] + found["stereo/abs_rel"]) / 2)
     assert report["best"] == found["abs_rel"]
     (line,) = [line for line in done.lines if line.startswith("step 10: ")]
-    assert line.startswith(
-        f"step 10: validation abs_rel {found['abs_rel']:.4f} (the best so far), a vertical ramp has 0."
-    )
+    assert line.startswith(f"step 10: validation abs_rel {found['abs_rel']:.4f} (the best so far), delta 0.")
     assert sum(report["parameters"].values()) == sum(weight.numel() for weight in LiteNet().parameters())
     with Image.open(folder / "pictures" / "0000010.png") as sheet:
         assert sheet.size == (3 * 64, 3 * 48)
@@ -206,7 +204,7 @@ def test_a_folder_belongs_to_one_recipe_and_one_method(place: Path, whole: tuple
     assert "another recipe (the files that data names differs)" in done.lines[-1]
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out)
     assert (done.code, len(done.lines)) == (2, 1)
-    assert "recipe.yaml: encoder is unknown; there are data, loss, optim" in done.err
+    assert "recipe.yaml: data.validation_stereo: there is no such key" in done.err
 
 
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
@@ -234,14 +232,14 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["data.rgbd=[]", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
         (["data.validation=0", "data.validation_stereo=null"], "the recipe has nothing to judge the network by"),
         (["data.validation_stereo={place}/pairs"], "data.validation_stereo has scenes of data.stereo in it, such as"),
-        (["data.size=[64, 80]"], "data.size [64, 80]: both sides must be multiples of 32"),
-        (["data.scales=[]"], "data.scales is empty: give one number at least, such as [1]"),
-        (["data.scales=[0]"], "data.scales.0 cannot be 0; it takes a number from 0.1 to 2"),
-        (["network=lite1"], "network cannot be 'lite1'; it takes lite0, lite2"),
-        (["data.photo=x"], "data.photo is unknown; there are photos, rgbd, stereo, made"),
-        (["loss.features=none"], "loss.features is unknown; there are factor, line, steps"),
-        (["optim.frozen=8"], "optim.frozen cannot be 8; it takes a whole number from 0 to 7"),
-        (["optim.min_lr=0.1"], "optim.min_lr 0.1 is above optim.lr 0.001"),
+        (["data.size=[64, 80]"], "data.size.1: input should be a multiple of 32, not 80"),
+        (["data.scales=[]"], "data.scales: tuple should have at least 1 item"),
+        (["data.scales=[0]"], "data.scales.0: input should be greater than or equal to 0.1, not 0"),
+        (["network=lite1"], "network: input should be 'lite0' or 'lite2', not 'lite1'"),
+        (["data.photo=x"], "data.photo: there is no such key; there are photos, rgbd, stereo, made"),
+        (["loss.features=none"], "loss.features: there is no such key; there are factor, line, steps"),
+        (["optim.frozen=8"], "optim.frozen: input should be less than or equal to 7, not 8"),
+        (["optim.min_lr=0.1"], "optim: min_lr 0.1 is above lr 0.001"),
         (["optim.batch=0"], "optim.batch"),
         (["encoder={place}/recipe.yaml"], "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder="),
         (["encoder=/nowhere.pth"], "/nowhere.pth: no weights of EfficientNet-Lite2"),
@@ -298,8 +296,7 @@ def test_pictures_that_make_a_loss_that_is_no_number_are_named(
     done = train(place, tmp_path / "out")
     assert done.code == 2
     assert "out/bad_batch: step 0 gave numbers that are not finite (loss, " in done.lines[-1]
-    facts = json.loads((tmp_path / "out" / "bad_batch" / "pictures-0.json").read_text())
-    assert (facts["step"], len(facts["pictures"])) == (0, 2)
+    assert " among " in done.lines[-1]
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -34,12 +35,16 @@ def train(
     verbose: VerboseOption = False,
 ) -> None:
     """Train the residual or SHARP itself: best.safetensors, last.safetensors, run.json, pictures and logs."""
+    from spackle.errors import InputError
     from spackle.progress import Reporter
-    from spackle.training.run import train_recipe
+    from spackle.training.direct_ft import DirectFt
+    from spackle.training.recipe import Recipe, load_recipe
+    from spackle.training.residual import ResidualTask
+    from spackle.training.train import train
 
-    choices = overrides or []
-    ended = train_recipe(
-        recipe, choices, output, Reporter(verbose), method=method, checkpoint=checkpoint, overwrite=overwrite
-    )
+    if method == "residual" and checkpoint is not None:
+        raise InputError(f"-c {checkpoint}: --method residual learns without a base: leave the option out")
+    task = ResidualTask if method == "residual" else partial(DirectFt, checkpoint=checkpoint)
+    ended = train(load_recipe(Recipe, recipe, overrides or ()), task, output, Reporter(verbose), overwrite)
     if ended == "stopped":
         raise typer.Exit(INTERRUPTED)

@@ -1,4 +1,4 @@
-"""What a run needs to go on, and the weights that come out of it: whole files, or the ones before them."""
+"""What a run leaves in its folder: checkpoints to resume from, each whole or the one before it, and curves."""
 
 from __future__ import annotations
 
@@ -7,40 +7,44 @@ import io
 import math
 import os
 import shutil
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spackle.errors import InputError, reason_in_a_line
-from spackle.files import atomic_path
+from spackle.errors import InputError, reading, reason_in_a_line
+from spackle.files import NEW, atomic_path
 from spackle.training.recipe import AnyRecipe, differences
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
-BEST, LAST, RUN, PICTURES, LOGS, BAD = (
-    "best.safetensors", "last.safetensors", "run.json", "pictures", "logs", "bad_batch",
-)  # fmt: skip
+BEST, LAST, RUN = "best.safetensors", "last.safetensors", "run.json"
+RESULTS = (NEWEST, PREVIOUS, BEST, LAST, RUN)
+PICTURES, LOGS, BAD = "pictures", "logs", "bad_batch"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Progress:
     """How far a run has come, as plain numbers."""
 
     step: int = 0  # steps done
-    best: float | None = None  # of what the method aims at, such as the loss; None before the first validation
+    best: float | None = None  # of the task's aim, such as the loss; None before the first validation
     best_step: int = 0
     stale: int = 0  # validations since then
     seconds: float = 0.0  # of all its starts together
-    history: tuple[dict[str, float], ...] = ()  # what each validation found
+    history: list[dict[str, float]] = dataclasses.field(default_factory=list)  # each validation's measures
 
-    def validated(self, found: dict[str, float], aim: str, min_delta: float) -> Progress:
-        """After a validation whose number called `aim` says which weights are best; the lower the better."""
-        history = (*self.history, found)
+    def validated(self, measures: dict[str, float], aim: str, min_delta: float) -> bool:
+        """Note a validation; whether its measure called `aim` is the best so far: the lower the better."""
+        self.history.append({"step": self.step, **measures})
         best = math.inf if self.best is None else self.best
-        if math.isfinite(found[aim]) and found[aim] < best - min_delta:
-            return dataclasses.replace(self, best=found[aim], best_step=self.step, stale=0, history=history)
-        return dataclasses.replace(self, stale=self.stale + 1, history=history)
+        if math.isfinite(measures[aim]) and measures[aim] < best - min_delta:
+            self.best, self.best_step, self.stale = measures[aim], self.step, 0
+        else:
+            self.stale += 1
+        return self.stale == 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,10 +65,8 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
 
     InputError where it cannot be written, or the disk is full; what was there stays.
     """
-    progress = dataclasses.asdict(checkpoint.progress)
-    state = {**vars(checkpoint), "progress": {**progress, "history": list(progress["history"])}}
     buffer = io.BytesIO()  # torch's own writer hides that a disk is full
-    torch.save(state, buffer)
+    torch.save({**vars(checkpoint), "progress": dataclasses.asdict(checkpoint.progress)}, buffer)
     newest = folder / NEWEST
     with atomic_path(newest) as temporary:
         temporary.write_bytes(buffer.getbuffer())
@@ -83,8 +85,7 @@ def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
             continue
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-            history = tuple(state["progress"].pop("history"))
-            return Checkpoint(**{**state, "progress": Progress(**state["progress"], history=history)}), problem
+            return Checkpoint(**{**state, "progress": Progress(**state["progress"])}), problem
         except Exception as error:  # a damaged file can raise anything
             problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
     if problem:
@@ -92,7 +93,34 @@ def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
     return None, None
 
 
-def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
+def find_run(
+    output: Path, overwrite: bool, method: str, recipe: AnyRecipe, digest: str, log: Callable[[str], None]
+) -> tuple[Path, Checkpoint | None]:
+    """The folder of a run, and the checkpoint in it that the run goes on from, if any.
+
+    The folder is `output`, but to `overwrite` a run there `output`/.new, which `replace_run` ends.
+
+    Raises:
+        InputError: the folder holds another run, or none of its checkpoints can be read.
+    """
+    anew = overwrite and any((output / name).exists() for name in RESULTS)
+    folder = output / NEW if anew else output
+    try:
+        found, problem = load_checkpoint(folder)
+        if found:
+            _check_same_run(found, method, recipe, digest, output)
+    except InputError:
+        if not anew:
+            raise
+        found = problem = None  # begun by another recipe, or damaged
+    if found:
+        if problem:
+            log(f"{problem}: going on from the one before it")
+        log(f"{folder}: going on from step {found.progress.step}")
+    return folder, found
+
+
+def _check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
     """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
     other = differences(checkpoint.recipe, recipe)
     if not other and checkpoint.digest != digest:
@@ -104,11 +132,6 @@ def check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, diges
     else:
         return
     raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
-
-
-def holds_run(folder: Path) -> bool:
-    """Whether a run left something in a folder that another one would replace."""
-    return any((folder / name).exists() for name in (NEWEST, PREVIOUS, BEST, LAST, RUN))
 
 
 def replace_run(folder: Path, new: Path) -> None:
@@ -123,3 +146,36 @@ def replace_run(folder: Path, new: Path) -> None:
         if own.exists():
             os.replace(own, old)
     shutil.rmtree(new)
+
+
+class Logs:
+    """TensorBoard's event files in a run's folder, where it is installed."""
+
+    def __init__(self, folder: Path, first: int, log: Callable[[str], None], wanted: bool = True) -> None:
+        """Hide what an earlier start logged after the step `first`; write nothing unless `wanted`."""
+        self.folder, self.writer = folder / LOGS, None
+        if not wanted:
+            return
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of protobuf's, about itself
+                import tensorboard  # noqa: F401  # torch's own import of it fails with other words
+                from torch.utils.tensorboard import SummaryWriter
+            self.writer = SummaryWriter(str(self.folder), purge_step=first)
+        except ImportError:
+            log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
+
+    def numbers(self, group: str, values: Mapping[str, float], step: int) -> None:
+        """Points of the curves GROUP/NAME."""
+        for name, value in values.items():
+            self.write("add_scalar", f"{group}/{name}", value, step)
+
+    def write(self, method: str, *arguments: object, **options: object) -> None:
+        """Call a method of torch's writer; InputError for a disk that is full, which it notices a call later."""
+        if self.writer is not None:
+            with reading(self.folder, "cannot write the logs: {reason}", OSError):
+                getattr(self.writer, method)(*arguments, **options)
+
+    def close(self) -> None:
+        """Write what is still in memory."""
+        self.write("close")

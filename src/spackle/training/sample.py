@@ -5,19 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
-from spackle.errors import InputError
-from spackle.files import atomic_path
+from spackle.errors import reading
+from spackle.files import write_whole
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
@@ -27,11 +28,14 @@ from spackle.residual.seeds import Rim, Seeds, make_seeds
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
 FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which an opaque blob is no longer drawn
 # Half precision is enough for these, and halves what is read at every step. Not for positions.
-HALVED: tuple[str, ...] = ("base.quats", "base.scales", "base.opacities", "base.colors")
-HALVED += ("rendering.rgb", "rendering.depth", "rendering.alpha", "cues.rgb", "cues.inverse_depth", "cues.alpha")
-HALVED += ("seeds.slope", "seeds.rgb", "rim.rgb", "rim.mirrored", "rim.distance")
-HALVED += ("rim.exemplar", "rim.mismatch")
+HALVED = (
+    "base.quats", "base.scales", "base.opacities", "base.colors", "rendering.rgb", "rendering.depth",
+    "rendering.alpha", "cues.rgb", "cues.inverse_depth", "cues.alpha", "seeds.slope", "seeds.rgb", "rim.rgb",
+    "rim.mirrored", "rim.distance", "rim.exemplar", "rim.mismatch",
+)  # fmt: skip
+PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
+P = TypeVar("P")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,13 +74,9 @@ class Sample:
 
     def to(self, device: torch.device) -> Sample:
         """The same on another device, but for the camera, whose numbers are read by the host."""
-
-        def moved(grid: Any) -> Any:
-            if isinstance(grid, Tensor):
-                return grid.to(device, non_blocking=device.type != "cpu")
-            return dataclasses.replace(grid, **{name: moved(t) for name, t in vars(grid).items() if name != "unit"})
-
-        return dataclasses.replace(self, **{name: moved(t) for name, t in vars(self).items() if name != "camera"})
+        move = partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
+        parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
+        return dataclasses.replace(self, **parts, target=move(self.target))
 
     def crop(self, row: int, column: int, height: int, width: int) -> Sample:
         """The part of a view whose upper left cell is (row, column), height × width cells."""
@@ -86,19 +86,18 @@ class Sample:
         K = self.camera.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
-        view = self.rendering
 
-        def part(grid: Seeds | Cues | Rim) -> dict[str, Tensor]:
-            return {name: value[cells].clone() for name, value in vars(grid).items() if name != "unit"}
+        def cut(grid: Tensor) -> Tensor:
+            return grid[cells].clone()
 
-        seeds = part(self.seeds)
+        seeds = _mapped(self.seeds, cut)
         return Sample(
             camera=dataclasses.replace(self.camera, K=K, width=CELL * width, height=CELL * height),
             base=self.base,
-            rendering=Rendering(view.rgb[pixels].clone(), view.depth[pixels].clone(), view.alpha[pixels].clone()),
-            seeds=Seeds(seeds.pop("uv") - torch.tensor([left, top]).to(self.seeds.uv), **seeds, unit=self.seeds.unit),
-            cues=Cues(**part(self.cues)),
-            rim=Rim(**part(self.rim)),
+            rendering=_mapped(self.rendering, lambda t: t[pixels].clone()),
+            seeds=dataclasses.replace(seeds, uv=seeds.uv - torch.tensor([left, top]).to(seeds.uv)),
+            cues=_mapped(self.cues, cut),
+            rim=_mapped(self.rim, cut),
             target=self.target[pixels].clone(),
         )._with_near_base()
 
@@ -146,42 +145,39 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
 def save_sample(sample: Sample, path: Path) -> None:
     """Write a sample, whole or not at all; colours of the truth with 8 bits."""
     camera = sample.camera
-    tensors: dict[str, Tensor] = {
+    tensors = {
         "camera.K": camera.K,
         "camera.world_to_camera": camera.world_to_camera,
         "camera.size": torch.tensor([camera.width, camera.height]),
         "target": (sample.target * 255).round().to(torch.uint8),
     }
-    for part in ("base", "rendering", "cues", "rim", "seeds"):
-        value = getattr(sample, part)
-        tensors |= {f"{part}.{f.name}": getattr(value, f.name) for f in dataclasses.fields(value)}
+    for part in PARTS:
+        tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
-    tensors |= {name: tensors[name].half() for name in tensors if name in HALVED}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save({name: tensor.contiguous() for name, tensor in tensors.items()}))
+    tensors |= {name: tensors[name].half() for name in HALVED}
+    write_whole(path, save({name: tensor.contiguous() for name, tensor in tensors.items()}))
 
 
 def load_sample(path: str | os.PathLike[str]) -> Sample:
     """Read a sample; InputError for a missing or broken file."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # it is no dict
-        tensors |= {name: tensors[name].float() for name in HALVED}
-
-        def part(name: str) -> dict[str, Tensor]:
-            return {key[len(name) + 1 :]: value for key, value in tensors.items() if key.startswith(name + ".")}
-
-        lens, seeds = part("camera"), part("seeds")
-        unit = float(seeds.pop("unit"))
-        width, height = lens["size"].tolist()
+    with reading(path, "no training sample, or damaged: delete it, and it is made anew"):
+        parts: dict[str, dict[str, Any]] = {}
+        for name, tensor in load_file(path).items():
+            part, _, field = name.partition(".")
+            parts.setdefault(part, {})[field] = tensor.float() if name in HALVED else tensor
+        lens, unit = parts["camera"], float(parts["seeds"].pop("unit"))
         return Sample(
-            camera=Camera(lens["K"], lens["world_to_camera"], width, height),
-            base=Gaussians(**part("base")),
-            rendering=Rendering(**part("rendering")),
-            seeds=Seeds(**seeds, unit=unit),
-            cues=Cues(**part("cues")),
-            rim=Rim(**part("rim")),
-            target=tensors["target"].float() / 255,
+            camera=Camera(lens["K"], lens["world_to_camera"], *lens["size"].tolist()),
+            base=Gaussians(**parts["base"]),
+            rendering=Rendering(**parts["rendering"]),
+            seeds=Seeds(**parts["seeds"], unit=unit),
+            cues=Cues(**parts["cues"]),
+            rim=Rim(**parts["rim"]),
+            target=parts["target"][""].float() / 255,
         )
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no training sample, or damaged: delete it, and it is made anew") from error
+
+
+def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
+    """A dataclass with a function applied to its tensors."""
+    tensors = {name: value for name, value in vars(part).items() if isinstance(value, Tensor)}
+    return dataclasses.replace(part, **{name: function(value) for name, value in tensors.items()})  # type: ignore[type-var]

@@ -22,7 +22,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.dataset.reader import DatasetFiles
-from spackle.errors import InputError
+from spackle.errors import InputError, reading
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
 from spackle.render import Renderer
@@ -87,46 +87,48 @@ FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
 FRAMES = 24  # of a path, one of which is the virtual camera
 UNCOMPLETED = "none"  # the inpainter that leaves its holes open
 
-
 View = Callable[[np.random.Generator], Sample]  # one of a source's views; InputError for a file that cannot be used
+Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # likewise a photo [H, W, 3] sRGB with depth
 
 
-def composite_view(
-    rng: np.random.Generator, photos: Sequence[Path], disparity: tuple[float, float], renderer: Renderer
+def random_reverse_view(
+    rng: np.random.Generator, draw: Draw, disparity: tuple[float, float], renderer: Renderer
 ) -> Sample:
-    """`reverse_view` of photos without depth, cut-outs of some in front of others."""
+    """`reverse_view` of a photo from a random frame of a random path."""
+    rgb, depth, camera = draw(rng)
+    prediction = lift(rgb, depth, camera, levels=0)  # a tile is seen as a whole, and a hole's outline is not a tile's
+    kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
+    reach = DepthRange.of(prediction.gaussians)
+    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
+    return reverse_view(prediction, rgb, viewer, renderer)
+
+
+def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
+    """Photos without depth, cut-outs of some in front of others."""
     height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
     rgb, inverse_depth = composite(rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width)
     focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
     every = torch.ones_like(inverse_depth, dtype=torch.bool)
     depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
-    return _reverse(rng, rgb, depth, Camera.from_focal(focal, width, height), disparity, renderer)
+    return rgb, depth, Camera.from_focal(focal, width, height)
 
 
-def frame_view(
-    rng: np.random.Generator,
-    frames: Sequence[Path],
-    focal_px: float,
-    unit_m: float,
-    disparity: tuple[float, float],
-    renderer: Renderer,
-) -> Sample:
-    """`reverse_view` of a depth camera's photo, one of `frames`: see `load_frame`."""
+def frame_photo(
+    rng: np.random.Generator, frames: Sequence[Path], focal_px: float, unit_m: float
+) -> tuple[Tensor, DepthMap, Camera]:
+    """One of a depth camera's photos: see `load_frame`."""
     rgb, depth = load_frame(_chosen(rng, frames), unit_m)
-    camera = Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
-    return _reverse(rng, rgb, depth, camera, disparity, renderer)
+    return rgb, depth, Camera.from_focal(focal_px, rgb.shape[1], rgb.shape[0])
 
 
-def stereo_view(
-    rng: np.random.Generator, folders: Sequence[Path], disparity: tuple[float, float], renderer: Renderer
-) -> Sample:
-    """`reverse_view` of the left photo of a stereo pair, one of `folders`: see `load_pair`."""
+def left_photo(rng: np.random.Generator, folders: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
+    """The left photo of a stereo pair: see `load_pair`."""
     left, _, depth, camera, _ = load_pair(_chosen(rng, folders))
-    return _reverse(rng, left, depth, camera, disparity, renderer)
+    return left, depth, camera
 
 
 def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
-    """The left photo of a stereo pair seen from the right one's place, which is the truth."""
+    """The left photo of a stereo pair seen from the right camera, whose photo is the truth."""
     left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
     base = lift(left, depth, camera).gaussians
     return Sample.of(base, renderer.render(base, beside), beside, camera, right)
@@ -183,13 +185,11 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
 
     InputError for a file that is missing or broken.
     """
-    try:
-        scene = folder / "scene.json"
+    scene = folder / "scene.json"
+    with reading(folder, "no stereo pair: needs a scene.json that names the photos and the lens ({reason})"):
         facts = json.loads(scene.read_text(encoding="utf-8"))
         names = [folder / facts[key] for key in ("left", "right", "disparity")]
         lens = read_calibration(scene)
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"{folder}: no stereo pair: needs a scene.json that names the photos and the lens") from error
     left, right = (load_photo(name).rgb for name in names[:2])
     if left.shape != right.shape:
         raise InputError(f"{folder}: the two photos differ in size")
@@ -201,19 +201,3 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     height, width = left.shape[:2]
     cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
     return left, right, depth, *cameras
-
-
-def _reverse(
-    rng: np.random.Generator,
-    rgb: Tensor,
-    depth: DepthMap,
-    camera: Camera,
-    disparity: tuple[float, float],
-    renderer: Renderer,
-) -> Sample:
-    """`reverse_view` from a random frame of a random path."""
-    prediction = lift(rgb, depth, camera, levels=0)  # a tile is seen as a whole, and a hole's outline is not a tile's
-    kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
-    reach = DepthRange.of(prediction.gaussians)
-    viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
-    return reverse_view(prediction, rgb, viewer, renderer)

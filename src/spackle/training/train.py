@@ -1,0 +1,297 @@
+"""The training loop, from top to bottom: batch, forward, losses, step, validate, save.
+
+A `Task` says what learns, and from what. Whatever stops a run, it goes on from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import functools
+import math
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW
+
+from spackle.device import pick_device
+from spackle.errors import InputError, reading
+from spackle.files import results_folder, write_json
+from spackle.formats import save_png
+from spackle.machine import hardware, versions, without_nan
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
+from spackle.training.checkpoint import (
+    BAD,
+    BEST,
+    LAST,
+    PICTURES,
+    RESULTS,
+    RUN,
+    Checkpoint,
+    Logs,
+    Progress,
+    find_run,
+    replace_run,
+    save_checkpoint,
+)
+from spackle.training.ranks import joined_ranks, rank, rank_count, sum_of_ranks, wait_for_ranks
+from spackle.training.recipe import AnyRecipe, OptimRecipe
+from spackle.training.task import Task
+
+EMA_START = 10  # the average forgets the first, bad weights this quickly: decay (s + 1) / (s + 10)
+END = {
+    "steps": "all steps are done",
+    "patience": "no improvement any more",
+    "stopped": "stopped; the same command goes on from here",
+}
+R = TypeVar("R", bound=AnyRecipe)
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+def train(
+    recipe: R, open_task: Callable[[R, torch.device], Task], output: Path, reporter: Reporter, overwrite: bool = False
+) -> str:
+    """Train, or go on with a run; as one of several processes where torchrun started them.
+
+    Args:
+        recipe: what to do.
+        open_task: makes the task whose networks run on a device; refuses what cannot be used, before any long work.
+        output: a folder for all results.
+        reporter: the first process reports to it.
+        overwrite: start anew where `output` holds a run; the samples in it stay, and so does the old run until the new
+            one, in `output`/.new, has ended.
+
+    Returns:
+        Why the run ended: "steps" (all are done), "patience" (nothing improved) or "stopped" (by a signal).
+
+    Raises:
+        InputError: a file or folder that cannot be used, a loss that is not finite.
+    """
+    kind = pick_device(None if recipe.run.device == "auto" else recipe.run.device).type
+    with joined_ranks(kind) as device, contextlib.ExitStack() as stack:
+        if rank() == 0:  # which alone writes
+            stack.enter_context(results_folder(output, RESULTS, alone=True))
+        else:
+            reporter = Reporter(console=Console(quiet=True))
+        task = open_task(recipe, device)
+        if task.items_a_step % rank_count():
+            raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes")
+        folder, found = find_run(output, overwrite, task.name, recipe, task.digest, reporter.log)
+        facts = task.prepare(output, reporter)
+        wait_for_ranks()  # nobody looks for checkpoints any more
+        if folder != output and rank() == 0:
+            if found is None:
+                shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(exist_ok=True)
+        why, step = _learn(recipe, task, folder, found, facts, device, reporter)
+        if rank() == 0:
+            if folder != output and why != "stopped":
+                replace_run(output, folder)
+                folder = output
+            reporter.log(f"{END[why]}, step {step} -> {folder}")
+        return why
+
+
+def _learn(
+    recipe: AnyRecipe,
+    task: Task,
+    folder: Path,
+    found: Checkpoint | None,
+    facts: dict[str, Any],
+    device: torch.device,
+    reporter: Reporter,
+) -> tuple[str, int]:
+    """The loop of one process; all processes of a run do the same steps. Returns why it ended, and the steps done."""
+    optim, run = recipe.optim, recipe.run
+    network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    average = copy.deepcopy(network).requires_grad_(False)
+    # Gradients are averaged over the processes while they are computed.
+    wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
+    optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
+    progress, on_disk = Progress(), -1  # the step of the newest checkpoint
+    if found:
+        with reading(folder, "its checkpoint is of another network ({reason}): choose another with -o, or --overwrite"):
+            network.load_state_dict(found.network)
+            average.load_state_dict(found.average)
+            optimizer.load_state_dict(found.optimizer)
+        progress, on_disk = found.progress, found.progress.step
+    facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
+    facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
+
+    def state() -> Checkpoint:
+        states = network.state_dict(), average.state_dict(), optimizer.state_dict()
+        return Checkpoint(progress, *states, facts["recipe"], task.digest, task.name)
+
+    def report(ended: str | None = None) -> None:
+        if rank() == 0:
+            write_json(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
+
+    def save() -> None:
+        nonlocal on_disk
+        if rank() == 0 and on_disk != progress.step:
+            task.export(average, folder / LAST)
+            save_checkpoint(state(), folder)  # at the end: a run that is killed before it exports again
+            on_disk = progress.step
+            report()
+
+    def parts(step: int) -> list[list[int]]:
+        """This process's items of a step, as they go through the network."""
+        own = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
+        size = task.at_once or len(own)
+        return [own[start : start + size] for start in range(0, len(own), size)]
+
+    todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
+    with (
+        contextlib.closing(Logs(folder, progress.step, reporter.log, rank() == 0)) as logs,
+        contextlib.closing(made_ahead(lambda key: task.batch(*key), todo)) as batches,
+        reporter.steps("train", progress.step, optim.steps) as tell,
+        asked_to_stop(alone=rank_count() == 1) as asked,
+    ):
+        begun, before, stopped, recent = time.perf_counter(), progress.seconds, False, list[dict[str, float]]()
+        while progress.step < optim.steps and progress.stale < run.patience and not stopped:
+            step = progress.step
+
+            # Forward and backward: a step's parts add up their gradients, its last one joins those of the processes.
+            optimizer.zero_grad(set_to_none=True)
+            sums: dict[str, Tensor] = {}
+            for number, part in enumerate(own := parts(step), 1):
+                share = len(part) * rank_count() / task.items_a_step
+                alone = rank_count() > 1 and number < len(own)
+                with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
+                    loss, terms = task.loss(wrapped, next(batches))
+                    (share * loss).backward()  # type: ignore[no-untyped-call]
+                for name, value in {"loss": loss.detach(), **terms}.items():
+                    sums[name] = sums.get(name, 0.0) + share * value.double()
+            sums["gradient"] = clip_grad_norm_(network.parameters(), optim.clip).double()
+            mine = {**dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)), "stop": float(asked())}
+            means = [total / rank_count() for total in sum_of_ranks(list(mine.values()), device)]
+            numbers = dict(zip(mine, means, strict=True))
+            stopped = numbers.pop("stop") > 0
+            if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
+                if rank() == 0:
+                    (folder / BAD).mkdir(exist_ok=True)
+                    save_checkpoint(state(), folder / BAD)
+                wait_for_ranks()
+                names = ", ".join(task.names(step, [item for part in own for item in part]))
+                raise InputError(
+                    f"{folder / BAD}: step {step} gave numbers that are not finite ({', '.join(bad)}); the weights "
+                    f"before it are there: lower optim.lr, or remove what is broken among {names}"
+                )
+
+            # Step
+            rate = learning_rate(step, optim)
+            for group in optimizer.param_groups:
+                group["lr"] = group.get("lr_scale", 1.0) * rate
+            optimizer.step()
+            with torch.no_grad():
+                for mean, weight in zip(average.parameters(), network.parameters(), strict=True):
+                    mean.lerp_(weight, 1 - ema_decay(step, optim.ema))
+            progress.step, progress.seconds = step + 1, before + time.perf_counter() - begun
+            recent.append({**numbers, "lr": rate})
+            last = progress.step == optim.steps
+
+            # Log
+            if progress.step % run.log_every == 0 or last:
+                numbers = {name: sum(each[name] for each in recent) / len(recent) for name in recent[0]}
+                logs.numbers("train", numbers, progress.step)
+                tell(progress.step, f"loss {numbers['loss']:.4f}")
+                recent = []
+
+            # Validate the averaged weights, keep them where they are the best so far, and draw what they do
+            if progress.step % run.validate_every == 0 or last:
+                measures = validate(task, average, device)
+                best = progress.validated(measures, task.aim, run.min_delta)
+                if rank() == 0:
+                    sheet = task.picture(average)
+                    (folder / PICTURES).mkdir(exist_ok=True)
+                    save_png(sheet, folder / PICTURES / f"{progress.step:07d}.png")
+                    if best:
+                        task.export(average, folder / BEST)
+                    logs.numbers("validation", measures, progress.step)
+                    logs.write("add_image", "views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
+                    told = "the best so far" if best else f"best {progress.best:.4f} at step {progress.best_step}"
+                    rest = ", ".join(f"{name} {value:.4f}" for name, value in measures.items() if name != task.aim)
+                    line = f"validation {task.aim} {measures[task.aim]:.4f} ({told}), {rest}"
+                    reporter.log(f"step {progress.step}: {line}")
+                    report()
+
+            # Save
+            if progress.step % run.save_every == 0:
+                save()
+        save()
+    why = "steps" if progress.step >= optim.steps else "patience" if progress.stale >= run.patience else "stopped"
+    report(why)
+    return why, progress.step
+
+
+@torch.no_grad()
+def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, float]:
+    """Means of a task's measures over its validation items, the same in all processes, which share the items.
+
+    A measure that no item has is missing.
+    """
+    totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0)
+    mine, size = range(rank(), task.validation_items, rank_count()), task.at_once or task.items_a_step // rank_count()
+    for start in range(0, len(mine), size):
+        for name, values in task.measure(network, task.batch(None, mine[start : start + size])).items():
+            totals[name] += sum(values)
+            counts[name] += len(values)
+    sums = sum_of_ranks([*totals.values(), *counts.values()], device)
+    pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
+    return {name: total / count for name, total, count in pairs if count}
+
+
+def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
+    """The values of keys, in order; a thread makes the next one while one is used."""
+    with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
+        begun: Future[V] | None = None
+        for key in keys:
+            following = worker.submit(make, key)
+            if begun is not None:
+                yield begun.result()
+            begun = following
+        if begun is not None:
+            yield begun.result()
+
+
+def learning_rate(step: int, optim: OptimRecipe) -> float:
+    """Linear warm-up, then a cosine down to `min_lr` ("Training Details and Loss Weights"); steps count from 0."""
+    if step < optim.warmup:
+        return optim.lr * (step + 1) / optim.warmup
+    done = min(1.0, (step - optim.warmup) / max(1, optim.steps - optim.warmup))
+    return optim.min_lr + (optim.lr - optim.min_lr) * (1 + math.cos(math.pi * done)) / 2
+
+
+def ema_decay(step: int, decay: float) -> float:
+    """Share of the average that stays at a step."""
+    return min(decay, (step + 1) / (step + EMA_START))
+
+
+def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> list[int]:
+    """Which of `count` samples a process sees at a step: nothing but the arguments decides.
+
+    Every epoch is a permutation of all samples by `seed`; a batch may end one and begin the next. All `ranks` processes
+    share the same global batch, which they divide evenly.
+    """
+    share = batch // ranks
+    first = step * batch + rank * share
+    return [int(_epoch(seed, place // count, count)[place % count]) for place in range(first, first + share)]
+
+
+@functools.lru_cache(maxsize=2)
+def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+    return np.random.default_rng([seed, epoch]).permutation(count)
