@@ -32,8 +32,8 @@ from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer
 from spackle.residual.network import shipped_network
+from spackle.scene_fill import FillContext, fill_scene
 from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0
@@ -82,7 +82,7 @@ def load_world(side: int) -> World:
     camera = Camera.from_focal(float(pair.left_camera.focal[0]) / step, side, height)
     still = lift(rgb, depth_map(pair.depth.depth[rows][:, columns]), camera).gaussians
     around = [moved(camera, (x, y, z)) for x in (-0.8, 0.8, 0.0) for y in (-0.8, 0.4) for z in (-0.4, 0.4)]
-    aux = Completer(still, camera, get_renderer()).complete_scene(around, exact=True)
+    aux = fill_scene(FillContext(still, camera, get_renderer()), around, exact=True).aux
     return World(Gaussians.cat([still, aux]), board(camera), camera)
 
 

@@ -40,8 +40,9 @@ from spackle.render.cuda import Material, load_gsplat
 from spackle.render.pipeline import project, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
-from spackle.residual import Completer, hole_area_ratio
+from spackle.residual import hole_area_ratio
 from spackle.residual.network import ResidualNet, shipped_network
+from spackle.scene_fill import FillContext, fill_view
 from spackle.training.losses import total_loss
 from spackle.training.residual import complete_samples
 from spackle.training.sample import Sample
@@ -266,23 +267,23 @@ def completion(options: argparse.Namespace) -> Iterator[str]:
     gpu = renderer()
     scene, camera = holed_scene()
     view = find_view(scene, camera, gpu)[1]
-    completers = [Completer(scene, camera, drawer, shipped_network()) for drawer in (gpu, CpuRenderer())]
-    found = [completer.complete_view(view) for completer in completers]
+    contexts = [FillContext(scene, camera, drawer, shipped_network()) for drawer in (gpu, CpuRenderer())]
+    found = [fill_view(context, view).aux for context in contexts]
     one, other = (CpuRenderer().render([scene, aux], view) for aux in found)
     apart = float((one.rgb - other.rgb).abs().mean())
     yield (
         f"{len(found[0]):,} and {len(found[1]):,} Gaussians; mean difference {apart:.1e}; "
         f"holes {hole_area_ratio(one.alpha):.3%} and {hole_area_ratio(other.alpha):.3%}"
     )
-    there, guard = completers[0].there, completers[0].photo_guard()
-    before = gpu.render(there.base, view)
-    places = counted_waits(lambda: there.completed_view(view, [guard], rendering=before))
+    placed, guard = contexts[0].placed, contexts[0].photo_guard()
+    before = gpu.render(placed.base, view)
+    places = counted_waits(lambda: fill_view(placed, view, [guard], before))
     yield f"{len(places)} waits: {', '.join(sorted(set(places)))}"
-    guards, empty_view = [guard], before.to(torch.device("cpu"))
+    empty_view = before.to(torch.device("cpu"))
     yield from rows(
         {
-            "added time on the GPU": lambda _: there.completed_view(view, [guard], rendering=before),
-            "on the processor": lambda _: completers[1].completed_view(view, guards, rendering=empty_view),
+            "added time on the GPU": lambda _: fill_view(placed, view, [guard], before),
+            "on the processor": lambda _: fill_view(contexts[1], view, [guard], empty_view),
         },
         5,
     )

@@ -98,7 +98,7 @@ def filled_from_around(own: Any) -> Any:
 
 def all_covered(own: Any) -> Any:
     """`_sources` with specks."""
-    return lambda cues: cues.covered if bool(cues.covered.any()) else cues.inverse_depth > 0
+    return lambda features: features.inverse_depth > 0 if bool(features.mask.all()) else ~features.mask
 
 
 def no_edges(own: Any) -> Any:
@@ -132,7 +132,7 @@ FILL: dict[str, dict[str, Replace]] = {
     "network": {"shipped_network": lambda own: lambda: None},
     "texture": {"open_texture": lambda own: lambda fill: None},
     "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
-    "GOOD_FIT 0.12": {"texture.GOOD_FIT": lambda own: 0.12},
+    "TEXTURE_FADING 0.12": {"texture.TEXTURE_FADING": lambda own: 0.12},
     "sharpened": {"sharpened": first},
     "sky rule": NO_SKY,
     "beyond_border": {"fill_around": filled_from_around},
@@ -141,12 +141,12 @@ FILL: dict[str, dict[str, Replace]] = {
         "beyond_border.MIXED": lambda own: 10.0,
         "beyond_border.CARRIED": lambda own: 20.0,
     },
-    "shown beyond the border": {"texture.SHOWN": lambda own: 0.0},
-    "in proportion": {"_in_proportion": lambda own: lambda fine, cues, *more: torch.ones_like(cues.alpha)},
-    "repeat count": {"texture.OFTEN": lambda own: math.inf},
-    "continued": {"continued": first},
+    "patches beyond the border": {"texture.SHARE": lambda own: 0.0},
+    "in proportion": {"_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)},
+    "repeat count": {"texture.REPEATS": lambda own: math.inf},
+    "extended": {"extended": lambda own: lambda view: view.structure},
     "widened": {"widened": first},
-    "ALIKE": {"seeds.ALIKE": lambda own: math.inf},
+    "ALIKE": {"rim.ALIKE": lambda own: math.inf},
     "solid sources": {"_sources": all_covered},
 }
 MECHANISMS = (*FILL, *LIFT)

@@ -37,8 +37,7 @@ def main(folder: Path) -> None:
     pair = load_motorcycle()
     camera, renderer = pair.right_camera, spackle.get_renderer()
     base = lift(pair.left, pair.depth, pair.left_camera).gaussians
-    completer = spackle.Completer(base, pair.left_camera, renderer)
-    aux = completer.complete_view(camera, [completer.photo_guard()])
+    aux = spackle.fill_view(spackle.FillContext(base, pair.left_camera, renderer), camera).aux
 
     before = renderer.render(base, camera)
     hole = spackle.hole_mask(before.alpha)

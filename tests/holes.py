@@ -14,9 +14,10 @@ from spackle.color import linear_to_srgb
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer, Cues, ResidualNet, Seeds, make_seeds
+from spackle.residual import ResidualNet, Seeds, ViewFeatures, make_seeds
 from spackle.residual.network import shipped_network
-from spackle.residual.seeds import Rim
+from spackle.residual.rim import Rim, find_rim
+from spackle.scene_fill import FillContext
 
 CPU = CpuRenderer()
 
@@ -32,18 +33,18 @@ def random_view(seed: int, height: int, width: int) -> Rendering:
     return Rendering(rgb, depth, alpha)
 
 
-def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int = 72) -> tuple[Completer, Camera]:
+def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int = 72) -> tuple[FillContext, Camera]:
     """A box before a wall, and a view that looks behind the box."""
     scene = box_before_wall(width=width, height=height, focal=width * 80 // 96)
-    completer = Completer(scene.base(), scene.camera, CPU)
-    return completer, extremes(scene.camera, disparity, DepthRange.of(completer.base))[side]
+    context = FillContext(scene.base(), scene.camera, CPU)
+    return context, extremes(scene.camera, disparity, DepthRange.of(context.base))[side]
 
 
-def features_of(base: Gaussians | Rendering, camera: Camera, photo_camera: Camera) -> tuple[Cues, Seeds, Rim]:
+def features_of(base: Gaussians | Rendering, camera: Camera, photo_camera: Camera) -> tuple[ViewFeatures, Seeds, Rim]:
     """What f_res is given of a view: of Gaussians, or of a rendering."""
-    cues = Cues.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
-    seeds = make_seeds(cues, camera, photo_camera)
-    return cues, seeds, Rim.of(cues, seeds, camera, photo_camera)
+    features = ViewFeatures.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
+    seeds = make_seeds(features, camera, photo_camera)
+    return features, seeds, find_rim(features, seeds, camera, photo_camera)[0]
 
 
 def random_network(seed: int = 0, size: float = 0.02) -> ResidualNet:

@@ -20,7 +20,7 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
 # they are named here; all others are values.
-BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "formats", "downloads"}
+BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "scene_fill", "formats", "downloads"}
 SCENE = {"pipeline", "scene", "views"}
 BELOW_DATASET = {*BELOW_SCENE, "scene"}
 ALLOWED: dict[str, set[str]] = {
@@ -30,8 +30,9 @@ ALLOWED: dict[str, set[str]] = {
     "render": {"values"},
     "bases": {"values", "downloads"},
     "inpaint": {"values", "downloads"},
-    "residual": {"values", "render", "inpaint"},
-    "clips": {"values", "render", "bases", "residual", "inpaint", "formats"},
+    "residual": {"values", "render"},
+    "scene_fill": {"values", "render", "residual", "inpaint"},
+    "clips": {"values", "render", "bases", "residual", "scene_fill", "inpaint", "formats"},
     "viewer": {"values", "formats"},
     "scene": {*BELOW_SCENE, "viewer"},
     "workers": {"values"},

@@ -19,9 +19,10 @@ import spackle
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.gaussians import Gaussians
-from spackle.residual import CELL, Completer, Cues, hole_area_ratio, hole_mask
-from spackle.residual.complete import PASSES
-from spackle.residual.seeds import cell_centers
+from spackle.residual import CELL, ViewFeatures, hole_area_ratio, hole_mask
+from spackle.residual.view_features import cell_centers
+from spackle.scene_fill import FillContext, fill_scene, fill_view
+from spackle.scene_fill.fill import PASSES
 
 SOURCES = Path(spackle.__file__).parent
 SCENES = {
@@ -33,12 +34,12 @@ SCENES = {
 
 
 @functools.cache
-def completer(name: str, network: bool = False) -> Completer:
+def context_of(name: str, network: bool = False) -> FillContext:
     scene = SCENES[name]
-    return Completer(scene.base(), scene.camera, CPU, random_network() if network else None)
+    return FillContext(scene.base(), scene.camera, CPU, random_network() if network else None)
 
 
-def path_of(subject: Completer, kind: str, disparity: float = 0.3, frames: int = 4) -> list[Camera]:
+def path_of(subject: FillContext, kind: str, disparity: float = 0.3, frames: int = 4) -> list[Camera]:
     return trajectory(kind, subject.photo_camera, disparity, DepthRange.of(subject.base), frames)  # type: ignore[arg-type]
 
 
@@ -47,11 +48,11 @@ def path_of(subject: Completer, kind: str, disparity: float = 0.3, frames: int =
 
 @pytest.mark.parametrize(("name", "network"), [*((name, False) for name in SCENES), ("odd", True)])
 def test_the_base_comes_first_and_unchanged_in_what_is_merged(name: str, network: bool) -> None:
-    subject = completer(name, network)
+    subject = context_of(name, network)
     kept = Gaussians(*(t.clone() for t in subject.base.tensors))
     path = path_of(subject, "swipe")
-    view = subject.complete_view(path[-1], [subject.photo_guard()])
-    for aux in (view, subject.complete_scene(path)):
+    view = fill_view(subject, path[-1], [subject.photo_guard()]).aux
+    for aux in (view, fill_scene(subject, path).aux):
         assert len(aux) > 0
         assert same_bits(subject.base, kept)
         merged = Gaussians.cat([subject.base, aux])
@@ -65,10 +66,10 @@ def test_the_base_comes_first_and_unchanged_in_what_is_merged(name: str, network
 @settings(deadline=None, max_examples=15)
 @given(st.sampled_from(sorted(SCENES)), st.floats(-0.6, 0.6), st.floats(-0.3, 0.3), st.booleans())
 def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down: float, guarded: bool) -> None:
-    subject = completer(name)
+    subject = context_of(name)
     camera = subject.photo_camera.looking(torch.tensor([right, down, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
-    mask = Cues.of(CPU.render(subject.base, camera)).mask
-    aux = subject.complete_view(camera, [subject.photo_guard()] if guarded else [])
+    mask = ViewFeatures.of(CPU.render(subject.base, camera)).mask
+    aux = fill_view(subject, camera, [subject.photo_guard()] if guarded else []).aux
     uv, z = camera.project(aux.means)
     column, row = (uv / 2).floor().long().unbind(-1)
     beside = (uv - cell_centers(camera)[row, column]).abs()  # of a cell, or of one of its pixels
@@ -79,7 +80,7 @@ def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down
     assert int(torch.bincount(row * mask.shape[1] + column, minlength=1).max()) <= most
     assert len(aux) >= int(mask.sum()) if not guarded else len(aux) <= most * int(mask.sum())
     wild = dataclasses.replace(subject, network=random_network(size=0.05))
-    assert int(mask.sum()) <= len(wild.complete_view(camera)) <= most * int(mask.sum())
+    assert int(mask.sum()) <= len(fill_view(wild, camera).aux) <= most * int(mask.sum())
 
 
 # Rule 3: a view with an empty mask renders exactly as the base does.
@@ -87,13 +88,13 @@ def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down
 
 @pytest.mark.parametrize(("name", "network"), [*((name, False) for name in SCENES), ("odd", True)])
 def test_a_view_without_holes_gets_nothing_and_stays_bit_for_bit(name: str, network: bool) -> None:
-    subject = completer(name, network)
+    subject = context_of(name, network)
     photo = CPU.render(subject.base, subject.photo_camera)
     assert not hole_mask(photo.alpha).any()
-    aux = subject.complete_view(subject.photo_camera)
+    aux = fill_view(subject, subject.photo_camera).aux
     assert len(aux) == 0
-    assert len(subject.complete_scene([subject.photo_camera] * 2)) == 0
-    hidden = subject.complete_view(away(subject.photo_camera))
+    assert len(fill_scene(subject, [subject.photo_camera] * 2).aux) == 0
+    hidden = fill_view(subject, away(subject.photo_camera)).aux
     assert len(hidden) > 0  # out of sight
     for more in (aux, hidden):
         assert same_bits(CPU.render([subject.base, more], subject.photo_camera), photo)
@@ -110,8 +111,8 @@ def test_a_view_without_holes_gets_nothing_and_stays_bit_for_bit(name: str, netw
 def test_a_completed_scene_shows_the_photo_as_the_base_does(
     name: str, network: bool, kind: str, disparity: float
 ) -> None:
-    subject = completer(name, network)
-    aux = subject.complete_scene(path_of(subject, kind, disparity, frames=8))
+    subject = context_of(name, network)
+    aux = fill_scene(subject, path_of(subject, kind, disparity, frames=8)).aux
     assert len(aux) > 0
     before = CPU.render(subject.base, subject.photo_camera)
     after = CPU.render([subject.base, aux], subject.photo_camera)
@@ -123,8 +124,8 @@ def test_a_completed_scene_shows_the_photo_as_the_base_does(
 @pytest.mark.parametrize("name", ["box", "odd"])
 def test_a_completed_view_behind_the_photos_guard_shows_the_photo_as_the_base_does(name: str, right: float) -> None:
     """As far as disparity 0.6 and a little, but looking elsewhere than a trajectory does."""
-    subject = completer(name)
-    aux = subject.complete_view(shifted(subject.photo_camera, right), [subject.photo_guard()])
+    subject = context_of(name)
+    aux = fill_view(subject, shifted(subject.photo_camera, right), [subject.photo_guard()]).aux
     assert len(aux) > 0
     before = CPU.render(subject.base, subject.photo_camera)
     assert psnr(CPU.render([subject.base, aux], subject.photo_camera).rgb, before.rgb) >= 45
@@ -142,12 +143,12 @@ TWINS = {
     "bases/splats.py": "test_silhouettes.py",
     "evaluation/naive_renderer.py": "test_suite.py",
     "fill.py": "test_fill.py",
-    "inpaint/exemplar.py": "test_exemplar.py",
+    "filters.py": "test_filters.py",
+    "patches.py": "test_patches.py",
     "render": "test_render.py",
-    "residual/occlusion_guard.py": "test_occlusion_guard.py",
-    "residual/epipolar_walk.py": "test_seeds.py",
-    "residual/hole_features.py": "test_hole_features.py",
-    "residual/seeds.py": "test_seeds.py",
+    "residual/epipolar_walk.py": "test_base_values.py",
+    "residual/view_features.py": "test_view_features.py",
+    "scene_fill/occlusion_guard.py": "test_occlusion_guard.py",
     "surface.py": "test_surface.py",
 }
 

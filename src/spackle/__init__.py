@@ -31,10 +31,13 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
     from spackle.render.protocol import Rendering as Rendering
-    from spackle.residual import Completer as Completer
+    from spackle.residual import complete_view as complete_view
     from spackle.residual import hole_area_ratio as hole_area_ratio
     from spackle.residual import hole_mask as hole_mask
     from spackle.scene import Scene as Scene
+    from spackle.scene_fill import FillContext as FillContext
+    from spackle.scene_fill import fill_scene as fill_scene
+    from spackle.scene_fill import fill_view as fill_view
 
 __version__ = "0.1.0"
 
@@ -52,9 +55,10 @@ _NAMES = {
     "spackle.image": ("Photo", "load_photo"),
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
-    "spackle.residual": ("Completer", "hole_area_ratio", "hole_mask"),
+    "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
     "spackle.pipeline": ("complete", "predict"),
     "spackle.scene": ("Scene",),
+    "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_HOMES)

@@ -1,13 +1,20 @@
-"""Filters of pictures: Gaussian blur, and the greatest value in a window."""
+"""Filters of pictures: Gaussian blur, the greatest value in a window, and a distance transform."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
+
+from spackle._numba import kernel
+
+FAR = 1 << 14  # cells to a place that is not there
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -57,3 +64,29 @@ def greatest_in_windows(image: Tensor, size: int) -> Tensor:
             image = torch.maximum(image.narrow(dim, 0, count), image.narrow(dim, step, count))
             width += step
     return image
+
+
+def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """[2, H, W] row and column of the nearest pixel outside of a hole [H, W], nearly always; far away without any."""
+    near = np.where(hole, -FAR, np.indices(hole.shape)).astype(np.int32)
+    _propagate_nearest(hole, near)
+    return near
+
+
+@kernel
+def _propagate_nearest(hole: Any, near: Any) -> None:
+    """Each cell takes its neighbours' nearest cell if that is nearer: four sweeps, each the other way around."""
+    height, width = hole.shape
+    for turn in range(4):
+        for i in range(height):
+            y = i if turn % 2 == 0 else height - 1 - i
+            for j in range(width):
+                x = j if turn % 2 == 0 else width - 1 - j
+                if not hole[y, x]:
+                    continue
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        row, column = near[0, v, u], near[1, v, u]
+                        apart = (near[0, y, x] - y) ** 2 + (near[1, y, x] - x) ** 2
+                        if (row - y) ** 2 + (column - x) ** 2 < apart:
+                            near[0, y, x], near[1, y, x] = row, column

@@ -30,10 +30,10 @@ from spackle.image import Photo, load_photo
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.progress import Reporter, Step, progress_line
 from spackle.render import Renderer, get_renderer
-from spackle.residual import Completer, ResidualNet
+from spackle.residual import ResidualNet
 from spackle.residual.network import SHIPPED, load_residual, shipped_network
-from spackle.residual.texture import EXEMPLAR, PaintedTexture, Texture
 from spackle.scene import Scene
+from spackle.scene_fill import FillContext, Texture, exemplar_texture, fill_scene, fill_view, painted_texture
 from spackle.views import PathOptions, PlannedViews, plan_views
 
 LOG = logging.getLogger("spackle")
@@ -294,7 +294,7 @@ def complete(
     progress: Callable[[int, int], None] | None = None,
     seen: dict[int, Tensor] | None = None,
 ) -> Scene:
-    """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `Completer.complete_scene`.
+    """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `fill_scene`.
 
     Args:
         prediction: of a base.
@@ -306,18 +306,21 @@ def complete(
         renderer: the CPU's where None.
         precision: of the network.
         progress: called with views done and their number.
-        seen: in scene mode gets pictures of some views, for which they need not be drawn again; see `complete_scene`.
+        seen: in scene mode gets pictures of some views, for which they need not be drawn again; see `FilledScene`.
     """
     base, camera = prediction.gaussians, prediction.camera
     if fill == "none":
         return Scene(base, Gaussians.empty(), camera)
     chosen = shipped_network() if network == "shipped" else network
-    completer = Completer(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
+    context = FillContext(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
     if mode == "scene":
-        return Scene(base, completer.complete_scene(cameras, exact, progress, seen), camera)
-    guards, by_view = [completer.photo_guard()], []
+        filled = fill_scene(context, cameras, exact, progress)
+        if seen is not None:
+            seen.update(filled.pictures)
+        return Scene(base, filled.aux, camera)
+    guards, by_view = [context.photo_guard()], []
     for index, view in enumerate(cameras):
-        by_view.append(completer.complete_view(view, guards))
+        by_view.append(fill_view(context, view, guards).aux)
         if progress:
             progress(index + 1, len(cameras))
     return Scene(base, Gaussians.empty(), camera, tuple(by_view))
@@ -338,9 +341,9 @@ def open_texture(fill: Fill) -> Texture | None:
     "auto" is one of both, see `resolved`. "network" and "none" give None. InputError for "lama" without its weights.
     """
     chosen = resolved(fill)
-    return _lama() if chosen == "lama" else EXEMPLAR if chosen == "exemplar" else None
+    return _lama() if chosen == "lama" else exemplar_texture if chosen == "exemplar" else None
 
 
 @functools.cache
 def _lama() -> Texture:
-    return PaintedTexture(get_inpainter("lama", InpainterOptions()))
+    return functools.partial(painted_texture, get_inpainter("lama", InpainterOptions()))

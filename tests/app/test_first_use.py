@@ -26,7 +26,7 @@ sys.path.insert(0, sys.argv[1])
 from scenes import box_before_wall, shifted
 from spackle.cli.first_use import compile_kernels
 from spackle.render import get_renderer
-from spackle.residual import Completer
+from spackle.scene_fill import FillContext, fill_scene
 
 def there():
     kernels = [o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.__module__.startswith("spackle.")]
@@ -37,7 +37,8 @@ base, camera = scene.base(), scene.camera
 before = there()
 compile_kernels()
 ahead = there()
-aux = Completer(base, camera, get_renderer()).complete_scene([shifted(camera, x) for x in (-0.4, -0.2, 0.2, 0.4)])
+views = [shifted(camera, x) for x in (-0.4, -0.2, 0.2, 0.4)]
+aux = fill_scene(FillContext(base, camera, get_renderer()), views).aux
 assert len(aux) > 100, "nothing was completed"
 print(len(ahead - before), *sorted(there() - ahead))
 """

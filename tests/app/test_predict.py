@@ -34,9 +34,9 @@ from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
 from spackle.pipeline import FillOptions
-from spackle.residual import Completer, ResidualNet
+from spackle.residual import ResidualNet
 from spackle.residual.network import shipped_network
-from spackle.residual.texture import EXEMPLAR
+from spackle.scene_fill import FillContext, exemplar_texture, fill_scene
 
 
 def hashes(folder: Path) -> dict[str, object]:
@@ -187,9 +187,9 @@ def test_the_texture_of_the_fill_is_chosen_named_and_part_of_what_is_asked_for(
     assert report["residual"] == {"weights": "none" if fill == "none" else "shipped", "fill": fill}
     assert (requests[0] == requests[1]) == (fill == "exemplar")  # which is what auto comes to
     base = open_base(BaseSettings(depth=depth)).predict(load_photo(photo))[0]
-    texture = EXEMPLAR if fill == "exemplar" else None
-    completer = Completer(base.gaussians, base.camera, spackle.get_renderer(), shipped_network(), texture)
-    aux = Gaussians.empty() if fill == "none" else completer.complete_scene([camera], exact=True)
+    texture = exemplar_texture if fill == "exemplar" else None
+    context = FillContext(base.gaussians, base.camera, spackle.get_renderer(), shipped_network(), texture)
+    aux = Gaussians.empty() if fill == "none" else fill_scene(context, [camera], exact=True).aux
     assert report["aux"]["gaussians"] == len(aux)
     drawn = spackle.get_renderer().render([base.gaussians, aux], camera).rgb
     assert np.abs(pixels(tmp_path / "photo" / "views" / "0000.png") - 255 * drawn.numpy()).max() <= 0.51

@@ -15,7 +15,7 @@ from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
 from spackle.dataset.views import APART, PathChoice, ViewStack, open_completion, paint, path_cameras, render_views
 from spackle.inpaint import InpainterOptions
 from spackle.render import get_renderer
-from spackle.residual import Completer
+from spackle.scene_fill import FillContext, fill_view
 
 
 @pytest.mark.parametrize("kind", TRAJECTORIES)
@@ -110,10 +110,10 @@ def test_geometry_is_calmer_than_views_completed_one_by_one() -> None:
     scene = Scene(torch.where(box[..., None], front, pattern(points)), torch.where(box, 2.0, FAR), camera)
     cameras = path_cameras(PathChoice("swipe", 0.4), camera, DepthRange.of(scene.base()), 8)
     stack = render_views(scene.base(), camera, cameras, get_renderer())
-    completer = Completer(stack.base, camera, get_renderer())
-    guards = [completer.photo_guard()]
+    context = FillContext(stack.base, camera, get_renderer())
+    guards = [context.photo_guard()]
     with torch.no_grad():
-        alone = torch.stack([completer.completed_view(view, guards)[1].rgb for view in cameras])
+        alone = torch.stack([fill_view(context, view, guards).rendering.rgb for view in cameras])
     calm, off = flicker(stack, completed("geometry", stack))
     restless, other_off = flicker(stack, torch.where(stack.mask[..., None], alone, stack.rgb))
     assert calm < restless / 3

@@ -39,7 +39,8 @@ from spackle.evaluation.suite_sections import SuiteRow, holed_scene, photo_scene
 from spackle.evaluation.timing import complete_in_laps
 from spackle.image import Photo
 from spackle.render import CpuRenderer, get_renderer
-from spackle.residual import Completer, ResidualNet, hole_area_ratio
+from spackle.residual import ResidualNet, hole_area_ratio
+from spackle.scene_fill import FillContext, fill_view
 
 CPU = torch.device("cpu")
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rerender": 9.0}
@@ -112,10 +113,10 @@ def test_the_layouts_are_the_papers() -> None:
 
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
-    completer = Completer(prediction.gaussians, prediction.camera, renderer)
+    context = FillContext(prediction.gaussians, prediction.camera, renderer)
     for view in large_views(prediction, (0.3, 0.5)):
-        found = bench.time_view([0.25, 0.5, 4.0], completer, view.setting, view.camera, 3, CPU)
-        assert found["added"] == len(completer.complete_view(view.camera)) > 0
+        found = bench.time_view([0.25, 0.5, 4.0], context, view.setting, view.camera, 3, CPU)
+        assert found["added"] == len(fill_view(context, view.camera).aux) > 0
         assert found["base_gaussians"] == len(prediction.gaussians)
         assert set(found["seconds"]) == set(STAGES)
         assert all(len(seconds) == 3 and min(seconds) > 0 for seconds in found["seconds"].values())
@@ -123,7 +124,7 @@ def test_a_view_costs_what_a_completion_adds() -> None:
         for path, parts in (("base_ms", BASE_PATH), ("extra_ms", EXTRA)):
             assert figures[path] == pytest.approx(sum(figures[f"{name}_stage_ms"] for name in parts))
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
-    closed = Completer(opaque, prediction.camera, renderer)
+    closed = FillContext(opaque, prediction.camera, renderer)
     whole = bench.time_view([1.0], closed, "0", prediction.camera, 1, CPU)
     assert (whole["added"], whole["seconds"]["rerender"]) == (0, [0.0])  # a view without holes: no second render
 
@@ -279,9 +280,9 @@ def test_what_completion_adds_to_a_view_with_holes_is_the_sum_of_its_stages() ->
     assert added == pytest.approx(found["mask, seeds, network, placing"].values + found["redraw"].values)
     assert found["added time over base render"].values == pytest.approx(added / found["base render of the view"].values)
     assert (facts["disparity"], facts["holes"]) == (disparity, pytest.approx(0.05, rel=0.05))
-    completer = Completer(base, camera, CpuRenderer(), network)
-    whole = completer.complete_view(view)
-    assert same_bits(complete_in_laps(completer, view, lambda name: None), whole)
+    context = FillContext(base, camera, CpuRenderer(), network)
+    whole = fill_view(context, view).aux
+    assert same_bits(complete_in_laps(context, view, lambda name: None), whole)
     assert facts["added"] == len(whole) > 0
 
 

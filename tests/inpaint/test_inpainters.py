@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scenes import psnr
 
 from spackle.errors import InputError
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter
@@ -29,3 +30,18 @@ def test_only_the_holes_change_and_every_time_in_the_same_way(name: str) -> None
 def test_an_unknown_inpainter_is_a_line() -> None:
     with pytest.raises(InputError, match="inpainter nobody: unknown"):
         get_inpainter("nobody", InpainterOptions())
+
+
+def test_exemplar_goes_on_with_a_pattern_also_where_depth_is_unknown() -> None:
+    y, x = torch.meshgrid(torch.arange(100), torch.arange(117), indexing="ij")
+    bricks = torch.where((y % 8 < 2) | ((x + 7 * (y // 8 % 2)) % 14 < 2), 0.8, 0.3)
+    truth, hole = bricks[..., None] * torch.tensor([1, 0.8, 0.6]), torch.zeros(100, 117, dtype=torch.bool)
+    hole[40:66, 45:71] = True
+    holes, depths = torch.stack([hole, hole | True, hole & False]), torch.ones(3, 100, 117)
+    depths[0, :, :9] = 0
+    rgb, painter = torch.where(holes[..., None], 0.0, truth), get_inpainter("exemplar", InpainterOptions())
+    painted = painter.paint(rgb, holes, depths)
+    assert psnr(painted[0][hole], truth[hole]) > 40
+    assert torch.equal(painted[0][~hole], truth[~hole])
+    assert torch.equal(painted[1:], rgb[1:])
+    assert torch.equal(painter.paint(rgb[:1], holes[:1], 0 * depths[:1]), painted[:1])

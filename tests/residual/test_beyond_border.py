@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.residual import CELL, Cues, Seeds, beyond_border, make_seeds
-from spackle.residual.seeds import cell_centers
+from spackle.residual import CELL, Seeds, ViewFeatures, beyond_border, make_seeds
+from spackle.residual.view_features import cell_centers
 
 PHOTO = Camera.from_focal(150, 240, 160)
 VIEW = PHOTO.looking(torch.tensor([-1.2, 0.0, 0.0]), torch.tensor([0.3, 0.0, 4.0]))
@@ -18,7 +18,7 @@ FLOOR, WALL = torch.tensor([0.7, 0.6, 0.2]), torch.tensor([0.2, 0.3, 0.8])
 GROUND, BACK = 1.0, 6.0  # y of the floor and z of the wall
 
 
-def room() -> tuple[Cues, Tensor, Tensor]:
+def room() -> tuple[ViewFeatures, Tensor, Tensor]:
     """What the view shows of a floor and a wall without end; the inverse depth of all cells, and which are floor."""
     rays = VIEW.unproject(cell_centers(VIEW), torch.ones(VIEW.height // CELL, VIEW.width // CELL)) - VIEW.position
     reach = torch.where(rays[..., 1] > 0, GROUND / rays[..., 1].clamp_min(1e-6), torch.inf)
@@ -26,7 +26,7 @@ def room() -> tuple[Cues, Tensor, Tensor]:
     place, _ = PHOTO.project(VIEW.position + rays * depth[..., None])
     mask = ((place < 0) | (place >= torch.tensor([PHOTO.width, PHOTO.height]))).any(-1)
     rgb = torch.where(floor[..., None], FLOOR, WALL)
-    return Cues(rgb * ~mask[..., None], ~mask / depth, (~mask).float(), mask), 1 / depth, floor
+    return ViewFeatures(rgb * ~mask[..., None], ~mask / depth, (~mask).float(), mask), 1 / depth, floor
 
 
 def test_a_floor_stays_level_and_a_wall_goes_on() -> None:
@@ -60,7 +60,7 @@ def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:
     row, edge = 20, int((~mask[20]).nonzero().max())
     near[row : row + 8, edge - 10 : edge + 6] = True  # before the wall, and over the photo's border
     red = torch.tensor([0.9, 0.1, 0.1])
-    shown = Cues(
+    shown = ViewFeatures(
         torch.where(near[..., None], red, cues.rgb),
         torch.where(near, 0.22, cues.inverse_depth),
         torch.where(near, 1.0, cues.alpha),
@@ -73,7 +73,7 @@ def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:
 
 def test_a_view_of_the_photos_own_frame_has_nothing_beyond() -> None:
     cues, _, _ = room()
-    inner = Cues(cues.rgb, torch.ones_like(cues.inverse_depth), cues.alpha, cues.mask)
+    inner = ViewFeatures(cues.rgb, torch.ones_like(cues.inverse_depth), cues.alpha, cues.mask)
     seeds = make_seeds(inner, VIEW, VIEW)
     assert isinstance(seeds, Seeds)
     assert float((seeds.inverse_depth - 1).abs().max()) < 0.02

@@ -13,8 +13,8 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.gaussians import Gaussians
 from spackle.residual import Seeds
+from spackle.residual.base_values import OPACITY
 from spackle.residual.compose import COLOR_MARGIN, DELTA_CHANNELS, compose
-from spackle.residual.seeds import OPACITY
 
 
 def flat_seeds(count: int) -> tuple[Seeds, Camera]:

@@ -16,12 +16,13 @@ from torch.nn.functional import interpolate
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.residual import Cues, Seeds, hole_area_ratio
+from spackle.residual import Seeds, ViewFeatures, hole_area_ratio
 from spackle.residual import network as residual_network
-from spackle.residual.complete import SEEDS_HAR
 from spackle.residual.network import IN_CHANNELS, STRIDE, predict_deltas
-from spackle.residual.seeds import Rim
+from spackle.residual.rim import Rim
 from spackle.residual.sparse import Cells, Crop, conv_rows, crops_around, relu_rows, upsampled
+from spackle.scene_fill import fill_scene
+from spackle.scene_fill.fill import SEEDS_HAR
 
 
 @settings(deadline=None, max_examples=60)
@@ -67,7 +68,7 @@ def test_holes_far_apart_are_looked_at_apart_and_a_full_mask_at_once() -> None:
 
 
 @pytest.fixture(scope="module")
-def view() -> tuple[Cues, Seeds, Rim]:
+def view() -> tuple[ViewFeatures, Seeds, Rim]:
     """A board before the left end of a long wall, seen from the side."""
     height, width = 96, 640
     depth = torch.full((height, width), 4.0)
@@ -77,7 +78,7 @@ def view() -> tuple[Cues, Seeds, Rim]:
     return features_of(base, extremes(scene.camera, 0.1, DepthRange.of(base))[1], scene.camera)
 
 
-def test_crops_give_what_the_whole_picture_gives(view: tuple[Cues, Seeds, Rim]) -> None:
+def test_crops_give_what_the_whole_picture_gives(view: tuple[ViewFeatures, Seeds, Rim]) -> None:
     mask = view[0].mask
     whole, cropped = CountingNetwork(shipped()), CountingNetwork(shipped())
     one = predict_deltas(whole, *view, "fp32", dense=True)
@@ -105,7 +106,7 @@ def test_specks_of_a_path_are_the_seeds_alone_and_great_holes_the_networks() -> 
     assert holes[1] < SEEDS_HAR < holes[0]
     for camera, exact, asked in ((little, False, False), (little, True, True), (wide, False, True)):
         counting.cells = 0
-        assert len(subject.complete_scene([camera], exact=exact)) > 0
+        assert len(fill_scene(subject, [camera], exact=exact).aux) > 0
         assert bool(counting.cells) == asked
 
 

@@ -24,7 +24,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual.compose import DELTA_CHANNELS, compose
-from spackle.residual.hole_features import CELL, Cues
+from spackle.residual.view_features import CELL, ViewFeatures
 from spackle.training import composites
 from spackle.training.composites import composite
 from spackle.training.data import Supply
@@ -269,7 +269,7 @@ def test_no_blob_that_a_tile_shows_is_left_out(seed: int) -> None:
 def test_enough_cells_and_masked_ones_first(size: tuple[int, int], share: float) -> None:
     mask = torch.rand(size) < share
     alpha = (4 * torch.rand(size)).round() / 4  # many alike
-    cells = training_cells(Cues(torch.zeros(*size, 3), torch.zeros(size), alpha, mask))
+    cells = training_cells(ViewFeatures(torch.zeros(*size, 3), torch.zeros(size), alpha, mask))
     assert (cells | ~mask).all()
     assert int(cells.sum()) == max(int(mask.sum()), min(MIN_AUX, mask.numel()))
     if (cells & ~mask).any() and not cells.all():

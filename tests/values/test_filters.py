@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from spackle.filters import blurred, broadly_blurred, greatest_around, greatest_in_windows
+from spackle.filters import blurred, broadly_blurred, greatest_around, greatest_in_windows, nearest_known
 
 
 @pytest.mark.parametrize(("size", "sigma"), [((9, 13), 0.65), ((9, 13), 2.5), ((2, 5), 4.0), ((1, 1), 1.0)])
@@ -41,3 +41,13 @@ def test_the_greatest_value_around_is_that_of_a_plain_loop(reach: int) -> None:
     if 2 * reach < 7:
         inside = expected[:, reach : 7 - reach, reach : 11 - reach]
         assert torch.equal(greatest_in_windows(pictures, 2 * reach + 1), inside)
+
+
+@pytest.mark.parametrize(("size", "share"), [((1, 9), 0.5), ((23, 31), 0.9), ((40, 17), 0.997), ((30, 30), 0.1)])
+def test_the_nearest_known_cell_is_that_of_brute_force(size: tuple[int, int], share: float) -> None:
+    hole = np.random.default_rng(1).random(size) < share
+    hole[0, 0] = False
+    near, here = nearest_known(hole), np.indices(size)
+    found, best = np.hypot(*(near - here)), np.hypot(*(here[..., None] - np.argwhere(~hole).T[:, None, None])).min(-1)
+    assert not hole[tuple(near)].any()
+    assert (np.mean(found == best) > 0.99, np.abs(found - best).max() < 0.5) == (True, True)

@@ -16,11 +16,11 @@ import torch
 
 from spackle._numba import is_compiled
 from spackle.camera import Camera
-from spackle.inpaint.exemplar import exemplar
+from spackle.patches import match_patches
 from spackle.render import Renderer, get_renderer, place_of
 from spackle.render.blend import blend_tiles
-from spackle.residual import Completer
-from spackle.residual.occlusion_guard import OcclusionGuard, free_factors
+from spackle.scene_fill import FillContext, OcclusionGuard, fill_scene
+from spackle.scene_fill.occlusion_guard import free_factors
 from spackle.surface import surface_gaussians
 
 SIDE = 64  # pixels of the picture that the second process completes
@@ -53,12 +53,12 @@ def compile_kernels() -> None:
     depth = torch.full((SIDE, SIDE), 2.0)
     depth[SIDE // 4 : -SIDE // 4, SIDE // 4 : -SIDE // 4] = 1.0
     rgb, hole = torch.rand(SIDE, SIDE, 3), depth < 2
-    exemplar(rgb, hole, 1 / depth)
+    match_patches(rgb, hole, 1 / depth)
     shape = camera.pixel_centers().flatten(0, 1), 1 / depth.flatten(), torch.zeros(SIDE**2, 2)
     base = surface_gaussians(camera, *shape, 0.6, rgb.flatten(0, 1), torch.full((SIDE**2,), 0.9))
     guard = OcclusionGuard.of(get_renderer("cpu").render(base, camera), camera)
     free_factors(base, moved.position, [guard])
-    assert len(Completer(base, camera, get_renderer("cpu")).complete_scene([moved, camera]))
+    assert len(fill_scene(FillContext(base, camera, get_renderer("cpu")), [moved, camera]).aux)
 
 
 if __name__ == "__main__":

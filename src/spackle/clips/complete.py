@@ -27,8 +27,8 @@ from spackle.gaussians import Gaussians
 from spackle.progress import timed
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer, ResidualNet, hole_mask
-from spackle.residual.occlusion_guard import OcclusionGuard
+from spackle.residual import ResidualNet, hole_mask
+from spackle.scene_fill import FillContext, OcclusionGuard, fill_view
 
 FOLLOW = 0.05  # of the way to a new frame's depths, that is how far the path's go: a second or so to arrive
 
@@ -102,8 +102,9 @@ class ClipCompleter:
             if self.fill:
                 parts = (base, prediction.camera, self.renderer, self.network)
                 # Texture is found anew in each frame: it would flicker.
-                completer = Completer(*parts, texture=None, precision=self.precision)
-                aux, alone = completer.completed_view(camera, [guard], rendering=before)
+                context = FillContext(*parts, texture=None, precision=self.precision)
+                filled = fill_view(context, camera, [guard], before)
+                aux, alone = filled.aux, filled.rendering
         drawn, memory = CompletedView(camera, (base, aux), alone, before, alone, cut=past is not self._past), None
         if self.fill:
             with timed("carry", self.seconds):

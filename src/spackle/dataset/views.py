@@ -22,7 +22,8 @@ from spackle.gaussians import Gaussians
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, known_inverse_depth
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer, hole_mask
+from spackle.residual import hole_mask
+from spackle.scene_fill import FillContext, fill_scene
 
 APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
 SPARE = 6  # frames of a path that may coincide with others
@@ -115,7 +116,8 @@ def open_completion(name: str, options: InpainterOptions, renderer: Renderer) ->
 @torch.no_grad()
 def render_completed(views: ViewStack, renderer: Renderer) -> Tensor:
     """Each hole as one completed scene shows it, filled by seeds alone in the widest view: the same in all views."""
-    aux = Completer(views.base, views.photo_camera, renderer, texture=None).complete_scene(views.cameras, exact=True)
+    context = FillContext(views.base, views.photo_camera, renderer, texture=None)
+    aux = fill_scene(context, views.cameras, exact=True).aux
     targets = []
     for camera, target, hole in zip(views.cameras, views.rgb, views.mask, strict=True):
         if bool(hole.any()):

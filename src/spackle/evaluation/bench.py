@@ -29,7 +29,8 @@ from spackle.evaluation.timing import MS, TOTAL, Lap, Task, complete_in_laps, me
 from spackle.files import results_folder
 from spackle.machine import hardware, load_average, versions
 from spackle.progress import Reporter
-from spackle.residual import Completer, ResidualNet
+from spackle.residual import ResidualNet
+from spackle.scene_fill import FillContext
 from spackle.signals import asked_to_stop
 
 RESULTS, MARKDOWN, LATEX = "bench.json", "bench.md", "bench.tex"
@@ -105,27 +106,27 @@ def time_image(case: Case, tools: Evaluation, config: Mapping[str, Any], warm: b
     found = latest["base"]
     views = large_views(found, tools.options.disparities)
     precision = tools.options.base.precision
-    completer = Completer(found.gaussians, found.camera, tools.renderer, tools.network, precision=precision)
+    context = FillContext(found.gaussians, found.camera, tools.renderer, tools.network, precision=precision)
     wanted = [view for view in views if view.name == SIDE]
-    costs = [time_view(seconds, completer, view.setting, view.camera, config["runs"], device) for view in wanted]
+    costs = [time_view(seconds, context, view.setting, view.camera, config["runs"], device) for view in wanted]
     facts = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load, "warm": warm or not counts}
     return {"name": case.name, "facts": {**facts, "notes": found.notes}, "problem": None, "views": costs}
 
 
 def time_view(
-    base_s: Sequence[float], completer: Completer, setting: str, camera: Camera, runs: int, device: torch.device
+    base_s: Sequence[float], context: FillContext, setting: str, camera: Camera, runs: int, device: torch.device
 ) -> Record:
     """The cost of one view, which the tables call by `setting`; the base, on `device`, took `base_s` seconds."""
     added = 0
 
     def view(lap: Lap) -> None:
         nonlocal added
-        added = len(complete_in_laps(completer, camera, lap))
+        added = len(complete_in_laps(context, camera, lap))
 
     times = measure(runs, {"": view}, device)
     none = np.zeros(runs)  # of a view without holes, which is not rendered again
     stages = {name: (times.get(("", name), none) / MS).tolist() for name in STAGES if name != "base"}
-    return view_cost(setting, len(completer.base), added, {"base": base_s, **stages})
+    return view_cost(setting, len(context.base), added, {"base": base_s, **stages})
 
 
 def _finish(found: Efficiency, options: EvaluateOptions, output: Path, reporter: Reporter) -> None:

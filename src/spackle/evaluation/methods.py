@@ -17,13 +17,14 @@ from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer, ResidualNet, hole_mask
+from spackle.residual import ResidualNet, hole_mask
+from spackle.residual.base_values import make_seeds
 from spackle.residual.compose import compose
-from spackle.residual.hole_features import Cues
 from spackle.residual.network import predict_deltas
-from spackle.residual.occlusion_guard import OcclusionGuard, push_behind
-from spackle.residual.seeds import Rim, make_seeds
-from spackle.residual.texture import EXEMPLAR, Texture
+from spackle.residual.rim import find_rim
+from spackle.residual.view_features import ViewFeatures
+from spackle.scene_fill import FillContext, OcclusionGuard, Texture, exemplar_texture, fill_scene, fill_view
+from spackle.scene_fill.occlusion_guard import push_behind
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +43,13 @@ class Shot:
     @cached_property
     def guard(self) -> OcclusionGuard:
         """What the photo shows, which no completion may cover."""
-        return self.completer(None).photo_guard()
+        return self.context(None).photo_guard()
 
-    def completer(
-        self, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = EXEMPLAR
-    ) -> Completer:
+    def context(
+        self, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = exemplar_texture
+    ) -> FillContext:
         """What fills its holes; with seeds alone where there is no network."""
-        return Completer(self.base, self.prediction.camera, self.renderer, network, texture, precision=precision)
+        return FillContext(self.base, self.prediction.camera, self.renderer, network, texture, precision=precision)
 
     def draw(self, aux: Gaussians, index: int) -> View:
         """A view with aux Gaussians on top of the base."""
@@ -71,18 +72,18 @@ Method = Callable[[Shot], Iterator[View]]  # the views of a shot, in its order, 
 
 
 def _per_view(
-    shot: Shot, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = EXEMPLAR
+    shot: Shot, network: ResidualNet | None, precision: Precision = "auto", texture: Texture | None = exemplar_texture
 ) -> Iterator[View]:
     """Aux Gaussians for each view by itself (paper, section 3.4); seeds alone where there is no network."""
-    completer = shot.completer(network, precision, texture)
+    context = shot.context(network, precision, texture)
     for camera, before in zip(shot.cameras, shot.before, strict=True):
-        aux, drawn = completer.completed_view(camera, [shot.guard], rendering=before)
-        yield View(drawn.rgb, drawn.alpha, len(aux))
+        filled = fill_view(context, camera, [shot.guard], before)
+        yield View(filled.rendering.rgb, filled.rendering.alpha, len(filled.aux))
 
 
 def _one_scene(shot: Shot, network: ResidualNet | None, precision: Precision) -> Iterator[View]:
     """One set of aux Gaussians for all views of a shot together."""
-    aux = shot.completer(network, precision).complete_scene(shot.cameras, exact=True)
+    aux = fill_scene(shot.context(network, precision), shot.cameras, exact=True).aux
     for index in range(len(shot.cameras)):
         yield shot.draw(aux, index)
 
@@ -92,11 +93,11 @@ def _dense(shot: Shot, network: ResidualNet | None, precision: Precision) -> Ite
     """An aux Gaussian for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
     photo_camera = shot.prediction.camera
     for index, (camera, before) in enumerate(zip(shot.cameras, shot.before, strict=True)):
-        cues = Cues.of(before)
+        cues = ViewFeatures.of(before)
         seeds = make_seeds(cues, camera, photo_camera)
         deltas = None
         if network is not None:
-            rim = Rim.of(cues, seeds, camera, photo_camera)
+            rim, _ = find_rim(cues, seeds, camera, photo_camera)
             deltas = predict_deltas(network, cues, seeds, rim, precision, dense=True).flatten(0, 1)
         aux = compose(seeds.select(torch.ones_like(cues.mask)), deltas, camera)
         yield shot.draw(push_behind(aux, camera.position, [shot.guard]), index)

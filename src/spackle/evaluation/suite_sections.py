@@ -28,7 +28,8 @@ from spackle.render import CpuRenderer, Renderer
 from spackle.render.binning import list_tiles, sort_by_depth
 from spackle.render.pipeline import blend, project, wanted_tiles
 from spackle.render.project import KernelCamera
-from spackle.residual import Completer, ResidualNet, hole_area_ratio
+from spackle.residual import ResidualNet, hole_area_ratio
+from spackle.scene_fill import FillContext, fill_scene, fill_view
 
 LIMIT_RUNS = 7  # at least: the best run counts
 MATRIX_SIDE, COPY_MB = 2048, 256
@@ -129,8 +130,8 @@ def completion_section(
 ) -> Section:
     """One view, 5 % of which are holes, beside the base's render of it; without a network the seeds fill the holes."""
     disparity, camera = find_view(base, photo_camera, renderer)
-    completer = Completer(base, photo_camera, renderer, network)
-    times = measure(runs, {"": lambda lap: complete_in_laps(completer, camera, lap)}, device)
+    context = FillContext(base, photo_camera, renderer, network)
+    times = measure(runs, {"": lambda lap: complete_in_laps(context, camera, lap)}, device)
     render, guard, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
     names = (
         "base render of the view",
@@ -143,7 +144,7 @@ def completion_section(
     rows.append(SuiteRow("added time over base render", (place + redraw) / render, "×"))
     facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
     holes = hole_area_ratio(renderer.render(base, camera).alpha)
-    return rows, {**facts, "holes": holes, "added": len(completer.complete_view(camera))}
+    return rows, {**facts, "holes": holes, "added": len(fill_view(context, camera).aux)}
 
 
 def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES) -> tuple[float, Camera]:
@@ -181,13 +182,13 @@ def video_section(
     prediction, aux = lift(), Gaussians.empty()
     depths = DepthRange.of(prediction.gaussians)
     path = trajectory("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
-    completer = Completer(prediction.gaussians, prediction.camera, renderer, network)
+    context = FillContext(prediction.gaussians, prediction.camera, renderer, network)
 
     def scene(lap: Lap) -> None:
         nonlocal aux
         base = lift()
         lap(LIFT)
-        aux = Completer(base.gaussians, base.camera, renderer, network).complete_scene(path)
+        aux = fill_scene(FillContext(base.gaussians, base.camera, renderer, network), path).aux
         lap(COMPLETE)
         with torch.no_grad():  # as bytes, so that all frames fit into memory
             views = (renderer.render([base.gaussians, aux], camera).rgb for camera in path)
@@ -199,9 +200,9 @@ def video_section(
 
     def scratch(lap: Lap) -> None:
         for camera in path:
-            guard = completer.photo_guard()
+            guard = context.photo_guard()
             lap(GUARDS)
-            completer.completed_view(camera, [guard])
+            fill_view(context, camera, [guard])
             lap(EACH)
 
     times = measure(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)

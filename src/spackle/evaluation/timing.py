@@ -15,7 +15,7 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import Completer
+from spackle.scene_fill import FillContext, fill_view
 
 TOTAL = "total"
 MS = 1000.0
@@ -82,14 +82,14 @@ class _LappedRenderer:
 
 
 @torch.no_grad()
-def complete_in_laps(completer: Completer, camera: Camera, lap: Lap) -> Gaussians:
+def complete_in_laps(context: FillContext, camera: Camera, lap: Lap) -> Gaussians:
     """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
-    completer = completer.there
-    before = completer.renderer.render(completer.base, camera)
+    context = context.placed
+    before = context.renderer.render(context.base, camera)
     lap("view")
-    guard = completer.photo_guard()
+    guard = context.photo_guard()
     lap("photo")
-    inside = dataclasses.replace(completer, renderer=_LappedRenderer(completer.renderer, lap))
-    aux = inside.complete_view(camera, [guard], rendering=before)
+    inside = dataclasses.replace(context, renderer=_LappedRenderer(context.renderer, lap))
+    aux = fill_view(inside, camera, [guard], before).aux
     lap("completion")
     return aux

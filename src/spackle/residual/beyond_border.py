@@ -12,10 +12,9 @@ from torch import Tensor
 from spackle.camera import Camera, beside
 from spackle.color import bright_or_blue
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import broadly_blurred
-from spackle.inpaint.exemplar import nearest_known
+from spackle.filters import broadly_blurred, nearest_known
 from spackle.residual.epipolar_walk import WIDENING, walk, widened
-from spackle.residual.hole_features import Cues
+from spackle.residual.view_features import ViewFeatures
 
 AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go on beyond it
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
@@ -27,22 +26,28 @@ LEAST = 1e-9
 
 
 def fill_around(
-    cues: Cues, across: Tensor, uv: Tensor, known: Tensor, inside: Tensor, camera: Camera, photo_camera: Camera
+    features: ViewFeatures,
+    across: Tensor,
+    uv: Tensor,
+    known: Tensor,
+    inside: Tensor,
+    camera: Camera,
+    photo_camera: Camera,
 ) -> tuple[Tensor, Tensor]:
     """Inverse depth [h, w] and colours [3, h, w] of all cells, the photo continued beyond its border.
 
     Args:
-        cues: of the view.
+        features: of the view.
         across: [h, w] inverse depth, in holes that of all around.
         uv: [h, w, 2] pixels of the cells.
         known: [h, w] bool: cells to start from.
         inside: [h, w] bool: cells whose points lie in the photo's frame; what is behind goes on there.
         camera, photo_camera: the view's and the photo's.
     """
-    mask, bias = cues.mask, FAR_BIAS * inside
+    mask, bias = features.mask, FAR_BIAS * inside
     beyond = mask & ~inside
     if int(beyond.count_nonzero()) <= FEW * beyond.numel():
-        return far_fill(cues.inverse_depth, cues.rgb.permute(2, 0, 1), known, far_bias=bias)
+        return far_fill(features.inverse_depth, features.rgb.permute(2, 0, 1), known, far_bias=bias)
     # A cell's point times its inverse depth, in the photo's frame: ray + shift * inverse depth.
     here, there = (view.world_to_camera.double() for view in (camera, photo_camera))
     motion = beside(there @ here.inverse(), uv)
@@ -53,7 +58,7 @@ def fill_around(
     place = points[..., :2] / depth * photo_lens.diagonal()[:2] + photo_lens[:2, 2]
     size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
     ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    looks = torch.cat([cues.rgb, _sky(cues.rgb, known)[..., None]], dim=-1)
+    looks = torch.cat([features.rgb, _sky(features.rgb, known)[..., None]], dim=-1)
     values = torch.cat([looks, (across / depth[..., 0])[..., None], ends[..., None].float()], dim=-1)
 
     found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
@@ -63,11 +68,11 @@ def fill_around(
     found = widened(found, led & ~hidden, WIDENING * steps)
     away = 1 / found[..., 4].clamp_min(LEAST) - motion[2, 3]
     led = led & ~hidden & (away > 0) & (rays[..., 2] > 0)
-    nearest = torch.where(known, cues.inverse_depth, 0).amax()
+    nearest = torch.where(known, features.inverse_depth, 0).amax()
     carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
     bias = torch.where(hidden, FAR_BIAS, bias)
-    depths, mixed = far_fill(cues.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
+    depths, mixed = far_fill(features.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
     depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :4].movedim(-1, 0), mixed)
     others = beyond & ~led
     if bool(others.any()):

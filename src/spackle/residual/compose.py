@@ -15,7 +15,7 @@ from torch.nn.functional import softplus
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
-from spackle.residual.seeds import OPACITY, SPREAD_PX, Seeds
+from spackle.residual.base_values import OPACITY, SPREAD_PX, Seeds
 from spackle.surface import surface_gaussians
 
 # Channels of a delta field: three of geometry, eleven of texture, as in SHARP.

@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from spackle._numba import kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.residual.hole_features import CELL, GRAIN
+from spackle.residual.view_features import CELL, GRAIN
 
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line

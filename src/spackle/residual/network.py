@@ -16,10 +16,11 @@ from torch.nn.functional import interpolate, pad
 
 from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.network_file import fill_network, read_tensors
+from spackle.residual.base_values import Seeds
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
-from spackle.residual.hole_features import Cues
-from spackle.residual.seeds import Rim, Seeds
+from spackle.residual.rim import Rim
 from spackle.residual.sparse import Cells, conv_rows, crops_around, point_rows, relu_rows, upsampled
+from spackle.residual.view_features import ViewFeatures
 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
@@ -37,7 +38,7 @@ FEW = 0.45  # of a level's cells: where more are wanted, the convolution of all 
 STEM_GAIN = 3.0  # the features are of order 0.3
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 
-Grids = TypeVar("Grids", Cues, Seeds, Rim)
+Grids = TypeVar("Grids", ViewFeatures, Seeds, Rim)
 
 
 class ResidualBlock(nn.Module):
@@ -140,25 +141,31 @@ class ResidualNet(nn.Module):
         return _with_copies(heads[..., :height, :width], features)
 
 
-def network_input(cues: Cues, seeds: Seeds, rim: Rim) -> Tensor:
+def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
     """Features [1, 21, h, w], centred around zero; depths as log inverse depth over the view's median."""
-    cue_depth = torch.where(cues.inverse_depth > 0, (cues.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
+    cue_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
-    maps = [cue_depth, cues.alpha, cues.mask.to(cues.alpha), seed_depth]
+    maps = [cue_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
     grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
-    *colors, distance, mismatch = (grid[cues.mask] for grid in grids)  # elsewhere the rim is the cell itself
+    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere the rim is the cell itself
     own, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
     there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
-    far = there.new_zeros(*cues.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-    far[cues.mask] = there
-    channels = [cues.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
+    far = there.new_zeros(*view.mask.shape, IN_CHANNELS - CUE_CHANNELS)
+    far[view.mask] = there
+    channels = [view.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
 
 @torch.no_grad()
 def predict_deltas(
-    network: nn.Module, cues: Cues, seeds: Seeds, rim: Rim, precision: Precision = "auto", *, dense: bool = False
+    network: nn.Module,
+    view: ViewFeatures,
+    seeds: Seeds,
+    rim: Rim,
+    precision: Precision = "auto",
+    *,
+    dense: bool = False,
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; other cells are undefined.
 
@@ -167,20 +174,20 @@ def predict_deltas(
 
     Args:
         network: a `ResidualNet`; its features travel to the device where it lies.
-        cues, seeds, rim: of the same view.
+        view, seeds, rim: features of one view.
         precision: of the convolutions; auto is bfloat16 where the hardware multiplies it natively.
         dense: deltas of all cells.
     """
     device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
-    chosen = torch.ones_like(cues.mask) if dense else cues.mask
+    chosen = torch.ones_like(view.mask) if dense else view.mask
     few = network if isinstance(network, ResidualNet) and device.type == "cpu" and not dense else None
-    field = cues.alpha.new_zeros(*cues.mask.shape, DELTA_CHANNELS)
+    field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
     # Around all crops: autocast converts the weights once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE):
             there = outer.slices
-            features = network_input(_part(cues, there), _part(seeds, there), _part(rim, there)).to(device)
+            features = network_input(_part(view, there), _part(seeds, there), _part(rim, there)).to(device)
             own = torch.zeros_like(chosen[there])
             own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
             chosen_rows = own.view(-1).to(device)

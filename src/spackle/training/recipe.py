@@ -15,7 +15,7 @@ from spackle.device import Precision
 from spackle.downloads import installed
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
-from spackle.residual.hole_features import CELL
+from spackle.residual.view_features import CELL
 
 PACKAGED = Path(__file__).parent / "recipes"
 MAX_BYTES = 1 << 16

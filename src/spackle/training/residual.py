@@ -15,8 +15,8 @@ from spackle.files import make_folder, write_whole
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of, render_batch
 from spackle.residual.compose import compose
-from spackle.residual.hole_features import Cues
 from spackle.residual.network import ResidualNet, load_residual, network_input
+from spackle.residual.view_features import ViewFeatures
 from spackle.training.data import CACHE, Supply
 from spackle.training.recipe import Recipe
 from spackle.training.sample import Sample, load_sample
@@ -60,7 +60,7 @@ def complete_samples(
     )
 
 
-def training_cells(cues: Cues, least: int = MIN_AUX) -> Tensor:
+def training_cells(cues: ViewFeatures, least: int = MIN_AUX) -> Tensor:
     """[h, w] bool: the masked cells, and where they are fewer than `least` the most transparent others."""
     missing = least - int(cues.mask.sum())
     if missing <= 0:

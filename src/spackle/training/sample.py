@@ -22,8 +22,10 @@ from spackle.files import write_whole
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
-from spackle.residual.hole_features import CELL, Cues, hole_mask
-from spackle.residual.seeds import Rim, Seeds, make_seeds
+from spackle.residual.base_values import Seeds, make_seeds
+from spackle.residual.mask import hole_mask
+from spackle.residual.rim import Rim, find_rim
+from spackle.residual.view_features import CELL, ViewFeatures
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
 FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which an opaque blob is no longer drawn
@@ -46,7 +48,7 @@ class Sample:
     base: Gaussians  # those that touch the tiles around the holes
     rendering: Rendering  # of the whole base
     seeds: Seeds  # a grid, one for each 2×2 pixels
-    cues: Cues  # likewise
+    cues: ViewFeatures  # likewise
     rim: Rim  # likewise
     target: Tensor  # [H, W, 3] sRGB
 
@@ -56,9 +58,9 @@ class Sample:
 
         `photo_camera` is that of the base's photo.
         """
-        rendering, cues = rendering.detach(), Cues.of(rendering)
+        rendering, cues = rendering.detach(), ViewFeatures.of(rendering)
         seeds = make_seeds(cues, camera, photo_camera)
-        rim = Rim.of(cues, seeds, camera, photo_camera)
+        rim, _ = find_rim(cues, seeds, camera, photo_camera)
         return Sample(camera, base.detach(), rendering, seeds, cues, rim, target)
 
     @property
@@ -171,7 +173,7 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
             base=Gaussians(**parts["base"]),
             rendering=Rendering(**parts["rendering"]),
             seeds=Seeds(**parts["seeds"], unit=unit),
-            cues=Cues(**parts["cues"]),
+            cues=ViewFeatures(**parts["cues"]),
             rim=Rim(**parts["rim"]),
             target=parts["target"][""].float() / 255,
         )

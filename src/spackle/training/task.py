@@ -17,7 +17,7 @@ from spackle.device import pick_dtype
 from spackle.formats.png import thumbnail
 from spackle.progress import Reporter
 from spackle.render import get_renderer
-from spackle.residual.hole_features import hole_area_ratio
+from spackle.residual.mask import hole_area_ratio
 from spackle.training.features import load_features
 from spackle.training.losses import hole_psnr, total_loss
 from spackle.training.recipe import Recipe

@@ -1,4 +1,4 @@
-"""The plain twin of the costs in `spackle.inpaint.exemplar`: the formula, for all sources of a cell at once."""
+"""The plain twin of the costs in `spackle.patches`: the formula, for all sources of a cell at once."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view as windows
 
+from spackle import patches as room
 from spackle.filters import blurred
-from spackle.inpaint import exemplar as room
-from spackle.inpaint.exemplar import RADIUS, SIDE
+from spackle.patches import RADIUS, SIDE
 
 INNER = slice(RADIUS, -RADIUS)
 

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 
+from torch import Tensor
+
 from spackle.camera import Camera
 from spackle.fill import far_fill
+from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
+from spackle.residual.base_values import BLOB_CELLS, Seeds, placed_behind
 from spackle.residual.compose import compose
-from spackle.residual.hole_features import CELL, Cues
-from spackle.residual.seeds import BLOB_CELLS, Seeds, placed_behind
-from spackle.residual.sparse import Cells
+from spackle.residual.view_features import CELL
 from spackle.surface import surface_slope
 
 REACH_CELLS = 6  # how far beneath the rim
@@ -21,23 +23,27 @@ COARSE = 3  # one Gaussian for COARSE × COARSE cells, as much larger: what lies
 EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 
-def rim_underlay(cues: Cues, seeds: Seeds, camera: Camera) -> Gaussians:
-    """What goes on beneath the surfaces around the holes of a view, as the holes' seeds do, behind all that is seen.
+def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
+    """Gaussians that extend the holes' seeds beneath the surfaces around the holes, behind all that is seen.
 
-    From beside, the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This closes
-    most such slits before they open: on a path fewer views are left to complete, and they show the same.
+    From another view the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This
+    closes most such slits before they open: fewer views of a path are left to complete, and they show the same.
+
+    Args:
+        mask: [h, w] bool: the cells of the view's holes.
+        seeds: of all cells.
+        camera: the view.
     """
-    rim = (Cells(cues.mask).grown(REACH_CELLS).grid & ~cues.mask)[EVERY]
+    rim = (greatest_around(mask, REACH_CELLS) & ~mask)[EVERY]
     known, rgb = ~rim, seeds.rgb[EVERY].permute(2, 0, 1)
     if not bool(rim.any()) or not bool(known.any()):
         return Gaussians.empty()
     coarse, rgb = far_fill(seeds.inverse_depth[EVERY], rgb, known)
     # At the rim, behind all that is seen or filled as far around as a blob reaches.
-    shown = dataclasses.replace(cues, inverse_depth=seeds.inverse_depth)
-    depth, chosen = seeds.inverse_depth.clone(), cues.mask.new_zeros(cues.mask.shape)
+    depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
     depth[EVERY], chosen[EVERY] = coarse, rim
-    placed = placed_behind(depth, chosen, shown, COARSE * BLOB_CELLS)[EVERY]
+    placed = placed_behind(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
     slope = surface_slope(placed) / (COARSE * CELL)
-    there = Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
-    fine = compose(there, None, camera)
+    beneath = Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim)
+    fine = compose(beneath, None, camera)
     return dataclasses.replace(fine, scales=COARSE * fine.scales)

@@ -11,60 +11,42 @@ from holes import random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
 
 from spackle.camera import Camera
-from spackle.fill import far_fill
 from spackle.render.protocol import Rendering
-from spackle.residual import CELL, Cues, Seeds, make_seeds
-from spackle.residual.beyond_border import fill_around
+from spackle.residual import Seeds, ViewFeatures, make_seeds
+from spackle.residual.base_values import BEHIND, BLOB_CELLS, inside_photo
 from spackle.residual.epipolar_walk import CRISP, SAME_DEPTH, WIDENING
-from spackle.residual.seeds import BEHIND, BLOB_CELLS, Rim, cell_centers
-from spackle.surface import surface_slope
-
-
-def plain_seeds(cues: Cues, camera: Camera, photo_camera: Camera) -> Seeds:
-    """`make_seeds` of a view that shows something: whole grids, one torch operation at a time."""
-    share = avg_pool2d(cues.covered.float()[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
-    choices = (cues.covered & (share > 0.5), cues.covered, cues.inverse_depth > 0)
-    known = next(choice for choice in choices if choice.any())
-    uv, colors = cell_centers(camera), cues.rgb.permute(2, 0, 1)
-    across, _ = far_fill(cues.inverse_depth, colors, known, far_bias=0.0)
-    point = camera.to(dtype=torch.float64).unproject(uv.double(), 1.0 / across.double())
-    place, z = photo_camera.project(point)
-    size = torch.tensor([photo_camera.width, photo_camera.height])
-    inside = ((place >= 0) & (place < size)).all(-1) & (z > 0)
-    filled, rgb = fill_around(cues, across, uv, known, inside, camera, photo_camera)
-    seen = torch.where(cues.inverse_depth > 0, cues.inverse_depth, torch.inf)
-    close = -max_pool2d(-seen[None, None], 2 * BLOB_CELLS + 1, stride=1, padding=BLOB_CELLS)[0, 0]
-    inverse_depth = torch.where(cues.mask, torch.minimum(filled, close) * (1.0 - BEHIND), filled)
-    slope = surface_slope(inverse_depth) / CELL
-    return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
+from spackle.residual.rim import Rim, find_rim
+from spackle.residual.view_features import cell_centers
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 40), st.integers(1, 40)), st.floats(0, 1))
-def test_seeds_match_their_plain_twin(seed: int, size: tuple[int, int], solid: float) -> None:
-    view = random_view(seed, *size)
-    generator = torch.Generator().manual_seed(seed)
-    closed = torch.rand(size, generator=generator) < solid
-    closed[seed % size[0], seed % size[1]] = True
-    depth = torch.where(closed, 1 + 3 * torch.rand(size, generator=generator), view.depth)
-    cues = Cues.of(Rendering(view.rgb, depth, torch.where(closed, 1.0, view.alpha)))
-    photo_camera = Camera.from_focal(25, size[1], size[0])
-    camera = photo_camera.looking(torch.rand(3, generator=generator) - 0.5, torch.tensor([0.1, 0.2, 3.0]))
-    found, plain = make_seeds(cues, camera, photo_camera), plain_seeds(cues, camera, photo_camera)
-    for field in dataclasses.fields(Seeds):
-        one, other = getattr(found, field.name), getattr(plain, field.name)
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-7, msg=field.name)
-    chosen = found.select(cues.mask)
+@given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 40), st.integers(1, 40)))
+def test_seeds_of_any_view_lie_behind_what_is_seen(seed: int, size: tuple[int, int]) -> None:
+    features, camera = ViewFeatures.of(random_view(seed, *size)), Camera.from_focal(25, size[1], size[0])
+    seeds = make_seeds(features, camera, camera)
+    assert all(bool(t.isfinite().all()) for t in (seeds.uv, seeds.inverse_depth, seeds.slope, seeds.rgb))
+    assert float(seeds.inverse_depth.min()) > 0
+    assert 0 <= float(seeds.rgb.min()) <= float(seeds.rgb.max()) <= 1
+    for y, x in features.mask.nonzero().tolist():
+        near = (slice(max(y - BLOB_CELLS, 0), y + BLOB_CELLS + 1), slice(max(x - BLOB_CELLS, 0), x + BLOB_CELLS + 1))
+        seen = features.inverse_depth[near]
+        if bool((seen > 0).any()):
+            assert float(seeds.inverse_depth[y, x]) <= float(seen[seen > 0].min()) * (1 - BEHIND / 2)
+    chosen = seeds.select(features.mask)
     for name in ("uv", "inverse_depth", "slope", "rgb"):
-        assert torch.equal(getattr(chosen, name), getattr(found, name)[cues.mask])
-    assert chosen.unit == found.unit
-    any_view = make_seeds(Cues.of(view), photo_camera, photo_camera)  # it may show nothing at all
-    assert all(bool(t.isfinite().all()) for t in (any_view.uv, any_view.inverse_depth, any_view.slope, any_view.rgb))
-    assert float(any_view.inverse_depth.min()) > 0
-    assert 0 <= float(any_view.rgb.min()) <= float(any_view.rgb.max()) <= 1
+        assert torch.equal(getattr(chosen, name), getattr(seeds, name)[features.mask])
+
+
+def test_the_photos_frame_is_found_point_by_point() -> None:
+    photo = Camera.from_focal(25, 40, 30)
+    camera = photo.looking(torch.tensor([0.4, -0.2, 0.1]), torch.tensor([0.1, 0.2, 3.0]))
+    inverse = 0.1 + torch.rand(15, 20, generator=torch.Generator().manual_seed(0))
+    place, z = photo.project(camera.unproject(cell_centers(camera), 1 / inverse))
+    expected = (z > 0) & ((place >= 0) & (place < torch.tensor([40, 30]))).all(-1)
+    assert 10 < int(expected.sum()) < 290
+    assert torch.equal(inside_photo(inverse, camera, photo), expected)
 
 
 def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
@@ -72,7 +54,7 @@ def test_where_nothing_is_seen_seeds_make_a_grey_wall() -> None:
     centers = cell_centers(camera)
     assert (centers.shape, centers[1, 2].tolist()) == ((2, 3, 2), [5.0, 3.0])
     empty = Rendering(torch.zeros(3, 5, 3), torch.zeros(3, 5), torch.zeros(3, 5))
-    seeds = make_seeds(Cues.of(empty), camera, camera)
+    seeds = make_seeds(ViewFeatures.of(empty), camera, camera)
     assert torch.equal(seeds.inverse_depth, torch.full((2, 3), 0.1))
     assert torch.equal(seeds.rgb, torch.full((2, 3, 3), 0.5))
 
@@ -90,9 +72,9 @@ def moved(*eye: float) -> Camera:
 
 
 def rim_of(mask: Tensor, inverse_depth: Tensor, camera: Camera, rgb: Tensor) -> Rim:
-    cues = Cues(rgb, inverse_depth, (~mask).float(), mask)
+    cues = ViewFeatures(rgb, inverse_depth, (~mask).float(), mask)
     seeds = Seeds(cell_centers(camera), inverse_depth, torch.zeros(HEIGHT, WIDTH, 2), rgb)
-    return Rim.of(cues, seeds, camera, CAMERA)
+    return find_rim(cues, seeds, camera, CAMERA)[0]
 
 
 def strip(first: int, last: int) -> Tensor:
@@ -141,9 +123,9 @@ def test_a_speck_at_the_border_fades_within_a_few_times_its_size() -> None:
     rgb[31:33, :41] = torch.tensor([0.9, 0.1, 0.1])
     mask = torch.zeros(64, 128, dtype=torch.bool)
     mask[:, 41:] = True
-    depth, camera = torch.ones(64, 128), moved(*SIDEWAYS)
+    depth, camera = torch.ones(64, 128), dataclasses.replace(moved(*SIDEWAYS), width=256, height=128)
     seeds = Seeds(cell_centers(Camera.from_focal(40, 256, 128)), depth, torch.zeros(64, 128, 2), rgb)
-    rim = Rim.of(Cues(rgb, depth, (~mask).float(), mask), seeds, camera, CAMERA)
+    rim, _ = find_rim(ViewFeatures(rgb, depth, (~mask).float(), mask), seeds, camera, CAMERA)
     for found in (rim.rgb, rim.mirrored[:, 82:]):  # what is farther than the photo is wide is not mirrored
         assert float((found[..., 0] - 0.3)[:, -25:].abs().max()) < 0.1  # of 0.6
     assert float(rim.rgb[31:33, 41:45, 0].min()) > 0.6

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.render.protocol import Rendering
-from spackle.residual import Cues, hole_area_ratio, hole_mask
+from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
 
 
 def test_a_hole_is_where_alpha_is_below_the_threshold() -> None:
@@ -36,11 +36,10 @@ def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], flo
 @given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 7), st.integers(1, 7)))
 def test_cues_match_a_plain_loop_and_are_cut_off_from_what_made_them(seed: int, size: tuple[int, int]) -> None:
     view = random_view(seed, *size)
-    cues = Cues.of(Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha))))
+    cues = ViewFeatures.of(Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha))))
     assert not any(t.requires_grad for t in (cues.rgb, cues.inverse_depth, cues.alpha))
     rows, columns = math.ceil(size[0] / 2), math.ceil(size[1] / 2)
     assert cues.mask.shape == (rows, columns)
-    assert torch.equal(cues.covered, ~cues.mask)
     for row in range(rows):
         for column in range(columns):
             rgb, inverse, alpha, mask = plain_cell(view, row, column)

@@ -18,14 +18,14 @@ from torch.nn.functional import max_pool2d
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.residual import hole_mask
-from spackle.residual.occlusion_guard import (
+from spackle.scene_fill import OcclusionGuard
+from spackle.scene_fill.occlusion_guard import (
     CLEARANCE,
     MAX_REACH_PX,
     PIT,
     REACH,
     STEPS,
     WINDOW_PX,
-    OcclusionGuard,
     push_behind,
     without_pits,
 )

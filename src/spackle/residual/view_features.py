@@ -1,7 +1,4 @@
-"""The mask M_v of a rendered view (paper, section 3.2, eq. 4), and what the residual looks at, cell by cell.
-
-The grid has one cell for each 2×2 pixels.
-"""
+"""What a rendered view shows, cell by cell: the input of f_res (paper, section 3.3). One cell has 2×2 pixels."""
 
 from __future__ import annotations
 
@@ -13,32 +10,22 @@ import torch
 from torch import Tensor
 
 from spackle._numba import kernel
+from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
+from spackle.residual.mask import MASK_THRESHOLD
 
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
 CLOSEST, FAINTEST = np.float32(1e-6), np.float32(1e-6)  # depth and summed opacity that are divided by, at least
 GRAIN = 16  # rows of cells that a thread takes at a time
 PROCESSOR = torch.device("cpu")
-MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (paper, eq. 4)
-
-
-def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
-    """M_v(p) = 1[A_v(p) < τ_α] (paper, eq. 4): [H, W] bool, true where nothing was seen."""
-    return alpha < threshold
-
-
-def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
-    """HAR = 1 − coverage (paper, section 4.2, eqs. 10 and 11): the share of hole pixels."""
-    hole = hole_mask(alpha, threshold)
-    return int(np.count_nonzero(hole.cpu().numpy())) / hole.numel()  # of what counts bits, numpy is the fastest by far
 
 
 @dataclasses.dataclass(frozen=True)
-class Cues:
-    """A view's cells, on the processor, detached from whatever made them. Grid: ceil(H/2) × ceil(W/2)."""
+class ViewFeatures:
+    """A view's cells, on the processor and detached from whatever made them. Grid: h × w = ceil(H/2) × ceil(W/2)."""
 
     rgb: Tensor  # [h, w, 3] sRGB of the covered part of the cell, without the black behind it
     inverse_depth: Tensor  # [h, w] farthest covered pixel's 1/z; 0 in a cell without any
@@ -46,8 +33,8 @@ class Cues:
     mask: Tensor  # [h, w] bool: some pixel of the cell is a hole
 
     @staticmethod
-    def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> Cues:
-        """Gather the cells of a rendering; an odd last row or column stands for its twin too."""
+    def of(rendering: Rendering, threshold: float = MASK_THRESHOLD) -> ViewFeatures:
+        """Gather the cells of a rendering; an odd last row or column is repeated."""
         rendering = rendering.to(PROCESSOR).detach()
         images = (rendering.rgb.flatten(1), rendering.depth, rendering.alpha)
         view = [image.float().contiguous().numpy() for image in images]
@@ -57,26 +44,12 @@ class Cues:
         cells, low = (rgb, inverse_depth, alpha, mask), np.float32(threshold)
         run_chunks(lambda start, stop: _gather(start, stop, *view, low, *cells), rows, GRAIN)
         colors = rgb.reshape(rows, columns, CHANNELS)
-        return Cues(*(torch.from_numpy(image) for image in (colors, inverse_depth, alpha, mask)))
-
-    @property
-    def covered(self) -> Tensor:
-        """[h, w] bool: the cells without a hole, which the fill may start from."""
-        return ~self.mask
+        return ViewFeatures(*(torch.from_numpy(image) for image in (colors, inverse_depth, alpha, mask)))
 
 
-def in_cells(picture: Tensor) -> Tensor:
-    """The pixels of each cell, [h, w, 2, 2, c] of [H, W, c]; an odd last row or column stands for its twin too."""
-    below, beside = (size % CELL for size in picture.shape[:2])
-    whole = torch.cat([picture, picture[-1:]]) if below else picture
-    whole = torch.cat([whole, whole[:, -1:]], dim=1) if beside else whole
-    rows, columns = (size // CELL for size in whole.shape[:2])
-    return whole.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
-
-
-def from_cells(blocks: Tensor) -> Tensor:
-    """The picture [2h, 2w, c] of pixels [h, w, 2, 2, c]."""
-    return blocks.transpose(1, 2).flatten(2, 3).flatten(0, 1)
+def cell_centers(camera: Camera) -> Tensor:
+    """[ceil(H/2), ceil(W/2), 2] in pixels."""
+    return camera.even().pixel_centers(stride=CELL)
 
 
 @kernel

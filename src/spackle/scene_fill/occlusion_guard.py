@@ -19,7 +19,8 @@ from spackle.device import run_chunks
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
-from spackle.residual.hole_features import MASK_THRESHOLD, PROCESSOR
+from spackle.residual.mask import MASK_THRESHOLD
+from spackle.residual.view_features import PROCESSOR
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre

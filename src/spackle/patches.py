@@ -1,0 +1,336 @@
+"""PatchMatch: a hole is filled from the picture itself, from coarse to fine.
+
+Each cell of a hole searches for a patch of the known part that matches what is around it (Barnes et al. 2009). All
+patches over a cell vote for its colour. Both steps alternate from coarse to fine (Wexler et al. 2007). The cost of a
+patch at q for a cell p adds up colours, the depth and the tone of its centre, and how far away it is:
+
+    cost = mean |I(p + o) - I(q + o)|²  +  (0.15 dz / σz)²  +  2 |L(p) - L(q)|²  +  0.05 (|p - q| / size)²
+
+over the offsets o of a patch, with colours I, the logarithm z of inverse depth and the tone L, which is the caller's
+guess, blurred. The mean counts a cell of the hole the less the deeper it lies.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from spackle._numba import kernel, reordering_kernel
+from spackle.device import run_chunks
+from spackle.filters import blurred, greatest_around, nearest_known
+
+RADIUS = 3  # patches have 7×7 cells
+SIDE = 2 * RADIUS + 1
+COARSEST = 48  # cells of the short side; no level is smaller
+ROUNDS = 6  # of search and vote at each level
+JUMPS = (4, 1)  # cells to the neighbours whose matches are tried, one search after the other
+MIRRORS = 2  # sources: the picture, and the picture mirrored left to right
+TONE_CELLS = 4.0  # standard deviation of the blur that makes the tone
+FADING = 0.8  # weight of a cell in a patch, for each cell that it lies deeper in the hole
+FAINTEST_CELL = np.float32(1e-30)  # weight of the deepest: still far from what float32 rounds to nothing
+DEPTH_WEIGHT, TONE_WEIGHT, OFFSET_WEIGHT = 0.15, math.sqrt(2), 0.05
+LEAST_SPREAD = 0.05  # of z: a wall that faces the camera has no depth to tell its parts apart by
+SAME_SURFACE = 0.25  # standard deviations of z by which a mirrored start may lie before or behind its place
+FAINTEST_VOTE, LEAST_COST = 1e-6, 1e-8
+GRAIN = 256  # cells that a thread takes at a time
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int32]
+
+
+@dataclasses.dataclass(frozen=True)
+class Patches:
+    """A picture whose hole is filled by patches of its known part."""
+
+    rgb: Tensor  # [H, W, 3] sRGB; outside of the hole as it was
+    mismatch: Tensor  # [H, W] root of the cost of each cell's patch; 0 outside of the hole
+    matches: Tensor  # [H, W, 3] picture (1 is the mirrored one), row, column of that patch; -1 where there is none
+
+
+def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches:
+    """Fill a hole by patches of the known part; the result is the same for any number of threads.
+
+    Args:
+        guess: [H, W, 3] sRGB; in the hole smooth colours, whose blur is the tone that a patch should have.
+        hole: [H, W] bool.
+        inverse_depth: [H, W], positive everywhere.
+    """
+    levels = _pyramid(guess.detach().float(), hole, inverse_depth.detach().float())
+    matches = None
+    for number in reversed(range(len(levels))):
+        matches = _match(levels[number], matches, number)
+    mismatch, places = np.zeros(hole.shape, np.float32), np.full((*hole.shape, 3), -1, np.int32)
+    if matches is not None:
+        mismatch[levels[0].hole], places[levels[0].hole] = np.sqrt(matches.costs), matches.places
+    return Patches(*(torch.from_numpy(grid) for grid in (levels[0].rgb, mismatch, places)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Level:
+    """The picture at one size, h × w cells."""
+
+    rgb: Floats  # [h, w, 3]; in the hole the latest votes, written in place
+    traits: Floats  # [h, w, 4] tone and depth, each in roots of the cost
+    hole: Bools  # [h, w]
+    weights: Floats  # [h + 6, w + 6] of a cell in a patch; 0 beyond the picture
+
+
+@dataclasses.dataclass(frozen=True)
+class _Matches:
+    """The best patch so far of each of the n cells of a level's hole."""
+
+    numbers: Ints  # [h, w] of each cell in the lists below; -1 outside of the hole
+    places: Ints  # [n, 3] source, row, column of the patch's centre
+    costs: Floats  # [n]
+
+
+def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
+    """The finest level first. The hole starts as what is mirrored at its rim, where that is the same surface."""
+    log = inverse_depth.clamp_min(1e-9).log()
+    depth = log / max(float(log[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
+    levels: list[_Level] = []
+    rgb, tone = guess, guess
+    for number in itertools.count():
+        near = nearest_known(hole.numpy())
+        if not number:
+            mirrored = rgb.numpy().copy()
+            _mirror(mirrored, hole.numpy(), depth.numpy(), near)
+            rgb = torch.from_numpy(mirrored)
+        tones = TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2**number, 0.5))
+        traits = torch.cat([tones, DEPTH_WEIGHT * depth[..., None]], dim=-1)
+        weights = np.zeros([size + 2 * RADIUS for size in hole.shape], np.float32)
+        inside = np.hypot(*(near - np.indices(hole.shape)).astype(np.float32))
+        weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.maximum(np.float32(FADING) ** inside, FAINTEST_CELL)
+        levels.append(_Level(rgb.numpy().copy(), np.ascontiguousarray(traits.numpy()), hole.numpy(), weights))
+        coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
+        if min(hole.shape) < 2 * COARSEST or bool(coarse_hole.all()) or not bool(hole.any()):
+            return levels
+        rgb, tone, depth = _halved(rgb), _halved(tone), _halved(depth[..., None])[..., 0]
+        hole = coarse_hole
+    raise AssertionError
+
+
+def _halved(image: Tensor) -> Tensor:
+    """Means of 2×2 cells of [h, w, c]."""
+    planes = image.permute(2, 0, 1)
+    return avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)
+
+
+@kernel
+def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
+    """In place: what lies as far beyond the nearest known cell as a cell lies before it, if its depth is alike."""
+    height, width = hole.shape
+    for y in range(height):
+        for x in range(width):
+            if hole[y, x]:
+                v, u = 2 * near[0, y, x] - y, 2 * near[1, y, x] - x
+                inside = 0 <= v < height and 0 <= u < width
+                if inside and not hole[v, u] and abs(depth[v, u] - depth[y, x]) < SAME_SURFACE:
+                    rgb[y, x] = rgb[v, u]
+
+
+def _match(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
+    """Search and vote in turn, the level's colours in place; None where there is no hole, or no patch for it."""
+    usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
+    usable[:RADIUS] = usable[-RADIUS:] = False
+    usable[:, :RADIUS] = usable[:, -RADIUS:] = False
+    if not usable.any() or not level.hole.any():
+        return None
+    height, width = level.hole.shape
+    cells = np.argwhere(level.hole).astype(np.int32)
+    numbers = np.full((height, width), -1, np.int32)
+    numbers[level.hole] = np.arange(len(cells))
+    pool = np.argwhere(usable).astype(np.int32)
+    both = (level.rgb, level.traits, usable)
+    sources, traits, valid = (np.ascontiguousarray(np.stack([grid, grid[:, ::-1]])) for grid in both)
+    places, costs = np.empty((len(cells), 3), np.int32), np.zeros(len(cells), np.float32)
+    parents = (coarse.numbers, coarse.places) if coarse else (numbers, places)
+    _begin(cells, coarse is not None, *parents, valid, pool, places)
+    padded = np.pad(level.rgb, ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
+    shown = padded[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    target = (padded, level.weights, level.traits, sources, traits, np.float32(OFFSET_WEIGHT / max(height, width) ** 2))
+
+    def vote(mean: float) -> None:
+        limit = np.float32(max(mean, LEAST_COST))
+        run_chunks(
+            lambda start, stop: _vote(start, stop, cells, numbers, places, costs, limit, sources, level.rgb),
+            len(cells),
+            GRAIN,
+        )
+        shown[:] = level.rgb
+
+    if coarse is not None:
+        vote(1.0)  # of costs that are all zero
+    for turn in range(ROUNDS):
+        run_chunks(lambda start, stop: _score(start, stop, cells, places, *target, costs), len(cells), GRAIN)
+        for jump in JUMPS:
+            seed = np.uint32(((number * ROUNDS + turn) * len(JUMPS) + jump) * 7919)
+            before = (numbers, places.copy(), costs.copy(), valid, pool, jump, seed)
+            run_chunks(
+                lambda start, stop, before=before: _search(start, stop, cells, *before, *target, places, costs),  # type: ignore[misc]
+                len(cells),
+                GRAIN,
+            )
+        vote(float(costs.mean()))
+    return _Matches(numbers, places, costs)
+
+
+@kernel
+def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: Any, pool: Any, places: Any) -> None:
+    """Matches of a level: its parent's, twice as far; or any."""
+    rows, columns = coarse_numbers.shape
+    height, width = valid.shape[1:]
+    for n in range(len(cells)):
+        y, x = cells[n]
+        k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
+        pick = pool[_hash(np.uint32(n)) % np.uint32(len(pool))]
+        m, v, u = np.int64(0), np.int64(pick[0]), np.int64(pick[1])
+        if k >= 0:
+            # A mirrored picture's cells begin at the other side.
+            side = width - 2 * columns if coarse[k, 0] else 0
+            row, column = 2 * coarse[k, 1] + y % 2, 2 * coarse[k, 2] + x % 2 + side
+            if 0 <= row < height and 0 <= column < width and valid[coarse[k, 0], row, column]:
+                m, v, u = np.int64(coarse[k, 0]), np.int64(row), np.int64(column)
+        places[n, 0], places[n, 1], places[n, 2] = m, v, u
+
+
+@kernel
+def _hash(value: Any) -> Any:
+    """A uint32 that looks random."""
+    value = np.uint32(value)
+    value ^= value >> np.uint32(16)
+    value = np.uint32(value * np.uint32(0x7FEB352D))
+    value ^= value >> np.uint32(15)
+    value = np.uint32(value * np.uint32(0x846CA68B))
+    value ^= value >> np.uint32(16)
+    return value
+
+
+@reordering_kernel
+def _patch_cost(padded: Any, weights: Any, source: Any, y: int, x: int, v: int, u: int, bound: Any) -> Any:
+    """Weighted mean of the squared differences of two patches; infinite as soon as it must exceed the bound."""
+    total, mass = np.float32(0), np.float32(0)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            mass += weights[y + j, x + i]
+    limit = bound * mass
+    for j in range(SIDE):
+        for i in range(SIDE):
+            red = padded[y + j, x + i, 0] - source[v + j - RADIUS, u + i - RADIUS, 0]
+            green = padded[y + j, x + i, 1] - source[v + j - RADIUS, u + i - RADIUS, 1]
+            blue = padded[y + j, x + i, 2] - source[v + j - RADIUS, u + i - RADIUS, 2]
+            total += weights[y + j, x + i] * (red * red + green * green + blue * blue)
+        if total > limit:
+            return np.float32(np.inf)
+    return total / mass
+
+
+@kernel
+def _cost(
+    padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any,
+    y: int, x: int, m: int, v: int, u: int, bound: Any,
+) -> Any:  # fmt: skip
+    """Of the patch of source m around (v, u) for the cell (y, x); infinite where it exceeds the bound."""
+    cost = np.float32(0)
+    for c in range(own.shape[2]):
+        apart = own[y, x, c] - traits[m, v, u, c]
+        cost += apart * apart
+    across = x - (own.shape[1] - 1 - u if m else u)
+    cost += offset * np.float32((y - v) * (y - v) + across * across)
+    if cost >= bound:
+        return np.float32(np.inf)
+    return cost + _patch_cost(padded, weights, sources[m], y, x, v, u, bound - cost)
+
+
+@kernel
+def _score(
+    start: int, stop: int, cells: Any, places: Any,
+    padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, costs: Any,
+) -> None:  # fmt: skip
+    """The costs of the matches start..stop, since the colours have changed."""
+    whole = np.float32(1e30)
+    for n in range(start, stop):
+        y, x = cells[n]
+        m, v, u = places[n]
+        costs[n] = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, whole)
+
+
+@kernel
+def _search(
+    start: int, stop: int, cells: Any, numbers: Any, before: Any, worth: Any, valid: Any, pool: Any, jump: int,
+    seed: Any, padded: Any, weights: Any, own: Any, sources: Any, traits: Any, offset: Any, places: Any, costs: Any,
+) -> None:  # fmt: skip
+    """Better matches for the cells start..stop: their neighbours', any, and some ever nearer to the best."""
+    mirrors, height, width = valid.shape
+    for n in range(start, stop):
+        y, x = cells[n]
+        best, bm, bv, bu = worth[n], np.int64(before[n, 0]), np.int64(before[n, 1]), np.int64(before[n, 2])
+        for turn in range(4):
+            dy = jump if turn == 0 else -jump if turn == 1 else 0
+            dx = jump if turn == 2 else -jump if turn == 3 else 0
+            if not (0 <= y + dy < height and 0 <= x + dx < width):
+                continue
+            k = numbers[y + dy, x + dx]
+            if k < 0:
+                continue
+            m, v, u = np.int64(before[k, 0]), np.int64(before[k, 1]) - dy, np.int64(before[k, 2]) - dx
+            if 0 <= v < height and 0 <= u < width and valid[m, v, u]:
+                cost = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, best)
+                if cost < best:
+                    best, bm, bv, bu = cost, m, v, u
+        chance = _hash(np.uint32(n) * np.uint32(9781) + seed)
+        pick = pool[chance % np.uint32(len(pool))]
+        chance = _hash(chance)
+        m = np.int64(chance % np.uint32(mirrors))
+        v, u = np.int64(pick[0]), np.int64(width - 1 - pick[1] if m else pick[1])
+        cost = _cost(padded, weights, own, sources, traits, offset, y, x, m, v, u, best)
+        if cost < best:
+            best, bm, bv, bu = cost, m, v, u
+        reach = max(height, width) // 4
+        while reach >= 1:
+            chance = _hash(chance)
+            span = np.uint32(2 * reach + 1)
+            v = bv + np.int64(chance % span) - reach
+            u = bu + np.int64((chance >> np.uint32(12)) % span) - reach
+            if 0 <= v < height and 0 <= u < width and valid[bm, v, u]:
+                cost = _cost(padded, weights, own, sources, traits, offset, y, x, bm, v, u, best)
+                if cost < best:
+                    best, bv, bu = cost, v, u
+            reach //= 4
+        costs[n] = best
+        places[n, 0], places[n, 1], places[n, 2] = bm, bv, bu
+
+
+@kernel
+def _vote(
+    start: int, stop: int, cells: Any, numbers: Any, places: Any, costs: Any, mean: Any, sources: Any, rgb: Any
+) -> None:
+    """Colours of the cells start..stop: the mean of what all patches over them say, the better ones counting more."""
+    height, width = numbers.shape
+    for n in range(start, stop):
+        y, x = cells[n]
+        red, green, blue, mass = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        for dy in range(-RADIUS, RADIUS + 1):
+            for dx in range(-RADIUS, RADIUS + 1):
+                if not (0 <= y + dy < height and 0 <= x + dx < width):
+                    continue
+                k = numbers[y + dy, x + dx]
+                if k < 0:
+                    continue
+                # A patch lies within its source, so this is there.
+                m, v, u = places[k, 0], places[k, 1] - dy, places[k, 2] - dx
+                weight = np.float32(np.exp(-costs[k] / mean)) + np.float32(FAINTEST_VOTE)
+                red += weight * sources[m, v, u, 0]
+                green += weight * sources[m, v, u, 1]
+                blue += weight * sources[m, v, u, 2]
+                mass += weight
+        rgb[y, x, 0], rgb[y, x, 1], rgb[y, x, 2] = red / mass, green / mass, blue / mass

@@ -1,0 +1,301 @@
+"""One scene for a whole path, or one view: the residual's cells behind guards, with texture and a second pass.
+
+Base Gaussians are only read. The renderer draws and the network computes on the renderer's device; everything else
+happens on the processor. The images of a view travel there once, and its new Gaussians back once.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
+from spackle.device import Precision
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer, place_of, touched_tiles
+from spackle.render.protocol import Rendering
+from spackle.residual.base_values import BEHIND, Seeds
+from spackle.residual.complete import CompletedCells, complete_cells
+from spackle.residual.compose import compose
+from spackle.residual.mask import MASK_THRESHOLD, hole_area_ratio
+from spackle.residual.network import ResidualNet
+from spackle.residual.rim import find_rim
+from spackle.residual.view_features import CELL, PROCESSOR, ViewFeatures
+from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
+from spackle.scene_fill.rim_underlay import rim_underlay
+from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
+from spackle.scene_fill.view_order import QUIET_HAR, CheckedFrames, farthest_first, skipped_gap
+
+PASSES = 2  # a second look closes what the first one's blobs left thin
+CLOSED_HAR = 1e-4  # fewer holes than this need no second look
+WIDEST = 8  # views of a path whose content stays in front from the first
+OPPOSITE = 2  # views that are completed before anything goes beneath the rims of either
+PAINTED_VIEWS = 2  # of a scene that get the chosen texture, the exemplar's after them: they show nearly all holes
+FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
+SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
+FINE_SPREAD_PX = 0.5  # standard deviation of one blob a pixel, which a wide one for its cell backs
+
+
+@dataclasses.dataclass(frozen=True)
+class FillContext:
+    """A photo's base, and what fills the holes of its views."""
+
+    base: Gaussians
+    photo_camera: Camera
+    renderer: Renderer
+    network: ResidualNet | None = None  # None: deltas of zero, so the seeds alone fill the holes
+    texture: Texture | None = exemplar_texture  # None: colours as the network or the seeds have them
+    threshold: float = MASK_THRESHOLD
+    precision: Precision = "auto"  # of the network: auto is bfloat16 where the hardware multiplies it natively
+
+    @functools.cached_property
+    def placed(self) -> FillContext:
+        """The same with base and network on the renderer's device."""
+        device = place_of(self.renderer)
+        if self.base.means.device.type == device.type:
+            return self
+        network = None if self.network is None else copy.deepcopy(self.network).to(device)
+        return dataclasses.replace(self, base=self.base.to(device), network=network)
+
+    @property
+    def seeds_alone(self) -> FillContext:
+        """The same without network and texture."""
+        return dataclasses.replace(self, network=None, texture=None)
+
+    def photo_guard(self) -> OcclusionGuard:
+        """What the photo shows: no aux Gaussian may stand in front of that."""
+        rendering = self.renderer.render(self.placed.base, self.photo_camera)
+        return OcclusionGuard.of(rendering, self.photo_camera, self.threshold)
+
+
+@dataclasses.dataclass(frozen=True)
+class FilledView:
+    """The aux Gaussians of one view, and the view with them."""
+
+    aux: Gaussians
+    rendering: Rendering
+
+
+@dataclasses.dataclass(frozen=True)
+class FilledScene:
+    """One set of aux Gaussians for all views."""
+
+    aux: Gaussians
+    pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of the completed views that were drawn in passing, by their index
+
+
+@torch.no_grad()
+def fill_view(
+    context: FillContext,
+    camera: Camera,
+    guards: Sequence[OcclusionGuard] | None = None,
+    rendering: Rendering | None = None,
+) -> FilledView:
+    """Complete one view by itself; it looks as if all were drawn at once, at the cost of what changes.
+
+    Args:
+        context: the photo's base, and what fills its holes.
+        camera: the view.
+        guards: views whose content must stay in front; the photo's alone where None.
+        rendering: the base from this view, where that is at hand.
+    """
+    guards = [context.photo_guard()] if guards is None else guards
+    stage = _Stage(context.placed)
+    aux, _, view = _fill(
+        context.placed, stage, stage.look(camera, rendering), camera, guards, CLOSED_HAR, beneath=False
+    )
+    device = context.base.means.device
+    return FilledView(Gaussians.cat(aux).to(device), view.to(device))
+
+
+@torch.no_grad()
+def fill_scene(
+    context: FillContext,
+    cameras: Sequence[Camera],
+    exact: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> FilledScene:
+    """Complete a whole path by one set of aux Gaussians, the same from every frame.
+
+    Views are visited from the widest inwards, spread over the path. Each sees what the earlier ones
+    added, and may add only behind what the photo, the widest views and the views before it show:
+    in its holes, and beneath their rims. What lies beneath a rim of one of the two widest views may be
+    what the other one shows in a hole, and fills better: it has to wait for both.
+
+    Args:
+        context: the photo's base, and what fills its holes.
+        cameras: the frames of a path, in their order; with `exact` any views.
+        exact: look at every view and complete it if it has a hole; else skip frames beside one that needs
+            nothing, so that holes too small to see may stay open.
+        progress: called with (views visited, views in all).
+    """
+    if not cameras:
+        return FilledScene(Gaussians.empty(context.base.means.device), {})
+    placed, device, threshold = context.placed, context.base.means.device, context.threshold
+    order, stage = farthest_first(cameras, context.photo_camera), _Stage(placed)
+    guards = {-1: context.photo_guard()}
+    for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
+        view = stage.look(cameras[index])
+        guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
+    checked, pictures, filled = CheckedFrames(len(cameras)), dict[int, Tensor](), 0
+    aux = [Gaussians.empty()]
+    waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
+    for count, index in enumerate(order):
+        camera = cameras[index]
+        if exact or index not in checked:
+            view = stage.look(camera) if count else view
+            holes = hole_area_ratio(view.alpha, threshold)
+            # No frame is skipped where all are looked at.
+            gap = float(holes == 0) if exact else skipped_gap(holes, view.alpha, threshold)
+            if gap:
+                pictures[index] = to_bytes(view.rgb)
+            else:
+                others = [guard for of, guard in guards.items() if of != index]
+                means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
+                if filled >= PAINTED_VIEWS and means.texture is not None:
+                    means = dataclasses.replace(means, texture=exemplar_texture)
+                enough = CLOSED_HAR if exact else QUIET_HAR
+                new, rims, view = _fill(means, stage, view, camera, others, enough, beneath=len(cameras) > 1)
+                aux += new
+                waiting += [(index, part) for part in rims]
+                filled += 1
+                pictures.clear()
+                guards[index] = OcclusionGuard.of(view, camera, threshold)
+                if filled >= OPPOSITE:
+                    hidden = _behind_others(waiting, cameras, guards)
+                    stage.add(*hidden)
+                    aux += hidden
+                    waiting.clear()
+            checked.add(index, gap)
+        if progress:
+            progress(count + 1, len(order))
+    if waiting:
+        pictures.clear()
+    return FilledScene(Gaussians.cat([*aux, *_behind_others(waiting, cameras, guards)]).to(device), pictures)
+
+
+def _fill(
+    context: FillContext,
+    stage: _Stage,
+    view: Rendering,
+    camera: Camera,
+    guards: Sequence[OcclusionGuard],
+    enough: float,
+    *,
+    beneath: bool,
+) -> tuple[list[Gaussians], list[Gaussians], Rendering]:
+    """What fills the holes of the view that the stage shows, what lies `beneath` their rims, and the view filled."""
+    aux, rims = [Gaussians.empty()], []
+    for turn in range(PASSES):
+        # What the network's blobs leave thin, the seeds close: it would only leave it thin again.
+        means = context.seeds_alone if turn else context
+        features = ViewFeatures.of(view, context.threshold)
+        if not bool(features.mask.any()):
+            break
+        cells = complete_cells(features, camera, context.photo_camera, means.network, context.precision)
+        new, underlay = _propose(means, view, features, cells, camera, guards)
+        if beneath:
+            rims.append(rim_underlay(features.mask, underlay, camera))
+        if not len(new):
+            break
+        aux.append(new)
+        view = stage.look_again(new)
+        if hole_area_ratio(view.alpha, context.threshold) < enough:
+            break
+    return aux, rims, view
+
+
+def _propose(
+    context: FillContext,
+    view: Rendering,
+    features: ViewFeatures,
+    completed: CompletedCells,
+    camera: Camera,
+    guards: Sequence[OcclusionGuard],
+) -> tuple[Gaussians, Seeds]:
+    """One Gaussian for each masked cell, with a texture one for each pixel, all behind what the guards show.
+
+    Also returns the seeds that extend beneath the rims.
+    """
+    mask, cells, seeds = features.mask, completed.aux, completed.seeds
+    picture, rim = None, completed.rim
+    if context.texture is not None:
+        rim = rim or find_rim(features, seeds, camera, context.photo_camera)
+        structure = features.rgb.clone()
+        structure[mask] = linear_to_srgb(cells.colors)
+        picture = context.texture(HoleView(view, features, seeds, *rim, structure))
+    eye, depths = camera.position, camera.to_camera(cells.means)[:, 2]
+    factors, parts = free_factors(cells, eye, guards), []
+    factors = torch.where(factors > 0, without_pits(depths * factors, mask) / depths, 0)
+    if picture is not None:
+        wanted, blobs = (in_cells(image)[mask] for image in (picture, sharpened(picture)))
+        rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
+        index = rough.nonzero()[:, 0]
+        deltas = None if completed.deltas is None else completed.deltas[index]
+        pixels = _pixels(seeds.select(mask).select(index), deltas, camera, blobs[index])
+        parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
+        # As a lifted photo has them: behind the pixels' Gaussians one for each cell.
+        cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
+        factors = factors / (1 - BEHIND)
+    parts.append(moved_away(cells, eye, factors))
+    inverse_depth = seeds.inverse_depth.clone()
+    if rim is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
+        moved = rim[0].beyond[mask] & (factors > 0)
+        inverse_depth[mask] = torch.where(moved, 1 / (depths * factors), inverse_depth[mask])
+    return Gaussians.cat(parts), dataclasses.replace(seeds, inverse_depth=inverse_depth)
+
+
+def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:
+    """Gaussians [4n] for the pixels of n cells: flat seeds [n], deltas [n, 14], or None, and sRGB [n, 2, 2, 3]."""
+    offsets = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+    rise = (seeds.slope[:, None] * offsets).sum(-1).flatten()
+    inverse_depth, slope, rgb = (
+        field.repeat_interleave(len(offsets), 0) for field in (seeds.inverse_depth, seeds.slope, seeds.rgb)
+    )
+    uv, inverse_depth = (
+        (seeds.uv[:, None] + offsets).flatten(0, 1),
+        (inverse_depth + rise).clamp_min(0.5 * inverse_depth),
+    )
+    repeated = None if deltas is None else deltas.repeat_interleave(len(offsets), 0)
+    pixels = compose(Seeds(uv, inverse_depth, slope, rgb, seeds.unit), repeated, camera, FINE_SPREAD_PX)
+    return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))
+
+
+def _behind_others(
+    waiting: Sequence[tuple[int, Gaussians]], cameras: Sequence[Camera], guards: Mapping[int, OcclusionGuard]
+) -> list[Gaussians]:
+    """What lies beneath the rims of some views, each behind what the guards of all other views show."""
+    return [
+        push_behind(rims, cameras[index].position, [guard for of, guard in guards.items() if of != index])
+        for index, rims in waiting
+    ]
+
+
+class _Stage:
+    """The base and what was added to it, on the renderer's device, and how the last camera saw them."""
+
+    def __init__(self, context: FillContext) -> None:
+        self._renderer, self._device, self._sets = context.renderer, place_of(context.renderer), [context.base]
+
+    def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
+        """What a camera sees, on the processor; `rendering` where it has been drawn already."""
+        drawn = self._renderer.render(self._sets, camera) if rendering is None else rendering.to(self._device)
+        self._camera, self._drawn = camera, drawn
+        return drawn.to(PROCESSOR)
+
+    def add(self, *sets: Gaussians) -> None:
+        """More Gaussians, which the next look sees."""
+        self._sets += [part.to(self._device) for part in sets]
+
+    def look_again(self, new: Gaussians) -> Rendering:
+        """Add Gaussians, and look from the last camera: only tiles that they touch are drawn."""
+        self.add(new)
+        tiles = touched_tiles(self._sets[-1], self._camera, self._renderer)
+        self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
+        return self._drawn.to(PROCESSOR)

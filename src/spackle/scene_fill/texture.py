@@ -1,0 +1,184 @@
+"""Colours of what fills a hole: structure is the residual's, texture comes from a picture whose hole is painted.
+
+The paper has none of this: its network learns from an inpainter's pictures. A network that learns from true views stays
+smooth where the truth is ambiguous.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from spackle.fill import FAR_BIAS, far_fill
+from spackle.filters import blurred, broadly_blurred, nearest_known
+from spackle.inpaint import Inpainter, known_inverse_depth
+from spackle.patches import Patches
+from spackle.render.protocol import Rendering
+from spackle.residual.base_values import Seeds
+from spackle.residual.mask import hole_mask
+from spackle.residual.rim import Rim
+from spackle.residual.view_features import CELL, ViewFeatures
+
+TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
+TEXTURE_FADING = 0.5  # mismatch at which a third of the texture is left
+SHARE, SHARE_FADING = 0.4, 0.36  # of patches beyond the photo's border; mismatch at which a third of it is left
+REPEATS = 4.0  # what is repeated more often is a pattern, and fades
+BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of patches gets no share
+BLOCK = 4  # cells along the side of a square, all of which count as repeated when one is
+BLOCK_CHOICE, FAINTEST_VOTE = 3.0, 1e-6  # how much harder votes for blocks depend on their costs; least vote
+LEAST_COST = 1e-8
+EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
+CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
+LEAST_ENERGY = 1e-7
+OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
+STEPS = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class HoleView:
+    """A view with holes, and what the residual makes of them."""
+
+    rendering: Rendering
+    features: ViewFeatures
+    seeds: Seeds  # of all cells
+    rim: Rim
+    patches: Patches  # that match the masked cells
+    structure: Tensor  # [h, w, 3] sRGB of all cells, the masked ones as the residual fills them
+
+
+Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's pixels; those of masked cells count
+
+
+def exemplar_texture(view: HoleView) -> Tensor:
+    """High frequencies of the view itself over the residual's structure; beyond its border the photo is extended.
+
+    There the residual knows least, and its structure is fog: patches get a share, but for what is broad in them.
+    """
+    features, rim, patches = view.features, view.rim, view.patches
+    pixels = in_cells(view.rendering.rgb)
+    painted = from_cells(patch_blocks(patches, pixels))
+    fine = painted - blurred(painted, TEXTURE_PX)
+    repeats = (repeat_counts(patches) / REPEATS).clamp_min(1)
+    gain = (-patches.mismatch / TEXTURE_FADING).exp() / repeats * _in_proportion(fine, view)
+    smooth = in_cells(_magnified(extended(view), features.mask))
+    picture = from_cells(torch.where(features.mask[..., None, None, None], smooth, pixels))
+    broad = broadly_blurred(painted - picture, BROAD * painted.shape[1])
+    share = SHARE * (-patches.mismatch / SHARE_FADING).exp() / repeats * rim.beyond
+    gain, share = (
+        from_cells(factor[..., None, None, None].expand(*factor.shape, CELL, CELL, 1)) for factor in (gain, share)
+    )
+    return fine.mul_(gain).add_(picture).lerp_(painted.sub_(broad), share)
+
+
+def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
+    """The picture that an inpainter makes of the view, structure and all."""
+    hole = hole_mask(view.rendering.alpha)
+    views = (view.rendering.rgb[None], hole[None], known_inverse_depth(view.rendering.depth, hole)[None])
+    return from_cells(in_cells(painter.paint(*views)[0]))
+
+
+def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
+    """A finer picture of which each cell is a block, [H, W, k, k, c], its hole filled with blocks from elsewhere in it.
+
+    A block is the mean of those that its cell's own match and its eight neighbours' say, the better ones counting
+    more. In `Patches.rgb` whole patches vote, and what is fine is lost.
+    """
+    height, width = patches.mismatch.shape
+    sources = torch.stack([blocks, blocks.flip(1, 3)])
+    matched = patches.matches[..., 0] >= 0
+    y, x = matched.nonzero(as_tuple=True)
+    costs = patches.mismatch.square()
+    limit = (costs[matched].mean() / BLOCK_CHOICE).clamp_min(LEAST_COST)
+    total, mass = torch.zeros_like(blocks[y, x]), torch.zeros_like(costs[y, x])
+    for dy, dx in itertools.product((-1, 0, 1), repeat=2):
+        v, u = (y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)
+        source, row, column = patches.matches[v, u].long().unbind(-1)
+        votes = (v == y + dy) & (u == x + dx) & matched[v, u]  # and then its patch lies within its source
+        weight = votes * ((-costs[v, u] / limit).exp() + FAINTEST_VOTE)
+        block = sources[source.clamp_min(0), (row - dy).clamp(0, height - 1), (column - dx).clamp(0, width - 1)]
+        total += weight[:, None, None, None] * block
+        mass += weight
+    filled = blocks.clone()
+    filled[y, x] = total / mass[:, None, None, None]
+    return filled
+
+
+def repeat_counts(patches: Patches) -> Tensor:
+    """How often what is around each cell's match is repeated, for each of its cells: [H, W]; 0 outside of the hole."""
+    matched = patches.matches[..., 0] >= 0
+    source, row, column = patches.matches.long().unbind(-1)
+    height, width = matched.shape
+    column = torch.where(source > 0, width - 1 - column, column)
+    number = row // BLOCK * width + column // BLOCK
+    counts = torch.bincount(number[matched], minlength=height * width)
+    return torch.where(matched, counts[number.clamp_min(0)] / BLOCK**2, 0)
+
+
+def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
+    """Factors [h, w] of at most 1 that make texture [2h, 2w, 3] no stronger than that of the surface around a hole.
+
+    Strokes of what is lively elsewhere do not belong on a calm wall, even where they fit what is there.
+    """
+    energy, hole = avg_pool2d(fine.square().sum(-1)[None], CELL)[0], view.features.mask.float()
+    parts = torch.stack([energy * hole, hole, energy * (1 - hole), 1 - hole])
+    coarse = avg_pool2d(parts, COARSE, ceil_mode=True, count_include_pad=False)
+    own, masked, others, seen = blurred(coarse.permute(1, 2, 0), CALM_CELLS / COARSE).unbind(-1)
+    every = (slice(None, None, COARSE),) * 2
+    around = (others / seen.clamp_min(1e-6)).clamp_min(LEAST_ENERGY).log()
+    known, bias = ~view.features.mask[every], FAR_BIAS * ~view.rim.beyond[every]
+    if bool(known.any()):
+        around = far_fill(view.seeds.inverse_depth[every], around[None], known, far_bias=bias)[1][0]
+    share = (around.exp() / (own / masked.clamp_min(1e-6)).clamp_min(LEAST_ENERGY)).sqrt().clamp_max(1)
+    factors = interpolate(share[None, None], scale_factor=COARSE, mode="bilinear")[0, 0]
+    return factors[: hole.shape[0], : hole.shape[1]]
+
+
+def _magnified(cells: Tensor, mask: Tensor) -> Tensor:
+    """A pixel's colours [2h, 2w, 3] between those of the cells [h, w, 3] around it, masked ones [h, w] alone."""
+    both = torch.cat([cells * mask[..., None], mask[..., None]], dim=-1).permute(2, 0, 1)
+    pixels = interpolate(both[None], scale_factor=CELL, mode="bilinear")[0].permute(1, 2, 0)
+    return pixels[..., :3] / pixels[..., 3:].clamp_min(1e-6)
+
+
+def extended(view: HoleView) -> Tensor:
+    """Structure [h, w, 3] that beyond the photo's border begins as the nearest cell of the photo, if it is as far away.
+
+    Behind an object the nearest cell is the object's, and nothing is extended.
+    """
+    features = view.features
+    near = torch.from_numpy(nearest_known(features.mask.numpy())).long()
+    cells = torch.stack(torch.meshgrid(*(torch.arange(size) for size in features.mask.shape), indexing="ij"))
+    row, column = (place.clamp_min(0) for place in near)
+    apart = (view.seeds.inverse_depth / features.inverse_depth[row, column].clamp_min(1e-9)).log()
+    fading = torch.exp((1 - torch.hypot(*(near - cells).float())) / EXTENDED_CELLS - (apart / SAME_DEPTH).square())
+    return torch.lerp(view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None])
+
+
+def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
+    """Colours [H, W, c] of blobs that show the wanted ones [H, W, c] where they overlap, by Jacobi steps.
+
+    A pixel shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_PX.
+    """
+    colors = wanted
+    for _ in range(steps):
+        colors = colors + wanted - blurred(colors, OVERLAP_PX)
+    return colors
+
+
+def in_cells(picture: Tensor) -> Tensor:
+    """The pixels of each cell, [h, w, 2, 2, c] of [H, W, c]; an odd last row or column is repeated."""
+    below, beside = (size % CELL for size in picture.shape[:2])
+    whole = torch.cat([picture, picture[-1:]]) if below else picture
+    whole = torch.cat([whole, whole[:, -1:]], dim=1) if beside else whole
+    rows, columns = (size // CELL for size in whole.shape[:2])
+    return whole.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
+
+
+def from_cells(blocks: Tensor) -> Tensor:
+    """The picture [2h, 2w, c] of pixels [h, w, 2, 2, c]."""
+    return blocks.transpose(1, 2).flatten(2, 3).flatten(0, 1)
