@@ -8,7 +8,7 @@ import itertools
 import math
 import os
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +18,8 @@ from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.network_file import fill_network, read_tensors
 from spackle.residual.base_values import Seeds
 from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
+from spackle.residual.crops import crops_around
 from spackle.residual.rim import Rim
-from spackle.residual.sparse import Cells, conv_rows, crops_around, point_rows, relu_rows, upsampled
 from spackle.residual.view_features import ViewFeatures
 
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
@@ -33,8 +33,6 @@ TYPICAL_MISMATCH = 0.1
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
 COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
 STRIDE = 2 ** (len(WIDTHS) - 1)
-REACH = 2  # how many cells around its own a block looks at, and so a head
-FEW = 0.45  # of a level's cells: where more are wanted, the convolution of all is faster than that of those
 STEM_GAIN = 3.0  # the features are of order 0.3
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 
@@ -58,13 +56,6 @@ class ResidualBlock(nn.Module):
         out: Tensor = self.second(self.first(torch.relu(x)).relu_())
         return out.add_(x)
 
-    def at(self, table: Tensor, there: Cells, wanted: Cells) -> Tensor:
-        """The same at some cells: the table of `wanted`, from one of `there`, which reaches two cells farther."""
-        between = wanted.grown(1)
-        inner = conv_rows(self.first, relu_rows(table), there.around(between))
-        change = conv_rows(self.second, relu_rows(inner), between.around(wanted))
-        return change.add_(table.index_select(0, there.rows_at(*wanted.places)))
-
 
 class ResidualNet(nn.Module):
     """Encoder of the cues, decoder, and SHARP's two heads: 8.02 M parameters.
@@ -87,58 +78,24 @@ class ResidualNet(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Features [B, 21, h, w] of `network_input` to deltas [B, 14, h, w]; any h and w."""
-        x, skips = self._encoded(features)
-        for level in reversed(range(len(skips))):
-            x = self._decoded(x, skips[level], level)
-        return self._deltas(x, features)
-
-    def deltas_at(self, features: Tensor, mask: Tensor) -> Tensor:
-        """`forward` at the cells of a mask [h, w], in its order: [n, 14]; what only the others need is not computed."""
-        x, skips = self._encoded(features)
-        masked = Cells(pad(mask, _completion(mask)))
-        wanted = [masked.grown(REACH)]  # of each level's decoder, the finest first
-        seen = [wanted[0].grown(REACH)]
-        for _ in skips[1:]:
-            wanted.append(seen[-1].halved())
-            seen.append(wanted[-1].grown(REACH))
-        levels = len(skips)
-        while levels and seen[levels - 1].share > FEW:
-            levels -= 1
-            x = self._decoded(x, skips[levels], levels)
-        if not levels and wanted[0].share > FEW:
-            return _rows(self._deltas(x, features))[mask.view(-1)]
-        table, there = _rows(x), Cells(mask.new_ones(x.shape[-2:]))
-        for level in reversed(range(levels)):
-            fine = upsampled(point_rows(cast(nn.Conv2d, self.up[level]), table), there, seen[level])
-            fine += _rows(skips[level]).index_select(0, seen[level].flat)
-            decode = cast(ResidualBlock, self.decode[level])
-            table, there = decode.at(fine, seen[level], wanted[level]), wanted[level]
-        heads = []
-        for block, _, last in cast(list[tuple[ResidualBlock, nn.Module, nn.Conv2d]], [self.geometry, self.texture]):
-            heads.append(point_rows(last, block.at(table, there, masked).relu_()))
-        return _with_copies(torch.cat(heads, dim=1), _rows(features)[mask.view(-1)])
-
-    def _encoded(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """The coarsest features, and those of each finer level; the grid completed to multiples of STRIDE."""
-        x = self.stem(pad(features, _completion(features), mode="replicate"))
+        height, width = features.shape[-2:]
+        # Completed so that each level's sides are twice the next one's.
+        x = self.stem(pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate"))
         skips = []
         for encode, down in zip(self.encode, self.down, strict=True):
             x = encode(x)
             skips.append(x)
             x = down(x)
-        return self.coarse(x), skips
-
-    def _decoded(self, x: Tensor, skip: Tensor, level: int) -> Tensor:
-        """One level finer."""
-        fine = interpolate(self.up[level](x), scale_factor=2, mode="bilinear", align_corners=False)
-        out: Tensor = self.decode[level](fine.add_(skip))
-        return out
-
-    def _deltas(self, x: Tensor, features: Tensor) -> Tensor:
-        """What the heads make of the finest grid."""
-        height, width = features.shape[-2:]
-        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)
-        return _with_copies(heads[..., :height, :width], features)
+        x = self.coarse(x)
+        for skip, up, decode in reversed(list(zip(skips, self.up, self.decode, strict=True))):
+            fine = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False)
+            x = decode(fine.add_(skip))
+        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
+        # The last outputs say how much of the known colours to take.
+        deltas, shares = heads[:, :-COPIES], heads[:, -COPIES:]
+        known = (FAR_RIM, MIRRORED, EXEMPLAR)
+        copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(known))
+        return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
 
 
 def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
@@ -169,8 +126,7 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; other cells are undefined.
 
-    The network looks only around the masked cells, see `spackle.residual.sparse`; on a processor it does not compute
-    what only the others need, see `ResidualNet.deltas_at`.
+    The network looks only around the masked cells, see `spackle.residual.crops`.
 
     Args:
         network: a `ResidualNet`; its features travel to the device where it lies.
@@ -181,18 +137,14 @@ def predict_deltas(
     device = next(network.parameters()).device
     dtype = pick_dtype(precision, device)
     chosen = torch.ones_like(view.mask) if dense else view.mask
-    few = network if isinstance(network, ResidualNet) and device.type == "cpu" and not dense else None
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
     # Around all crops: autocast converts the weights once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE):
-            there = outer.slices
-            features = network_input(_part(view, there), _part(seeds, there), _part(rim, there)).to(device)
-            own = torch.zeros_like(chosen[there])
-            own[inner.moved(-outer.top, -outer.left).slices] = chosen[inner.slices]
-            chosen_rows = own.view(-1).to(device)
-            found: Tensor = _rows(network(features))[chosen_rows] if few is None else few.deltas_at(features, own)
-            field[there][own] = found.float().cpu()
+            where, inside = outer.slices, inner.moved(-outer.top, -outer.left).slices
+            features = network_input(_part(view, where), _part(seeds, where), _part(rim, where)).to(device)
+            deltas = network(features)[0].permute(1, 2, 0)[inside]
+            field[inner.slices] = torch.where(chosen[inner.slices][..., None], deltas.float().cpu(), 0)
     return field
 
 
@@ -200,25 +152,6 @@ def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
     """The same of some rows and columns."""
     parts: dict[str, Any] = {name: field[where] for name, field in vars(grids).items() if isinstance(field, Tensor)}
     return dataclasses.replace(grids, **parts)
-
-
-def _with_copies(heads: Tensor, features: Tensor) -> Tensor:
-    """Deltas [B, 14, ...] from the outputs of the heads [B, 17, ...], the last three of which copy known colours."""
-    deltas, copies = heads[:, :-COPIES], heads[:, -COPIES:]
-    known = (FAR_RIM, MIRRORED, EXEMPLAR)
-    taken = sum(copies[:, k : k + 1] * features[:, colors] for k, colors in enumerate(known))
-    return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + taken, deltas[:, COLOR.stop :]], dim=1)
-
-
-def _completion(grid: Tensor) -> tuple[int, int, int, int]:
-    """What `pad` has to add to a grid [..., h, w] so that each level's sides are twice the next one's."""
-    height, width = grid.shape[-2:]
-    return 0, -width % STRIDE, 0, -height % STRIDE
-
-
-def _rows(x: Tensor) -> Tensor:
-    """[1, C, h, w] to a table [h · w, C]."""
-    return x[0].permute(1, 2, 0).flatten(0, 1)
 
 
 def _head(width: int, channels: int) -> nn.Sequential:
