@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import re
 import threading
 from collections.abc import Iterator
@@ -18,19 +17,14 @@ class Site:
 
     url: str
     content: bytes
-    etag: bool = True
+    others: dict[str, bytes] = dataclasses.field(default_factory=dict)  # by the end of their paths
     ranges: bool = True
-    if_range: bool = True  # False: gives the rest of whatever it has
     status: int = 200
     headers: dict[str, str | None] = dataclasses.field(default_factory=dict)  # None: left out
     drops: list[int] = dataclasses.field(default_factory=list)  # bytes before each of the next answers breaks off
     hang_after: int | None = None  # bytes of an answer, then nothing until `go_on` is set
     go_on: threading.Event = dataclasses.field(default_factory=threading.Event)
-    requests: list[dict[str, str]] = dataclasses.field(default_factory=list)
-
-    @property
-    def tag(self) -> str:
-        return f'"{hashlib.md5(self.content).hexdigest()}"'
+    requests: list[dict[str, str]] = dataclasses.field(default_factory=list)  # headers, and the path by "path"
 
 
 @contextlib.contextmanager
@@ -65,34 +59,19 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         site = self.server.site
-        site.requests.append(dict(self.headers))
-        start = self._start(site)
-        status = site.status if site.status != 200 else 206 if start else 200
-        size = len(site.content)
-        if start and start >= size:
-            status, body = 416, b""
-        else:
-            body = site.content[start or 0 :]
+        site.requests.append({**self.headers, "path": self.path})
+        content = site.others.get(self.path.rpartition("/")[2], site.content)
+        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        start = int(wanted[1]) if wanted and site.ranges else 0
+        status, body = site.status, content[start:]
         headers: dict[str, str | None] = {"Content-Length": str(len(body)), "Content-Type": "application/octet-stream"}
-        if site.etag:
-            headers["ETag"] = site.tag
-        if status == 206:
-            headers["Content-Range"] = f"bytes {start}-{size - 1}/{size}"
-        self.send_response(status)
+        if start and status == 200:
+            status, headers["Content-Range"] = 206, f"bytes {start}-{len(content) - 1}/{len(content)}"
+        self.send_response(416 if start and start >= len(content) else status)
         for name, value in (headers | site.headers).items():
             if value is not None:
                 self.send_header(name, value)
         self.end_headers()
-        self._send(site, body)
-
-    def _start(self, site: Site) -> int:
-        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
-        if not (wanted and site.ranges):
-            return 0
-        fits = self.headers.get("If-Range") in (None, site.tag, site.headers.get("Last-Modified"))
-        return int(wanted[1]) if fits or not site.if_range else 0
-
-    def _send(self, site: Site, body: bytes) -> None:
         if site.drops:
             body = body[: site.drops.pop(0)]
         elif site.hang_after is not None:

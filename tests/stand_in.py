@@ -1,10 +1,13 @@
-"""Bases in no time, whose depth is known beforehand; random weights of lite; `spackle predict` with either."""
+"""Bases in no time, whose depth is known beforehand; other weights than the published; `spackle predict` with them."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from command import Run, run
 from photos import box
@@ -15,8 +18,9 @@ from spackle.bases.lift import lift
 from spackle.bases.lite import LiteNet
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.image import Photo, resize_photo
+from spackle.weights import PUBLISHED, PublishedWeights
 
-SHARP_FILE = "sharp_2572gikvuh.pt"
+SHARP_FILE = PUBLISHED["sharp"].file
 QUICK = ("--no-render", "--residual", "none")
 
 
@@ -38,6 +42,13 @@ def write_lite(path: Path) -> Path:
     torch.manual_seed(0)
     save_file(LiteNet().state_dict(), path)
     return path
+
+
+def publish(patch: pytest.MonkeyPatch, name: str, content: bytes, **changes: object) -> PublishedWeights:
+    """Let other bytes be the published ones of that name, until the test ends."""
+    facts = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest(), **changes}
+    patch.setitem(PUBLISHED, name, dataclasses.replace(PUBLISHED[name], **facts))  # type: ignore[arg-type]
+    return PUBLISHED[name]
 
 
 def write_model(folder: Path) -> Path:

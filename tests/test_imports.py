@@ -20,16 +20,16 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
 # they are named here; all others are values.
-BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "scene_fill", "formats", "downloads"}
+BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "scene_fill", "formats", "weights"}
 SCENE = {"pipeline", "scene", "views"}
 BELOW_DATASET = {*BELOW_SCENE, "scene"}
 ALLOWED: dict[str, set[str]] = {
     "values": set(),
-    "downloads": {"values"},
+    "weights": {"values"},
     "formats": {"values"},
     "render": {"values"},
-    "bases": {"values", "downloads"},
-    "inpaint": {"values", "downloads"},
+    "bases": {"values", "weights"},
+    "inpaint": {"values", "weights"},
     "residual": {"values", "render"},
     "scene_fill": {"values", "render", "residual", "inpaint"},
     "clips": {"values", "render", "bases", "residual", "scene_fill", "inpaint", "formats"},

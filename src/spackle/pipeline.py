@@ -23,7 +23,6 @@ from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, TrajectoryKind
 from spackle.device import Precision
-from spackle.downloads import installed
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
@@ -35,6 +34,7 @@ from spackle.residual.network import SHIPPED, load_residual, shipped_network
 from spackle.scene import Scene
 from spackle.scene_fill import FillContext, Texture, exemplar_texture, fill_scene, fill_view, painted_texture
 from spackle.views import PathOptions, PlannedViews, plan_views
+from spackle.weights import installed
 
 LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any

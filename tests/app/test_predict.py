@@ -29,7 +29,6 @@ from safetensors.torch import save_file
 
 import spackle
 from spackle.bases.open import BaseSettings, open_base
-from spackle.downloads import known_weights
 from spackle.files import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
@@ -37,6 +36,7 @@ from spackle.pipeline import FillOptions
 from spackle.residual import ResidualNet
 from spackle.residual.network import shipped_network
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene
+from spackle.weights import published_weights
 
 
 def hashes(folder: Path) -> dict[str, object]:
@@ -201,7 +201,7 @@ def test_lamas_weights_are_painted_with_where_they_are_and_missed_where_they_are
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], "--fill", "lama", named="spackle weights get lama")
     assert (FillOptions().texture, FillOptions(None, "network").texture) == ("exemplar", "network")
-    (tmp_path / known_weights("lama").file).write_text("not LaMa's")
+    (tmp_path / published_weights("lama").file).write_text("not LaMa's")
     choices = (
         FillOptions(),
         FillOptions(mode="view"),
@@ -209,7 +209,7 @@ def test_lamas_weights_are_painted_with_where_they_are_and_missed_where_they_are
         FillOptions("none"),
     )
     assert [choice.texture for choice in choices] == ["lama", "exemplar", "lama", "none"]
-    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], named=known_weights("lama").file)
+    expect_refusal(tmp_path, "-i", pair[0], "--depth", pair[1], named=published_weights("lama").file)
 
 
 @pytest.mark.parametrize(

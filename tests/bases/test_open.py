@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import shutil
 from collections.abc import Callable
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from photos import HEIGHT, WIDTH, calibration, metres, write_depth, write_photo
 from safetensors.torch import load_file, save_file
 from scenes import same_bits
 from sharp_weights import gaussians_of, write_tiny
-from stand_in import SHARP_FILE, StandIn, write_model
+from stand_in import SHARP_FILE, StandIn, publish, write_model
 
 import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
@@ -30,7 +28,6 @@ from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.layers import TINY
-from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.pipeline import FillOptions
@@ -232,10 +229,13 @@ def test_broken_depth_in_the_photo_fails(
         pick(photo, name="rgbd")
 
 
-def test_damaged_weights_of_sharp_fail_once_for_all_photos(photo: Path, sharp: Path) -> None:
-    record = {"url": "https://x", "size": sharp.stat().st_size, "sha256": "0" * 64}
-    sharp.with_name(f"{sharp.name}.json").write_text(json.dumps(record))
-    said, log = "SHA-256 is not that of what was downloaded", list[str]()
+def test_damaged_weights_of_sharp_fail_once_for_all_photos(
+    photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = sharp.read_bytes()
+    publish(monkeypatch, "sharp", content)
+    sharp.write_bytes(content[::-1])
+    said, log = "SHA-256 is not the published one", list[str]()
     base = open_base(BaseSettings(), log.append)
     choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
     assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no Depth Anything here"] * 2
@@ -333,14 +333,13 @@ def test_a_models_folder_counts_by_its_files_and_not_by_its_place(tmp_path: Path
     assert open_base(settings).fingerprints != prints
 
 
-def test_tables_call_weights_apples_where_they_came_from_apple(tmp_path: Path) -> None:
-    file, record = tmp_path / "my_sharp.pt", tmp_path / "my_sharp.pt.json"
+def test_tables_call_weights_apples_where_name_and_size_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / SHARP_FILE
     file.write_bytes(b"weights")
-    unknown = "a network of SHARP's shape, from the photo alone, by weights of unknown origin: my_sharp.pt"
+    unknown = f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {SHARP_FILE}"
     assert BaseSettings("sharp", checkpoint=file).description == unknown
-    for url, says in (("https://mirror.example/a.pt", unknown), (WEIGHTS["sharp"].url, KINDS["sharp"].description)):
-        record.write_text(json.dumps({"url": url, "size": 7, "sha256": sha256(b"weights").hexdigest()}))
-        assert BaseSettings("sharp", checkpoint=file).description == says
+    publish(monkeypatch, "sharp", b"weights")
+    assert BaseSettings("sharp", checkpoint=file).description == KINDS["sharp"].description
     assert BaseSettings("lite", checkpoint=file).description == KINDS["lite"].description
 
 

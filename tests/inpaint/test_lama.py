@@ -19,13 +19,13 @@ from plain_lama import Weights, made_input, plain_logits
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from spackle.app.weights import lama_weights
+from spackle.cli.weights import lama_weights
 from spackle.dataset.shards import load_manifest
-from spackle.downloads import WEIGHTS
 from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.lama import MARGIN, LamaInpainter, groups_of, load_network, padded
 from spackle.inpaint.lama_network import LamaNetwork, expected_shapes
+from spackle.weights import PUBLISHED
 
 GOLDEN = Path(__file__).parents[1] / "data" / "lama_golden.npz"  # of the original class, see `made_input`
 X = made_input(24, 40)
@@ -338,7 +338,7 @@ def test_what_goes_wrong_is_a_line(file: Path, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
     with pytest.raises(InputError, match="spackle weights get lama"):
         get_inpainter("lama", InpainterOptions())
-    (tmp_path / WEIGHTS["lama"].file).write_bytes(file.read_bytes())
+    (tmp_path / PUBLISHED["lama"].file).write_bytes(file.read_bytes())
     inpainter = get_inpainter("lama", InpainterOptions(device="cpu"))
     assert list(inpainter.files.values()) == [tmp_path / "big-lama.pt"]
     with pytest.raises(InputError, match="its side must be between 128 and 1536"):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from spackle.downloads import known_weights
 from spackle.errors import InputError
 from spackle.training.losses import PAPER_WEIGHTS
 from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe
 from spackle.training.train import ema_decay, learning_rate, samples_of_step
+from spackle.weights import published_weights
 
 pytest.importorskip("yaml")
 PLAIN = "loss: {features: none}"
@@ -43,7 +43,7 @@ def test_resnet50_comes_from_the_folder_of_weights(tmp_path: Path, monkeypatch: 
     for override in ((), ("loss.features=squeezenet",)):
         with pytest.raises(InputError, match="spackle weights get features"):
             load_recipe(Recipe, "paper", override)
-    fetched = tmp_path / known_weights("features").file
+    fetched = tmp_path / published_weights("features").file
     fetched.touch()
     assert load_recipe(Recipe, "paper").loss.features_file == fetched
 

@@ -22,10 +22,10 @@ from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import Base, BasePrediction, Progress
 from spackle.bases.sharp.base import SharpBase, check_windows
 from spackle.device import PRECISIONS, MemoryShort, Precision
-from spackle.downloads import check_recorded, installed, known_weights, read_record
 from spackle.errors import InputError, check_name
 from spackle.files import fingerprint
 from spackle.image import Photo
+from spackle.weights import check_undamaged, installed, published_as, published_weights
 
 AUTO = "auto"
 AUTO_NETWORKS = ("sharp", "depth", "lite")  # in the order that `auto` tries them
@@ -146,8 +146,7 @@ class BaseSettings:
     def description(self) -> str:
         """The base's description below tables; it calls weights Apple's only if they were downloaded from Apple."""
         file = self.files.get("checkpoint") if self.named == "sharp" else None
-        record = None if file is None else read_record(file)
-        if file is None or (record is not None and record.url == known_weights("sharp").url):
+        if file is None or published_as(file) is published_weights("sharp"):
             return self.kind.description
         return f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {file.name}"
 
@@ -268,7 +267,7 @@ def _load(name: str, settings: BaseSettings, files: Mapping[str, Path], prints: 
     if name in ("sharp", "depth") and downloaded is None:
         return None
     if downloaded is not None:
-        check_recorded(downloaded)  # against the record of its download, if there is one
+        check_undamaged(downloaded)
     device = None if settings.device == "auto" else settings.device
     base: Base
     if name == "lite":

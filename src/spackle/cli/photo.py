@@ -15,7 +15,6 @@ from torch import Tensor
 import spackle
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseSettings
-from spackle.downloads import installed
 from spackle.errors import InputError
 from spackle.files import digest_of, file_records, fingerprint, results_folder, whole_set, write_json
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
@@ -25,6 +24,7 @@ from spackle.progress import Reporter, Step
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.views import video_problem
+from spackle.weights import installed
 
 REPORT = "report.json"
 Holes = list[dict[str, float | str]]  # of each measured view: its name, and its HAR before and after

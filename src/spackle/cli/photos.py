@@ -25,13 +25,13 @@ from spackle.cli.photo import (
 )
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
-from spackle.downloads import weights_digest
 from spackle.errors import InputError
 from spackle.files import as_recorded, check_file, check_mark, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.pipeline import Pipeline
 from spackle.progress import Notes, Reporter
 from spackle.signals import asked_to_stop
+from spackle.weights import weights_digest
 from spackle.workers import Workers, at_work, cluster, threads_of_torch
 
 THREADS_ON_RAY = 2  # of a worker

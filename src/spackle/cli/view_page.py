@@ -19,7 +19,6 @@ from pathlib import Path
 from spackle.bases.lite import LiteBase
 from spackle.bases.open import AUTO, ROUGH, BaseSettings
 from spackle.cli.export_scene import page_of
-from spackle.downloads import installed
 from spackle.errors import InputError, check_name
 from spackle.files import check_file
 from spackle.image import Photo, load_photo
@@ -31,6 +30,7 @@ from spackle.viewer import PageScene, page_files
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell
 from spackle.views import PathOptions
+from spackle.weights import installed
 
 DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")

@@ -1,13 +1,22 @@
-"""`spackle weights`: get, make, list."""
+"""`spackle weights`: download published weights, make random ones, and list those on this machine."""
 
 from __future__ import annotations
 
+import os
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from spackle.cli.options import JsonOption
+from spackle.errors import InputError
+
+if TYPE_CHECKING:  # torch takes seconds to load
+    from torch import Tensor
+
+    from spackle.progress import Reporter
+    from spackle.weights import PublishedWeights
 
 weights = typer.Typer(help="Weights that others publish: fetch them, list them.", no_args_is_help=True)
 
@@ -23,11 +32,66 @@ def weights_get(
     force: Annotated[bool, typer.Option("--force", help="Download what is there already.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Download weights and record their SHA-256; a broken download goes on where it stopped."""
-    from spackle.app.weights import get_weights
-    from spackle.progress import Reporter
+    """Download weights and check their SHA-256; a broken download goes on where it stopped."""
+    from rich.filesize import decimal
 
-    get_weights(name, output, Reporter(as_json=as_json), url=url, force=force)
+    from spackle.files import results_folder
+    from spackle.progress import Reporter
+    from spackle.weights import file_digest, published_weights, weights_folder
+
+    reporter, entry = Reporter(as_json=as_json), published_weights(name)
+    if url is not None and entry.beside:
+        raise InputError(f"--url {url}: {name} is several files of a hub: name a mirror of the hub in HF_ENDPOINT")
+    path = (output or weights_folder()) / entry.file
+    if output is not None and output.suffix.lower() == path.suffix and not entry.beside and not os.path.isdir(output):
+        path = output
+    summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
+    new = force or not os.path.isfile(path)
+    if new:
+        with results_folder(path.parent, [path.name]):
+            _fetch(entry, entry.address() if url is None else url, path, reporter)
+        reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
+    else:
+        with reporter.stage("check"):
+            if file_digest(path) != entry.sha256:
+                raise InputError(f"{path}: damaged, or your own: it has not the SHA-256 {entry.sha256}: give --force")
+        reporter.log(f"{summary}, there already and intact: {path}")
+    if entry.needs and find_spec(entry.needs) is None:
+        from spackle.bases.hf import NOT_INSTALLED
+
+        reporter.log(f"{name}: not to be used yet: {NOT_INSTALLED}")
+    reporter.result({"name": name, "file": path, "bytes": entry.bytes, "sha256": entry.sha256, "downloaded": new})
+
+
+def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) -> None:
+    """Download weights after what lies beside them: they tell that all is there."""
+    from urllib.parse import urlsplit
+
+    from spackle.weights.download import check_url, download
+
+    check_url(url)
+    parts = urlsplit(url)
+    if parts.scheme == "http" and parts.hostname not in ("localhost", "127.0.0.1", "::1"):
+        reporter.log(f"{entry.name}: warning: http:// is not encrypted: others on the way see what is downloaded")
+    noticed = False
+    with reporter.transfer(entry.name) as step:
+
+        def advance(done: int, total: int) -> None:
+            nonlocal noticed
+            if not noticed:  # not before: where nothing comes, nothing needs a licence
+                noticed = True
+                for line in entry.notice:
+                    reporter.log(line)
+            step(done, total)
+
+        try:
+            for name, (size, sha256) in entry.beside.items():
+                download(entry.address(name), path.with_name(name), size, sha256)
+            download(url, path, entry.bytes, entry.sha256, advance)
+        except KeyboardInterrupt:
+            if noticed:
+                reporter.log(f"{entry.name}: what has come is kept; the same command goes on from there")
+            raise
 
 
 @weights.command("make")
@@ -38,18 +102,56 @@ def weights_make(
     ] = "full",
 ) -> None:
     """Make random weights of SHARP's or LaMa's shape, the same each time, to try everything without theirs."""
-    from spackle.app.weights import make_weights
+    suffix = output.suffix.lower()
+    if suffix not in (".pt", ".safetensors"):
+        raise InputError(f"{output}: give a name that ends in .pt or .safetensors")
+    import torch
+    from safetensors.torch import save_file
+
+    from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
+    from spackle.bases.sharp.layers import CONFIGS
+    from spackle.files import atomic_path, results_folder
     from spackle.progress import Reporter
 
-    make_weights(output, size, Reporter())
+    with results_folder(output.parent, [output.name]), atomic_path(output) as temporary:
+        tensors = lama_weights() if size == "lama" else deterministic_weights(expected_shapes(CONFIGS[size]))
+        (torch.save if suffix == ".pt" else save_file)(tensors, temporary)
+    count = sum(tensor.numel() for tensor in tensors.values())
+    name, numbers = size if size == "lama" else f"sharp ({size})", f"{count / 1e6:.2f} M random numbers"
+    Reporter().log(f"{name}: {numbers}, the same each time; they show no scene -> {output}")
+
+
+def lama_weights(*size: int) -> dict[str, Tensor]:
+    """`deterministic_weights` of LaMa's generator, of another width and depth where given; variances around one."""
+    from spackle.bases.sharp.checkpoint import deterministic_weights
+    from spackle.inpaint.lama_network import expected_shapes
+
+    made = deterministic_weights(expected_shapes(*size))
+    return {name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()}
 
 
 @weights.command("list")
 def weights_list(as_json: JsonOption = False) -> None:
     """Say which weights are known, and which of them are here."""
     from rich.console import Console
+    from rich.filesize import decimal
+    from rich.table import Table
 
-    from spackle.app.weights import list_weights
     from spackle.progress import Reporter
+    from spackle.weights import PUBLISHED, weights_folder
 
-    list_weights(Reporter(as_json=as_json), Console(highlight=False))
+    reporter, folder, table = Reporter(as_json=as_json), weights_folder(), Table(box=None, pad_edge=False)
+    for header in ("name", "state", "file", "licence"):
+        table.add_column(header, overflow="fold")
+    for entry in PUBLISHED.values():
+        file, state = folder / entry.file, "not here"
+        if os.path.isfile(file):  # its size alone is checked, which takes no time
+            size = os.path.getsize(file)
+            state = f"{decimal(size)}, whole" if size == entry.bytes else f"damaged, or your own: {size:,} bytes"
+        facts = {"name": entry.name, "state": state, "file": file, "licence": entry.licence}
+        reporter.result({**facts, "purpose": entry.purpose})
+        table.add_row(entry.name, state, entry.file, entry.licence)
+    if not as_json:
+        console = Console(highlight=False)
+        console.print(table)
+        console.print(f"in {folder} (SPACKLE_WEIGHTS names another)", markup=False, soft_wrap=True)

@@ -13,11 +13,11 @@ from spackle.bases.open import NETWORKS, BaseSettings, kind_of
 from spackle.camera_path import MAX_DISPARITY, TrajectoryKind
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import COMPLETIONS, Completion
-from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.files import digest_of, fingerprint
 from spackle.inpaint import INPAINTERS
 from spackle.residual import MASK_THRESHOLD
+from spackle.weights import weights_digest
 from spackle.workers import Workers
 
 

@@ -16,7 +16,6 @@ from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open
 from spackle.camera_path import MAX_DISPARITY
 from spackle.dataset.options import base_digest
 from spackle.device import PRECISIONS, pick_dtype
-from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
 from spackle.evaluation.datasets import DATASETS, get_dataset
@@ -30,6 +29,7 @@ from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.training.features import load_features
+from spackle.weights import weights_digest
 
 BASE = BaseSettings("sharp")
 MAX_LIMIT = 1_000_000

@@ -14,7 +14,6 @@ import torch
 from spackle.bases.lift import lift
 from spackle.bases.open import BaseSettings, open_base
 from spackle.bases.sharp import SharpBase
-from spackle.downloads import weights_digest
 from spackle.errors import InputError, check_name
 from spackle.evaluation import suite_sections as sections
 from spackle.evaluation.bench import check_runs
@@ -30,6 +29,7 @@ from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual.network import load_residual
 from spackle.signals import asked_to_stop
+from spackle.weights import weights_digest
 
 PARTS = "sections"
 RESULTS, MARKDOWN = "suite.json", "suite.md"

@@ -17,13 +17,13 @@ from torch import Tensor
 
 from spackle.crop import Crop
 from spackle.device import enough_memory, own_arithmetic, pick_device
-from spackle.downloads import installed
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import check_file
 from spackle.image import MAX_SIDE, working_size
 from spackle.inpaint.lama_network import LamaNetwork, Shapes, expected_shapes
 from spackle.inpaint.protocol import InpainterOptions
 from spackle.inpaint.torchscript import TorchScriptFile
+from spackle.weights import installed
 
 SIDE = 1024  # pixels of the long side at which it works
 MIN_SIDE = 128

@@ -20,7 +20,6 @@ from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, own
 from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import DatasetView
 from spackle.device import enough_memory
-from spackle.downloads import check_recorded, installed, weights_digest
 from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.progress import Reporter
@@ -29,6 +28,7 @@ from spackle.training.data import short_digest
 from spackle.training.recipe import DataRecipe, Recipe
 from spackle.training.sources import PseudoViews
 from spackle.training.task import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask, sheet
+from spackle.weights import check_undamaged, installed, weights_digest
 
 BASE = "sharp"  # the base whose decoder can learn
 VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
@@ -171,5 +171,5 @@ def _find_owner(checkpoint: Path | None) -> Owner:
     read_checkpoint_tensors(path)  # refuses what is none, and reads no numbers yet
     if owner_of(path) is not None:
         raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
-    record = check_recorded(path)
-    return Owner(path, weights_digest(path) if record is None else record.sha256)
+    check_undamaged(path)
+    return Owner(path, weights_digest(path))

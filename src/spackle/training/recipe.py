@@ -12,10 +12,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import Precision
-from spackle.downloads import installed
 from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 from spackle.residual.view_features import CELL
+from spackle.weights import installed
 
 PACKAGED = Path(__file__).parent / "recipes"
 MAX_BYTES = 1 << 16

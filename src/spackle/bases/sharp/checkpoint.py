@@ -26,9 +26,8 @@ from torch import Tensor, nn
 from spackle.bases.sharp.layers import CONFIGS, GROUPS, SharpConfig, normed_residual, set_precision
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.device import enough_memory
-from spackle.downloads.transfer import digest
 from spackle.errors import InputError, reason_in_a_line
-from spackle.files import check_file
+from spackle.files import check_file, sha256_of
 
 Shapes = dict[str, tuple[int, ...]]
 
@@ -165,7 +164,7 @@ def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], own
         )
     try:
         with open(home, "rb") as file:
-            found = digest(file).hexdigest()
+            found = sha256_of(file)
     except OSError as error:
         raise InputError(f"{home}: cannot be read: {reason_in_a_line(error)}") from error
     if found != owner.sha256:

@@ -1,0 +1,101 @@
+"""Weights that others publish: what is known of each file, and where it lies on this machine.
+
+`published.json` holds the facts; to add a file, add an entry. `download.py` fetches one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from spackle.errors import InputError
+from spackle.files import check_file, sha256_of
+
+HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror of it
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedWeights:
+    """One published file of weights, and small files that belong to it."""
+
+    name: str
+    purpose: str
+    url: str
+    file: str  # its name in the folder of weights
+    bytes: int
+    sha256: str  # 64 hexadecimal digits
+    licence: str  # in a few words
+    notice: Sequence[str]  # lines that a person sees before the download
+    option: str  # that names a copy elsewhere
+    beside: Mapping[str, tuple[int, str]] = dataclasses.field(default_factory=dict)  # name to bytes and SHA-256
+    needs: str = ""  # a package that is not always installed
+
+    def address(self, file: str | None = None) -> str:
+        """The address of the weights, or of a file beside them, on the mirror of the hub if one is named."""
+        url = self.url if file is None else f"{self.url.rpartition('/')[0]}/{file}"
+        mirror = os.environ.get("HF_ENDPOINT", "").rstrip("/")
+        return mirror + url.removeprefix(HUB) if mirror and url.startswith(f"{HUB}/") else url
+
+
+_FACTS = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+PUBLISHED = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.items()}
+
+
+def published_weights(name: str) -> PublishedWeights:
+    """The entry of that name; InputError where there is none."""
+    if name not in PUBLISHED:
+        raise InputError(f"{name}: no weights of that name are known: choose from {', '.join(PUBLISHED)}")
+    return PUBLISHED[name]
+
+
+def weights_folder() -> Path:
+    """Where downloaded weights lie: $SPACKLE_WEIGHTS, else spackle/weights in $XDG_CACHE_HOME or ~/.cache.
+
+    InputError where none is set, and there is no home.
+    """
+    try:
+        if chosen := os.environ.get("SPACKLE_WEIGHTS"):
+            return Path(chosen).expanduser()
+        cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        return (cache if cache.is_absolute() else Path.home() / ".cache") / "spackle" / "weights"
+    except RuntimeError as error:
+        raise InputError("no home folder for downloaded weights: name a folder in SPACKLE_WEIGHTS") from error
+
+
+def installed(name: str) -> Path | None:
+    """The file of published weights in the folder of weights; None where it is not there."""
+    path = weights_folder() / published_weights(name).file
+    return path if os.path.isfile(path) else None
+
+
+def published_as(path: Path) -> PublishedWeights | None:
+    """The published weights that a file is by its name and size; None for a file of somebody's own."""
+    for entry in PUBLISHED.values():
+        named = path.parts[-len(Path(entry.file).parts) :] == Path(entry.file).parts
+        if named and os.path.isfile(path) and os.path.getsize(path) == entry.bytes:
+            return entry
+    return None
+
+
+def check_undamaged(path: Path) -> None:
+    """InputError where a file has the name and the size of published weights, and other bytes, or cannot be read."""
+    entry = published_as(path)
+    if entry is not None and file_digest(path) != entry.sha256:
+        again = f"delete it and run `spackle weights get {entry.name}`"
+        raise InputError(f"{path}: damaged, for its SHA-256 is not the published one: {again}")
+
+
+def weights_digest(path: Path) -> str:
+    """SHA-256 of weights: the published one where name and size are, which `check_undamaged` holds a file to."""
+    entry = published_as(path)
+    return file_digest(path) if entry is None else entry.sha256
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file of weights, as 64 hexadecimal digits; InputError where it cannot be read."""
+    check_file(path, "file of weights")
+    with open(path, "rb") as file:
+        return sha256_of(file)
