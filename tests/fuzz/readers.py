@@ -211,7 +211,7 @@ def _read_dataset(folder: Path) -> None:
 
 def _checkpoint(folder: Path) -> None:
     tensors = {"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}
-    state = Checkpoint(Progress(3, 0.5, history=({"loss": 1.0},)), tensors, tensors, {"state": {}}, {"run": {}}, "x")
+    state = Checkpoint(Progress(3, 0.5, history=[{"loss": 1.0}]), tensors, tensors, {"state": {}}, {"run": {}}, "x")
     save_checkpoint(state, folder)
 
 

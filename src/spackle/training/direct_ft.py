@@ -107,7 +107,6 @@ class DirectFt(ViewTask):
         return [group.view(index) for index in drawn_views([self.recipe.run.seed, step, item], group.views)]
 
     def complete(self, network: nn.Module, batch: Sequence[DatasetView]) -> ViewBatch:
-        """The views of one photo, predicted anew."""
         return render_photo(network, self.base, batch, self.renderer)
 
     @torch.no_grad()
@@ -121,7 +120,6 @@ class DirectFt(ViewTask):
         return sheet(rows, PICTURE_SIDE)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """Photos of the dataset."""
         return [self.files.samples[self.learned[item]][1].photo for item in items]
 
     def export(self, network: nn.Module, path: Path) -> None:

@@ -23,16 +23,14 @@ from spackle.training.features import FeatureNet
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
 NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhere
 TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
-
-
 PAPER_WEIGHTS = {"color": 10.0, "alpha": 0.5, "perceptual": 1.0, "preserve": 5.0}  # how much each term counts
 
 
 def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> Tensor:
     """[] mean |rgb - target| over a hole's pixels and the channels.
 
-    With `blur`, a standard deviation in pixels, the difference is blurred within the hole first: then low frequencies
-    alone count, and texture, which nobody can know, is left to the perceptual term.
+    With `blur`, a standard deviation in pixels, the difference is blurred within the hole first: low frequencies alone
+    count, and texture, which nobody can know, is left to the perceptual term.
     """
     apart = torch.where(hole[..., None], rgb - target, 0)
     if blur > 0:
@@ -44,8 +42,7 @@ def color_loss(rgb: Tensor, target: Tensor, hole: Tensor, blur: float = 0.0) -> 
 def alpha_loss(alpha: Tensor, hole: Tensor) -> Tensor:
     """[] mean -log(max(alpha, 0.001)) over a hole: cross entropy towards 1.
 
-    The clamp holds the loss under 6.9 and its gradient under 1000. It costs nothing: a pixel below it shows no
-    Gaussian at all, because a splat under 1/255 is not drawn.
+    The clamp holds the gradient under 1000 and costs nothing: a splat under 1/255 is not drawn.
     """
     opaque = torch.where(hole, alpha, 1).clamp_min(ALPHA_FLOOR)
     return _mean_of_images(-opaque.log(), hole)
@@ -68,22 +65,14 @@ def perceptual_loss(
 ) -> Tensor:
     """[] feature reconstruction and Gram statistics near the hole.
 
-    Near is the hole grown by a max-pool of `dilation`; elsewhere the prediction is replaced by the target. For each
-    layer, F and T are the features [C, h, w] of prediction and target, both divided by the root mean square of T (one
-    number for each image and layer, no gradient), so that every layer and every network speaks in the same units;
-    w [h, w] is the share of each cell that is near. Then the loss is the sum over layers of
+    Near is the hole grown by a max-pool of `dilation`, an odd side in pixels; elsewhere the prediction is replaced by
+    the target. F and T are a layer's features [C, h, w] of prediction and target, both divided by the root mean square
+    of T (no gradient), so that every layer speaks in the same units; w [h, w] is the share of each cell that is near.
+    The loss is the sum over layers of
 
-        sum(w |F - T|) / (C sum(w))  +  mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
+        sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
-    The mean over the C² entries is what makes the second term independent of C. Each term is between about 0.1 and 1 a
-    layer for very different images.
-
-    Args:
-        features: the frozen network.
-        rgb, target, hole: as above.
-        dilation: side of the max-pool in pixels of `hole`, odd; 1 grows nothing.
-        size: the longer side of the images that the network sees; None leaves them as they are.
-        gram: how much the second term counts.
+    `size` is the longer side of the images that the network sees; None leaves them as they are.
 
     Raises:
         ValueError: an even dilation.
@@ -114,15 +103,8 @@ def total_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum that is minimised, eq. 6.
 
-    Args:
-        rgb, alpha, target, base_rgb, hole: as above.
-        features: None leaves the perceptual term out.
-        weights: one number for each term, by its name.
-        dilation, size, gram: as in `perceptual_loss`.
-        blur: as in `color_loss`.
-
-    Returns:
-        [] the loss, and its terms by name, each [], unweighted and detached.
+    `features` None leaves the perceptual term out; `weights` has a number for each term, `blur` is as in `color_loss`,
+    the rest as in `perceptual_loss`. Returns the loss [], and its terms by name, each [], unweighted and detached.
     """
     terms = {
         "color": color_loss(rgb, target, hole, blur),
@@ -139,20 +121,16 @@ def total_loss(
 def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     """Perceptual distance inside a hole, like LPIPS without its learned weights; 0 is equal, lower is better.
 
-    Outside of the hole the prediction is replaced by the target, so that only the hole's content counts. For each layer
-    the feature vectors of both images are scaled to unit length along the channels; the squared difference (0 to 2 a
-    cell, for features that are not negative) is averaged over the cells by the share of each that is hole, not dilated,
-    and the layers are summed. The layers are the network's own: `SqueezeNet` has conv1, fire4, fire8, fire9 (0 to 8 in
-    all), `ResNet50` layer1 to layer4. Numbers of different networks do not compare, nor do they with published LPIPS.
+    For each layer the feature vectors of both images are scaled to unit length along the channels; the squared
+    difference (0 to 2 a cell, for features that are not negative) is averaged over the cells by the share of each that
+    is hole, not dilated, and the layers are summed. Numbers of different networks do not compare, nor do they with
+    published LPIPS.
 
     Args:
-        features: the network to look with.
-        rgb: [H, W, 3] the completed view, sRGB 0..1.
+        features: the network to look with, `SqueezeNet` as a rule.
+        rgb: [H, W, 3] the completed view, sRGB 0..1, which counts inside of the hole alone.
         target: [H, W, 3] the truth, finite everywhere.
-        hole: [H, W] bool.
-
-    Returns:
-        The distance; NaN where there is no hole.
+        hole: [H, W] bool; without one the distance is NaN.
     """
     if not hole.any():
         return math.nan
@@ -168,13 +146,7 @@ def hole_distance(features: FeatureNet, rgb: Tensor, target: Tensor, hole: Tenso
 def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
     """-10 log10 of the mean squared difference over a hole's pixels and the channels, in dB; higher is better.
 
-    Args:
-        rgb: [H, W, 3] the completed view, sRGB 0..1.
-        target: [H, W, 3] the truth.
-        hole: [H, W] bool.
-
-    Returns:
-        Decibels; infinite where both are equal, NaN where there is no hole.
+    `rgb` and `target` are [H, W, 3] sRGB 0..1, `hole` is [H, W] bool. Infinite for equal pictures, NaN without a hole.
     """
     if not hole.any():
         return math.nan

@@ -115,7 +115,6 @@ class ResidualTask(ViewTask):
         return [load_sample(files[item]) for item in items]
 
     def complete(self, network: nn.Module | None, batch: Sequence[Sample]) -> ViewBatch:
-        """Samples with what a network adds."""
         return complete_samples(network, batch, self.renderer, self.precision)
 
     @torch.no_grad()
@@ -127,7 +126,6 @@ class ResidualTask(ViewTask):
         return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)), PICTURE_SIDE)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
-        """The samples' files."""
         return [self.learned[item].name for item in items]
 
     def export(self, network: nn.Module, path: Path) -> None:
