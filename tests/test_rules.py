@@ -108,9 +108,7 @@ def test_a_view_without_holes_gets_nothing_and_stays_bit_for_bit(name: str, netw
     ("name", "network", "kind", "disparity"),
     [*itertools.product(SCENES, [False], TRAJECTORIES, [0.3, 0.5, 0.6]), ("box", True, "swipe", 0.3)],
 )
-def test_a_completed_scene_shows_the_photo_as_the_base_does(
-    name: str, network: bool, kind: str, disparity: float
-) -> None:
+def test_a_completed_scene_keeps_the_photo(name: str, network: bool, kind: str, disparity: float) -> None:
     subject = context_of(name, network)
     aux = fill_scene(subject, path_of(subject, kind, disparity, frames=8)).aux
     assert len(aux) > 0
@@ -122,7 +120,7 @@ def test_a_completed_scene_shows_the_photo_as_the_base_does(
 
 @pytest.mark.parametrize("right", [-1.5, -1.0, 0.5, 1.5])
 @pytest.mark.parametrize("name", ["box", "odd"])
-def test_a_completed_view_behind_the_photos_guard_shows_the_photo_as_the_base_does(name: str, right: float) -> None:
+def test_a_view_behind_the_photos_guard_keeps_the_photo(name: str, right: float) -> None:
     """As far as disparity 0.6 and a little, but looking elsewhere than a trajectory does."""
     subject = context_of(name)
     aux = fill_view(subject, shifted(subject.photo_camera, right), [subject.photo_guard()]).aux

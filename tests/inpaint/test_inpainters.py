@@ -32,7 +32,7 @@ def test_an_unknown_inpainter_is_a_line() -> None:
         get_inpainter("nobody", InpainterOptions())
 
 
-def test_exemplar_goes_on_with_a_pattern_also_where_depth_is_unknown() -> None:
+def test_exemplar_extends_a_pattern_also_without_depth() -> None:
     y, x = torch.meshgrid(torch.arange(100), torch.arange(117), indexing="ij")
     bricks = torch.where((y % 8 < 2) | ((x + 7 * (y // 8 % 2)) % 14 < 2), 0.8, 0.3)
     truth, hole = bricks[..., None] * torch.tensor([1, 0.8, 0.6]), torch.zeros(100, 117, dtype=torch.bool)

@@ -92,7 +92,7 @@ def told(colors: Tensor) -> list[int]:
 
 
 @pytest.mark.parametrize("far_left", [True, False])
-def test_after_a_sideways_move_a_row_goes_on_from_its_farther_side(far_left: bool) -> None:
+def test_after_a_sideways_move_a_row_extends_its_farther_side(far_left: bool) -> None:
     depth = torch.full((HEIGHT, WIDTH), 0.5)
     depth[:, :8] = 0.1 if far_left else 1.0
     rim = rim_of(strip(8, 11), depth, moved(*SIDEWAYS), RAMP)
@@ -103,7 +103,7 @@ def test_after_a_sideways_move_a_row_goes_on_from_its_farther_side(far_left: boo
     assert not rim.distance[:, 12:].any()
 
 
-def test_at_the_border_one_rim_counts_without_any_the_seed_stays_and_another_surface_is_not_mirrored() -> None:
+def test_one_rim_counts_none_keeps_the_seed_and_none_is_mirrored() -> None:
     rim = rim_of(strip(15, WIDTH - 1), torch.full((HEIGHT, WIDTH), 1.0), moved(*SIDEWAYS), RAMP)
     assert told(rim.rgb[3, 15:]) == [14] * 5
     assert told(rim.mirrored[3, 15:]) == [13, 12, 11, 10, 9]
@@ -118,7 +118,7 @@ def test_at_the_border_one_rim_counts_without_any_the_seed_stays_and_another_sur
     assert told(rim.mirrored[4, 8:12]) in ([6, 7, 7, 7], [16, 15, 14, 13])
 
 
-def test_a_speck_at_the_border_fades_within_a_few_times_its_size() -> None:
+def test_a_speck_at_the_border_fades_soon() -> None:
     rgb = torch.full((64, 128, 3), 0.3)
     rgb[31:33, :41] = torch.tensor([0.9, 0.1, 0.1])
     mask = torch.zeros(64, 128, dtype=torch.bool)

@@ -40,7 +40,7 @@ def test_a_floor_stays_level_and_a_wall_goes_on() -> None:
         assert float((seeds.rgb - color).abs().mean(-1)[beyond & surface].mean()) < 0.07
 
 
-def test_a_sky_goes_on_as_it_is_and_leaves_of_its_colour_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sky_is_extended_and_leaves_of_its_colour_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     cues, _, floor = room()  # the wall is as blue as a sky
     there = cues.mask & ~floor
     dots = torch.rand(floor.shape, generator=torch.Generator().manual_seed(0)) < 0.3
@@ -53,7 +53,7 @@ def test_a_sky_goes_on_as_it_is_and_leaves_of_its_colour_do_not(monkeypatch: pyt
     assert float((leaves - leaves_faded).abs().mean()) < 0.3 * float((calm - faded).abs().mean())
 
 
-def test_what_is_nearer_than_the_border_beside_it_does_not_go_on() -> None:
+def test_what_is_nearer_than_the_border_is_not_extended() -> None:
     cues, _, _ = room()
     mask = cues.mask
     near = torch.zeros_like(mask)

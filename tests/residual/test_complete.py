@@ -86,7 +86,7 @@ def test_a_view_is_completed_as_the_equations_say(size: tuple[int, int]) -> None
     assert float((found.alpha - final.alpha).abs().mean()) < 1e-3
 
 
-def test_without_holes_nothing_is_added_and_without_a_network_its_deltas_are_zero() -> None:
+def test_without_holes_or_network_there_is_nothing_or_the_seeds() -> None:
     scene = box_before_wall(width=48, height=36, focal=40)
     base = scene.base()
     assert len(complete_view(base, scene.camera, scene.camera, CPU, None)) == 0

@@ -53,9 +53,7 @@ def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
 
 
 @pytest.mark.parametrize(("channel", "step"), [(0, (1.5, 0.0)), (1, (0.0, -2.0))])
-def test_two_channels_move_a_gaussian_on_the_image_and_one_along_its_ray(
-    channel: int, step: tuple[float, float]
-) -> None:
+def test_two_channels_move_on_the_image_and_one_along_the_ray(channel: int, step: tuple[float, float]) -> None:
     _, after, seeds, camera = moved([channel], sum(step))
     uv, z = camera.project(after.means)
     torch.testing.assert_close(uv, seeds.uv + torch.tensor(step), rtol=0, atol=1e-3)
@@ -68,18 +66,8 @@ def test_two_channels_move_a_gaussian_on_the_image_and_one_along_its_ray(
         assert bool(((z < camera.project(before.means)[1]) == (by > 0)).all())  # inverse depth: more is nearer
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_scales_change_by_a_bounded_factor_each_axis_alone(axis: int) -> None:
-    for by, low, high in ((-1e4, 0.2499, 0.2501), (-0.01, 0.98, 0.995), (0.01, 1.005, 1.02), (1e4, 3.999, 4.001)):
-        before, after, _, _ = moved([3 + axis], by)
-        factor = after.scales / before.scales
-        assert low < float(factor[:, axis].min()) <= float(factor[:, axis].max()) < high
-        others = [k for k in range(3) if k != axis]
-        torch.testing.assert_close(factor[:, others], torch.ones(20, 2), rtol=1e-4, atol=0)
-
-
 @pytest.mark.parametrize("by", [-1e4, -1.0, 1.0, 1e4])
-def test_colour_and_opacity_stay_within_bounds_whatever_the_delta(by: float) -> None:
+def test_colour_and_opacity_stay_within_bounds(by: float) -> None:
     before, after, _, _ = moved(range(10, 14), by)
     for one, other in ((before.colors, after.colors), (before.opacities, after.opacities)):
         assert 0 <= float(other.min()) <= float(other.max()) <= 1

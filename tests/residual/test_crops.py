@@ -24,7 +24,7 @@ from spackle.scene_fill.fill import SEEDS_HAR
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**31), st.integers(1, 150), st.integers(1, 150), st.integers(0, 6), st.sampled_from([0, 5, 40]))
-def test_each_masked_cell_is_in_one_crop_and_has_its_surroundings(
+def test_each_masked_cell_is_in_one_crop_with_a_margin(
     seed: int, height: int, width: int, spots: int, margin: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -50,7 +50,7 @@ def test_each_masked_cell_is_in_one_crop_and_has_its_surroundings(
     assert sum(outer.area for _, outer in pairs) <= height * width
 
 
-def test_holes_far_apart_are_looked_at_apart_and_a_full_mask_at_once() -> None:
+def test_holes_far_apart_have_crops_of_their_own() -> None:
     mask = torch.zeros(768, 768, dtype=torch.bool)
     assert crops_around(mask, STRIDE) == []
     assert crops_around(~mask, STRIDE) == [(Crop(0, 0, 768, 768),) * 2]
@@ -93,7 +93,7 @@ def test_crops_give_what_the_whole_picture_gives(view: tuple[ViewFeatures, Seeds
     assert nothing.cells == 0
 
 
-def test_specks_of_a_path_are_the_seeds_alone_and_great_holes_the_networks() -> None:
+def test_specks_of_a_path_are_the_seeds_alone() -> None:
     subject, wide = box_view(0.3, width=160, height=120)
     _, little = box_view(0.006, width=160, height=120)
     counting = CountingNetwork(shipped())

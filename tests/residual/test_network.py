@@ -26,7 +26,7 @@ def test_the_network_has_the_papers_size() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31), (32, 48)])
-def test_the_network_takes_any_size_and_pictures_of_a_batch_do_not_mix(size: tuple[int, int]) -> None:
+def test_the_network_takes_any_size_and_does_not_mix_a_batch(size: tuple[int, int]) -> None:
     network = random_network()
     features = torch.randn(2, IN_CHANNELS, *size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -54,7 +54,7 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
     torch.testing.assert_close(features(1000.0), found, rtol=0, atol=0.02)
 
 
-def test_a_rendered_loss_trains_the_network_and_leaves_the_base_alone() -> None:
+def test_a_rendered_loss_trains_the_network_alone() -> None:
     scene = box_before_wall(width=48, height=36, focal=40)
     base = Gaussians(*(t.requires_grad_() for t in scene.base().tensors))
     camera = extremes(scene.camera, 0.2, DepthRange.of(base))[1]
@@ -73,7 +73,7 @@ def test_a_rendered_loss_trains_the_network_and_leaves_the_base_alone() -> None:
     assert all(t.grad is None for t in base.tensors)
 
 
-def test_weights_that_are_no_numbers_are_named_and_not_the_cameras(tmp_path: Path) -> None:
+def test_weights_that_are_no_numbers_are_named(tmp_path: Path) -> None:
     tensors = ResidualNet().state_dict()
     name = next(iter(tensors))
     tensors[name] = torch.full_like(tensors[name], torch.nan)

@@ -34,7 +34,7 @@ def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], flo
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 7), st.integers(1, 7)))
-def test_cues_match_a_plain_loop_and_are_cut_off_from_what_made_them(seed: int, size: tuple[int, int]) -> None:
+def test_features_match_a_plain_loop_and_are_detached(seed: int, size: tuple[int, int]) -> None:
     view = random_view(seed, *size)
     cues = ViewFeatures.of(Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha))))
     assert not any(t.requires_grad for t in (cues.rgb, cues.inverse_depth, cues.alpha))

@@ -50,7 +50,7 @@ def path_of(
 
 
 @pytest.mark.parametrize("network", [False, True])
-def test_the_completed_view_is_that_of_drawing_everything_and_repeats(network: bool) -> None:
+def test_a_completed_view_is_that_of_drawing_everything(network: bool) -> None:
     context, camera = box_view(0.4)
     context = dataclasses.replace(context, network=random_network() if network else None)
     filled = fill_view(context, camera)
@@ -80,7 +80,7 @@ def test_the_widest_view_comes_first_and_a_beginning_is_spread() -> None:
     assert sorted(farthest_first([camera] * 3, camera)) == [0, 1, 2]
 
 
-def test_no_aux_gaussian_of_a_scene_hides_the_photo_and_it_repeats() -> None:
+def test_no_aux_gaussian_of_a_scene_hides_the_photo() -> None:
     context, _ = box_view()
     path = path_of(context, "shake", frames=8)
     aux = fill_scene(context, path).aux
@@ -226,7 +226,7 @@ def test_an_underlay_covers_nothing_beyond_the_photos_border() -> None:
     assert float((both.rgb - without.rgb)[beyond].abs().max()) < 0.02
 
 
-def test_no_underlay_shows_in_a_hole_of_the_other_widest_view(
+def test_no_underlay_is_seen_in_the_other_widest_views_holes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     green = torch.tensor([0.0, 1.0, 0.0])

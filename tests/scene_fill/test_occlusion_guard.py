@@ -102,14 +102,14 @@ def test_pushing_matches_a_plain_loop(seed: int) -> None:
 
 @PROPERTY
 @given(SEEDS, st.tuples(st.integers(1, 90), st.integers(1, 30)))
-def test_a_guard_is_the_farthest_depth_in_a_window_and_none_over_holes(seed: int, size: tuple[int, int]) -> None:
+def test_a_guard_is_the_farthest_depth_in_a_window(seed: int, size: tuple[int, int]) -> None:
     view = random_view(seed, *size)
     guard = OcclusionGuard.of(view, Camera.from_focal(20, size[1], size[0]))
     seen = torch.where(hole_mask(view.alpha), 0.0, view.depth)[None, None]
     assert torch.equal(guard.depth, max_pool2d(seen, 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0, 0])
 
 
-def test_without_guards_or_gaussians_or_in_front_of_the_camera_nothing_is_pushed() -> None:
+def test_nothing_is_pushed_without_a_reason() -> None:
     aux, eye = random_aux(5, 0), torch.zeros(3)
     assert same_bits(push_behind(aux, eye, []), aux)
     guard = OcclusionGuard(Camera.from_focal(20, 16, 12), torch.full((12, 16), 5.0))

@@ -90,7 +90,7 @@ def painted_box(size: tuple[int, int]) -> tuple[FillContext, Camera, Paint]:
 
 @pytest.mark.parametrize("size", [(96, 72), (95, 71)])
 @pytest.mark.parametrize("threshold", [0.95, 0.98])
-def test_a_painted_picture_is_asked_for_once_and_reaches_the_hole(size: tuple[int, int], threshold: float) -> None:
+def test_a_painted_picture_is_asked_for_once_and_seen(size: tuple[int, int], threshold: float) -> None:
     subject, camera, painter = painted_box(size)
     view = CPU.render(subject.base, camera)
     filled = fill_view(dataclasses.replace(subject, threshold=threshold), camera, rendering=view)
@@ -124,7 +124,7 @@ def hole_view(width: int = 96) -> tuple[HoleView, FillContext, Camera]:
     return HoleView(view, features, seeds, *rim, structure), context, camera
 
 
-def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None:
+def test_the_texture_leaves_low_frequencies_to_the_structure() -> None:
     view, _, _ = hole_view()
     rim = dataclasses.replace(view.rim, beyond=torch.zeros_like(view.rim.beyond))
     bad = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
@@ -138,7 +138,7 @@ def test_the_exemplars_texture_leaves_low_frequencies_to_the_structure() -> None
     assert float((in_cells(plain)[~mask] - smooth).abs().mean()) < 0.02
 
 
-def test_beyond_the_photos_border_more_of_patches_is_shown_but_nothing_broad() -> None:
+def test_beyond_the_border_patches_get_a_share_but_nothing_broad() -> None:
     """Stripes on a wall, brighter where patches come from; the structure that meets them is grey."""
     stripes = (0.5 + 0.1 * torch.sin(torch.arange(192) * math.tau / 16)).view(1, -1, 1).repeat(96, 1, 3)
     stripes[:, :96] += 0.2
@@ -165,7 +165,7 @@ def test_beyond_the_photos_border_more_of_patches_is_shown_but_nothing_broad() -
     assert means == pytest.approx([0.5, 0.5], abs=0.02)
 
 
-def test_beyond_the_photos_border_its_nearest_cells_are_extended_if_they_are_as_far_away() -> None:
+def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
     view, context, camera = hole_view()
     features, seeds, beyond = view.features, view.seeds, view.rim.beyond
     assert 100 < int(beyond.sum()) < int(features.mask.sum()) - 100

@@ -39,7 +39,7 @@ def strip(width: int = 64, near: float = 1.0, far: float = 0.2) -> tuple[Tensor,
 @pytest.mark.parametrize("share", [0.0, 0.4])  # a single pixel, and many
 @PROPERTY
 @given(seed=SEEDS, size=SIZES, bias=BIASES)
-def test_known_pixels_stay_bit_for_bit_and_the_rest_within_what_is_known(
+def test_known_pixels_stay_and_the_rest_is_within_their_range(
     share: float, seed: int, size: tuple, bias: float
 ) -> None:
     inverse, values, known = random_scene(seed, *size, share)
@@ -82,7 +82,7 @@ def test_what_is_not_known_is_not_read(seed: int, size: tuple, bias: float) -> N
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("flipped", [False, True])
-def test_a_hole_beside_a_near_thing_continues_what_lies_behind_it(turned: bool, flipped: bool) -> None:
+def test_a_hole_beside_a_near_thing_extends_what_is_behind_it(turned: bool, flipped: bool) -> None:
     inverse, values, known = strip()
     if flipped:
         inverse, values, known = inverse.flip(1), values.flip(2), known.flip(1)

@@ -47,7 +47,7 @@ def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     """Seeds for every cell of a view (covered cells keep what they show).
 
     What a hole reveals depends on why it is there. Behind a surface of the photo the far side of the rim continues;
-    beyond the frame of the photo's camera nothing was in front, and what reaches the frame goes on.
+    beyond the frame of the photo's camera nothing was in front, and what reaches the frame is extended.
     """
     known = _sources(features)
     if not bool(known.any()):

@@ -1,7 +1,7 @@
-"""What goes on beyond the photo's border, where no camera has looked: floors as floors, walls as walls, sky as sky.
+"""Extends the photo beyond its border, where no camera has looked: floors as floors, walls as walls, sky as sky.
 
-What reaches the border goes on along the line on which the camera moved, at the same distance from the photo's plane.
-So a level floor and a wall stay the planes that they are, from wherever they are seen.
+What reaches the border is extended along the epipolar line, at the same distance from the photo's plane. So a level
+floor and a wall stay the planes that they are, from wherever they are seen.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from spackle.filters import broadly_blurred, nearest_known
 from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.view_features import ViewFeatures
 
-AT_BORDER = 0.03  # of the photo's width: what ends farther inside does not go on beyond it
-DETOUR = 2.0  # how many times farther than the nearest seen cell a line may lead
-MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those that are led there
+AT_BORDER = 0.03  # of the photo's width: what ends farther inside is not extended beyond it
+DETOUR = 2.0  # how many times farther than the nearest seen cell a line's far rim may lie
+MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those traced along the line
 FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
 SKY, CALM, CALM_CELLS = 0.85, 0.2, 4.0  # a sky is so bright, or blue; its colours vary so little among so many cells
-AT_ONCE = 0.03  # of the view's width from the border: a sky goes on as it is from there
+AT_ONCE = 0.03  # of the view's width from the border: from there a sky is extended as it is
 LEAST = 1e-9
 
 
@@ -41,7 +41,7 @@ def fill_around(
         across: [h, w] inverse depth, in holes that of all around.
         uv: [h, w, 2] pixels of the cells.
         known: [h, w] bool: cells to start from.
-        inside: [h, w] bool: cells whose points lie in the photo's frame; what is behind goes on there.
+        inside: [h, w] bool: cells whose points lie in the photo's frame; there what is behind is extended.
         camera, photo_camera: the view's and the photo's.
     """
     mask, bias = features.mask, FAR_BIAS * inside
@@ -63,20 +63,20 @@ def fill_around(
 
     found, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
     apart = _cells_to_known(mask)
-    led = beyond & (steps > 0) & (steps <= DETOUR * apart)
-    hidden = led & (found[..., 5] == 0)  # by something nearer, beside which the photo goes on
-    found = widened(found, led & ~hidden, WIDENING * steps)
+    traced = beyond & (steps > 0) & (steps <= DETOUR * apart)
+    hidden = traced & (found[..., 5] == 0)  # by something nearer, beside which the photo is extended
+    found = widened(found, traced & ~hidden, WIDENING * steps)
     away = 1 / found[..., 4].clamp_min(LEAST) - motion[2, 3]
-    led = led & ~hidden & (away > 0) & (rays[..., 2] > 0)
+    traced = traced & ~hidden & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, features.inverse_depth, 0).amax()
-    carried = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
+    extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
     bias = torch.where(hidden, FAR_BIAS, bias)
     depths, mixed = far_fill(features.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
-    depths, colors = torch.where(led, carried, depths), torch.where(led, found[..., :4].movedim(-1, 0), mixed)
-    others = beyond & ~led
+    depths, colors = torch.where(traced, extended, depths), torch.where(traced, found[..., :4].movedim(-1, 0), mixed)
+    others = beyond & ~traced
     if bool(others.any()):
-        refilled = far_fill(depths, colors, led | known, far_bias=bias)
+        refilled = far_fill(depths, colors, traced | known, far_bias=bias)
         depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
     far = apart / mask.shape[1]
     sky = colors[3] * (rays[..., 1] < 0) * (far / AT_ONCE).clamp_max(1)  # there is none below the middle of the photo

@@ -1,4 +1,4 @@
-"""Walks from the cells of a hole along their epipolar lines to its far rim, and what they bring from there."""
+"""Walks from the cells of a hole along their epipolar lines to its far rim, and the values found there."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera
 
     Args:
         uv: [h, w, 2] pixels of the cells.
-        values: [h, w, c] what is brought.
+        values: [h, w, c] what is looked up.
         inverse_depth: [h, w], positive.
         mask: [h, w] bool.
         camera: of the view.
@@ -56,7 +56,7 @@ def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera
 def widened(values: Tensor, mask: Tensor, radius: Tensor) -> Tensor:
     """Values [h, w, c], those of masked cells the mean of the masked ones within about `radius` [h, w] cells.
 
-    A small thing at a rim would go on as a streak to the other side of the hole; so it fades as far off as it is large.
+    A small thing at a rim would become a streak to the other side of the hole; so it fades as far off as it is large.
     """
     level = radius.clamp(1, 2**WIDEST_LEVEL).log2()[..., None]
     sums = (torch.cat([values, level, torch.ones_like(level)], dim=-1) * mask[..., None]).permute(2, 0, 1)

@@ -25,9 +25,9 @@ from spackle.residual.view_features import ViewFeatures
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
 MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
-EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the exemplar's
-IN_CHANNELS = EXEMPLAR.stop + 1  # and how badly that fits
-COPIES = 3  # channels that say how much of each to take
+EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the patches'
+IN_CHANNELS = EXEMPLAR.stop + 1  # and the patch distance
+COPIES = 3  # channels that say how much of each to copy
 TYPICAL_DISTANCE = 16.0  # of a cell to the rim
 TYPICAL_MISMATCH = 0.1
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
@@ -58,7 +58,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualNet(nn.Module):
-    """Encoder of the cues, decoder, and SHARP's two heads: 8.02 M parameters.
+    """Encoder of a view's features, decoder, and SHARP's two heads: 8.02 M parameters.
 
     The last layers start at zero, so an untrained network returns the seeds unchanged.
     """
