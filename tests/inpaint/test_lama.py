@@ -225,9 +225,10 @@ NAME = b"X\x01\x00\x00\x00a"
         (b"\x80\x02" + TENSOR % (b"J\xff\xff\xff\xfft", b"K\x01t") + b".", "no storage, shape or stride"),
         (b"\x80\x02" + TENSOR.replace(b"Float", b"Metal") % (b"K\x02t", b"K\x01t") + b".", "torch MetalStorage"),
         (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0fno", "cannot be read"),
-        (b"\x80\x02}\x82\x01.", "EXT1"),
+        (b"\x80\x02}\x82\x01.", "extension"),
         (b"0" * 5_000_000, "too large"),
-        (b"\x80\x02R.", "what is not there"),
+        (b"\x80\x02R.", "cannot be read"),
+        (b"\x80\x02}r\xff\xff\xff\x7f.", "holds no generator"),  # a memo of 2 billion places
     ],
 )  # fmt: skip
 def test_pickles_that_mean_harm_are_a_line(tmp_path: Path, data: bytes, said: str) -> None:

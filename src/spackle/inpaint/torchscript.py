@@ -1,15 +1,15 @@
 """The tensors of a TorchScript file, or of what `torch.save` wrote, without running anything that is in it.
 
 Such a file is a zip archive of tensors, code, and a pickle that says where in a tree of objects each tensor stands. The
-code is not looked at. The pickle is read as data: a class or a function in it is a name, and what it would make of its
-arguments is an inert `Holder`, or for the one function that stands for a tensor a `StoredTensor`.
+code is not looked at. The pickle is read with inert stand-ins: a `Holder` in place of any class or function in it, and
+a `StoredTensor` in place of what the one function that makes a tensor would return.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import io
 import math
-import pickletools
+import pickle
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -52,17 +52,36 @@ class StoredTensor(NamedTuple):
         return self.numbers * self.dtype.itemsize
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Holder:
-    """In place of an object of any class."""
+    """In place of an object of any class, or of what any function makes: keeps the fields that it is given."""
 
-    fields: dict[str, Any] = dataclasses.field(default_factory=dict)
+    kind = ""  # of a subclass: module and name of what it stands for
+
+    def __new__(cls, *arguments: object) -> Any:
+        """Whatever the arguments, an empty one; a `StoredTensor` in place of torch's function that makes a tensor."""
+        return _rebuilt(arguments) if cls.kind == REBUILD else super().__new__(cls)
+
+    def __init__(self, *arguments: object) -> None:
+        self.fields: dict[object, object] = {}
+
+    def __setitem__(self, name: object, value: object) -> None:
+        self.fields[name] = value
+
+    def __setstate__(self, state: object) -> None:
+        if "fields" not in vars(self):  # pickles make objects without initialising them
+            self.fields = {}
+        if isinstance(state, dict):
+            self.fields.update(state)
 
 
-class _Global(NamedTuple):
-    """In place of a class or a function."""
+class _Reader(pickle._Unpickler):  # in Python: the one in C takes whatever memory a pickle asks for
+    """Reads a pickle of plain values, `Holder` and `StoredTensor`: no class or function in it is looked up."""
 
-    name: str
+    def find_class(self, module: str, name: str) -> type[Holder]:
+        return type("Holder", (Holder,), {"kind": f"{module} {name}"})
+
+    def persistent_load(self, pid: Any) -> tuple[Any, ...]:
+        return tuple(pid)
 
 
 class TorchScriptFile:
@@ -78,7 +97,7 @@ class TorchScriptFile:
             self._root = names[0].removesuffix("data.pkl")
             if self._archive.getinfo(names[0]).file_size > MAX_PICKLE:
                 raise ValueError("its pickle is too large for a network")
-            self._tensors = _tensors(_decoded(self._archive.read(names[0])))
+            self._tensors = _tensors(_Reader(io.BytesIO(self._archive.read(names[0]))).load())
         except BaseException:
             self._archive.close()
             raise
@@ -112,102 +131,18 @@ class TorchScriptFile:
         return whole.as_strided(tensor.shape, tensor.stride, tensor.offset)
 
 
-def _decoded(data: bytes) -> Any:
-    """What a pickle describes, of plain values, lists, tuples, dicts with names, `Holder` and `StoredTensor`."""
-    stack: list[Any] = []
-    marks: list[int] = []
-    memo: dict[int, Any] = {}
-
-    def since_mark() -> list[Any]:
-        place = marks.pop()
-        items = stack[place:]
-        del stack[place:]
-        return items
-
-    def pop(count: int) -> list[Any]:
-        if len(stack) < count:
-            raise ValueError("its pickle takes what is not there")
-        items = stack[len(stack) - count :]
-        del stack[len(stack) - count :]
-        return items
-
-    value: Any
-    for opcode, value, _ in pickletools.genops(data):
-        match opcode.name:
-            case "STOP":
-                return stack.pop()
-            case "PROTO" | "FRAME":
-                pass
-            case "MARK":
-                marks.append(len(stack))
-            case "BINPUT" | "LONG_BINPUT":
-                memo[value] = stack[-1]
-            case "BINGET" | "LONG_BINGET":
-                stack.append(memo[value])
-            case "GLOBAL":
-                stack.append(_Global(value))
-            case "NONE":
-                stack.append(None)
-            case "NEWTRUE" | "NEWFALSE":
-                stack.append(opcode.name == "NEWTRUE")
-            case "EMPTY_DICT":
-                stack.append({})
-            case "EMPTY_LIST":
-                stack.append([])
-            case "EMPTY_TUPLE":
-                stack.append(())
-            case "TUPLE":
-                stack.append(tuple(since_mark()))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                stack.append(tuple(pop(int(opcode.name[-1]))))
-            case "APPEND" | "APPENDS":
-                items = pop(1) if opcode.name == "APPEND" else since_mark()
-                if isinstance(stack[-1], list):
-                    stack[-1].extend(items)
-            case "SETITEM" | "SETITEMS":
-                items = pop(2) if opcode.name == "SETITEM" else since_mark()
-                _set(stack[-1], dict(zip(map(_name, items[::2]), items[1::2], strict=True)))
-            case "BUILD":
-                (state,) = pop(1)
-                _set(stack[-1], state)
-            case "NEWOBJ" | "REDUCE":
-                made, arguments = pop(2)
-                stack.append(_rebuilt(arguments) if made == _Global(REBUILD) else Holder())
-            case "BINPERSID":
-                stack.append(tuple(pop(1)[0]))
-            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "BINUNICODE" | "SHORT_BINUNICODE":
-                stack.append(value)
-            case name:
-                raise ValueError(f"its pickle has {name}, which no network's has")
-    raise ValueError("its pickle has no end")
-
-
-def _name(key: object) -> str:
-    """A key of a dict, where it can name a tensor; other keys are one, and of no use."""
-    return key if isinstance(key, str) else ""
-
-
-def _set(holder: object, items: object) -> None:
-    """Give an object its fields, or a dict some items; what has none stays as it is."""
-    if isinstance(items, dict):
-        if isinstance(holder, Holder):
-            holder.fields.update(items)
-        elif isinstance(holder, dict):
-            holder.update(items)
-
-
 def _rebuilt(arguments: Any) -> StoredTensor:
     """What torch's pickles say of a tensor: its storage, offset, shape, stride, and more that does not matter here."""
     (kind, storage, key, _, count), offset, shape, stride = arguments[:4]
     numbers = (count, offset, *shape, *stride)
     if kind != "storage" or not isinstance(key, str) or not all(type(n) is int and n >= 0 for n in numbers):
         raise ValueError("one of its tensors has no storage, shape or stride")
-    if storage.name not in DTYPES:
-        raise ValueError(f"one of its tensors is of {storage.name}")
+    if storage.kind not in DTYPES:
+        raise ValueError(f"one of its tensors is of {storage.kind}")
     last = offset + sum((side - 1) * step for side, step in zip(shape, stride, strict=True))
     if math.prod(shape) > count or last >= count:
         raise ValueError(f"a tensor of shape {list(shape)[:8]} does not fit into its storage of {count} numbers")
-    return StoredTensor(DTYPES[storage.name], key, count, offset, tuple(shape), tuple(stride))
+    return StoredTensor(DTYPES[storage.kind], key, count, offset, tuple(shape), tuple(stride))
 
 
 def _tensors(root: object) -> dict[str, StoredTensor]:
@@ -218,8 +153,9 @@ def _tensors(root: object) -> dict[str, StoredTensor]:
         path, node = waiting.pop()
         if isinstance(node, StoredTensor):
             found[path] = node
-        fields = node.fields if isinstance(node, Holder) else node
+        fields = vars(node).get("fields") if isinstance(node, Holder) else node
         if isinstance(fields, dict):
+            fields = {name: child for name, child in fields.items() if isinstance(name, str)}
             nodes += len(fields)
             if nodes > MAX_NODES or len(path) > MAX_PATH:
                 raise ValueError("its objects are too many or too deep, or hold themselves")
