@@ -37,6 +37,7 @@ from spackle.scene_fill import FillContext, fill_scene
 from spackle.surface import surface_gaussians
 
 BOARD_M, FOCUS_M = 1.5, 3.0
+DISPARITY = 0.3
 PATH = 4  # the clip is the beginning of a path of this many times its length
 Truth = tuple[Camera, Rendering]
 Sums = dict[str, list[Tensor]]  # a figure → its pixels, a tensor for each frame
@@ -53,20 +54,13 @@ class World(NamedTuple):
     camera: Camera
 
 
-class Clip(NamedTuple):
-    """How the camera, and how the board moves."""
-
-    name: str
-    eye: tuple[float, float, float]  # where the camera gets to, in metres
-    board: float  # how far the board goes to the right, in metres
-
-
-CLIPS = (
-    Clip("pan past a board", (0.20, 0.0, 0.0), 0.0),
-    Clip("walk towards it", (0.0, 0.0, 0.25), 0.0),
-    Clip("a board passes", (0.0, 0.0, 0.0), 0.40),
-    Clip("both move", (-0.10, 0.03, 0.1), 0.25),
-)
+Eye = tuple[float, float, float]
+CLIPS: dict[str, tuple[Eye, float]] = {  # in metres: where the camera gets to, and how far the board goes to the right
+    "pan past a board": ((0.20, 0.0, 0.0), 0.0),
+    "walk towards it": ((0.0, 0.0, 0.25), 0.0),
+    "a board passes": ((0.0, 0.0, 0.0), 0.40),
+    "both move": ((-0.10, 0.03, 0.1), 0.25),
+}
 
 
 def load_world(side: int) -> World:
@@ -102,17 +96,9 @@ def board(camera: Camera) -> Gaussians:
     return surface_gaussians(camera, uv, flat, torch.zeros(len(uv), 2), 0.7, colors, torch.full((len(uv),), 0.99))
 
 
-def moved(camera: Camera, eye: tuple[float, float, float]) -> Camera:
+def moved(camera: Camera, eye: Eye) -> Camera:
     """The camera at another place, looking at what it looked at."""
     return camera.looking(torch.tensor(eye), torch.tensor([0.0, 0.0, FOCUS_M]))
-
-
-def at(world: World, clip: Clip, part: float) -> tuple[list[Gaussians], Camera]:
-    """The scene and the camera that takes it, `part` of the way through the clip."""
-    shift = torch.eye(4)
-    shift[0, 3] = clip.board * part
-    x, y, z = (part * goal for goal in clip.eye)
-    return [world.still, world.board.transform(shift)], moved(world.camera, (x, y, z))
 
 
 def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
@@ -124,15 +110,16 @@ def said_depth(depth: Tensor, dice: torch.Generator) -> Tensor:
     return 1 / (inverse + SHIFT_NOISE * float(inverse.median()) * rolls[1]).clamp_min(0.1 * float(inverse.median()))
 
 
-def play(
-    world: World, clip: Clip, frames: int, disparity: float, noisy: bool, steady: bool
-) -> Iterator[tuple[CompletedView, Truth]]:
+def play(world: World, clip: str, frames: int, noisy: bool, steady: bool) -> Iterator[tuple[CompletedView, Truth]]:
     """Each frame's completed view, and the truth."""
     renderer, dice = get_renderer(), torch.Generator().manual_seed(0)
     path, flow, network = PATH * frames, OpenCV("this").flow, shipped_network()
-    completer = ClipCompleter("rotate", disparity, path, renderer, flow, align=steady, network=network)
+    completer = ClipCompleter("rotate", DISPARITY, path, renderer, flow, align=steady, network=network)
     for index in range(frames):
-        scene, camera = at(world, clip, index / max(1, frames - 1))
+        part, ((x, y, z), board_m) = index / max(1, frames - 1), CLIPS[clip]
+        shift = torch.eye(4)
+        shift[0, 3] = board_m * part
+        scene, camera = [world.still, world.board.transform(shift)], moved(world.camera, (part * x, part * y, part * z))
         taken = renderer.render(scene, camera)
         depth = said_depth(taken.depth, dice) if noisy else taken.depth
         own = dataclasses.replace(camera, world_to_camera=torch.eye(4))
@@ -153,17 +140,16 @@ def true_flow(now: Truth, was: Truth) -> tuple[Tensor, Tensor]:
 
 def mean(parts: list[Tensor]) -> float:
     """Over all pixels of all frames."""
-    values = torch.cat([part.flatten().double() for part in parts] or [torch.zeros(1)])
-    return float(values.mean()) if len(values) else 0.0
+    return float(torch.cat([part.flatten().double() for part in parts]).mean())
 
 
-def judge(world: World, clip: Clip, frames: int, disparity: float, noisy: bool) -> Sums:
+def judge(world: World, clip: str, frames: int, noisy: bool) -> Sums:
     """Both ways through the same clip, side by side."""
     sums: Sums = collections.defaultdict(list)
     past: dict[str, tuple[CompletedView, Truth]] = {}
     # Where the depth is exact there is nothing to hold still, so the same run has both.
     steady = [noisy, False] if noisy else [False]
-    for runs in zip(*(play(world, clip, frames, disparity, noisy, way) for way in steady), strict=True):
+    for runs in zip(*(play(world, clip, frames, noisy, way) for way in steady), strict=True):
         now = {"carried": runs[0], "alone": runs[-1]}
         sums["holes"].append(runs[0][0].hole)
         for name, (drawn, (_, truth)) in now.items():
@@ -191,14 +177,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--side", type=int, default=384, help="pixels along the frame's longer side")
     parser.add_argument("--frames", type=int, default=24)
-    parser.add_argument("--disparity", type=float, default=0.3)
     options = parser.parse_args()
     world = load_world(options.side)
     heads = ("depth", "holes", "seen", "alone", "carried", "ratio", "alone dB", "carried dB")  # PSNR in the holes
     print(f"{'clip':18}", *(f"{head:>10}" for head in heads))
     for noisy in (False, True):
         for clip in CLIPS:
-            sums = judge(world, clip, options.frames, options.disparity, noisy)
+            sums = judge(world, clip, options.frames, noisy)
             alone, carried = mean(sums["alone hole"]), mean(sums["carried hole"])
             figures: tuple[float, ...] = (mean(sums["carried seen"]), alone, carried, carried / alone)
             figures += tuple(-10 * math.log10(mean(sums[f"{name} off"])) for name in ("alone", "carried"))
@@ -207,7 +192,7 @@ def main() -> None:
                 f"{mean(sums['holes']):.1%}",
                 *(f"{value:.2f}" for value in figures),
             ]
-            print(f"{clip.name:18}", *(f"{cell:>10}" for cell in cells), flush=True)
+            print(f"{clip:18}", *(f"{cell:>10}" for cell in cells), flush=True)
 
 
 if __name__ == "__main__":

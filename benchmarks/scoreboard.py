@@ -97,7 +97,6 @@ def filled_from_around(own: Any) -> Any:
 
 
 def all_covered(own: Any) -> Any:
-    """`_sources` with specks."""
     return lambda features: features.inverse_depth > 0 if bool(features.mask.all()) else ~features.mask
 
 
@@ -281,7 +280,6 @@ def text(measure: str, value: float, sign: str = "") -> str:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table."""
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---", *["---:"] * (len(head) - 1)], *rows))
 
 
@@ -370,7 +368,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--against", type=Path, help="compare with these figures")
     chosen = parser.parse_args(arguments)
     names = [DEFAULT, *(MECHANISMS if chosen.ledger else ()), *chosen.without]
-    for name in [part for run in names[1:] for part in run.split("+") if part not in MECHANISMS]:
+    for name in {part for run in names[1:] for part in run.split("+")} - {*MECHANISMS}:
         parser.error(f"--without {name!r}: choose of {', '.join(MECHANISMS)}")
     if chosen.photos:
         sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
