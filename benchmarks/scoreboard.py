@@ -271,8 +271,8 @@ def seam(rgb: Tensor, crossings: Sequence[Tensor]) -> float:
         reach = [F.max_pool1d(crossing.float(), 2 * r - 1, 1, r - 1) > 0 for r in (NEAR, BESIDE)]
         for row, where in zip(sums, (reach[0], reach[1] & ~reach[0]), strict=True):
             row += torch.stack([steps[where].double().sum(), where.sum()])
-    near, beside = (sums[:, 0] / sums[:, 1]).tolist()
-    return float(near / beside)
+    means = sums[:, 0] / sums[:, 1]
+    return float(means[0] / means[1])
 
 
 def text(measure: str, value: float, sign: str = "") -> str:
@@ -342,7 +342,6 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])
         ordered = [picture for end in zip(*pictures, strict=True) for group in end for picture in group]
         rows.append(np.concatenate([thumbnail(rgb) for rgb in ordered], axis=1))
-        print(file.name, file=sys.stderr, flush=True)
     width = max(row.shape[1] for row in rows)
     return Image.fromarray(np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows]))
 
