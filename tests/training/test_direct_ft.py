@@ -105,7 +105,7 @@ def train(place: Path, output: Path, *more: object) -> Run:
 # What learns, and what does not -------------------------------------------------------------------
 
 
-def test_before_the_first_step_the_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
+def test_the_first_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
     group = DatasetFiles(place / "data").group(0)
     views = [group.view(index) for index in range(group.views)]
     holes = [float(view.mask.float().mean()) for view in views]

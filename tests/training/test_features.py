@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from spackle.errors import InputError
@@ -64,7 +63,7 @@ def refusal(name: str, path: Path | None) -> str:
     return message
 
 
-def test_resnet_has_torchvisions_names_and_shapes_and_normalises_as_it_does() -> None:
+def test_resnet_has_torchvisions_names_shapes_and_input() -> None:
     network = ResNet50().eval()
     shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
@@ -92,9 +91,7 @@ def test_resnet_reads_torchvisions_file(resnet: dict[str, Tensor], tmp_path: Pat
     assert all(m.min() >= 0 for m in maps)
 
 
-def test_squeezenet_has_caffes_sizes_and_convolves_bgr_less_the_mean(
-    squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]
-) -> None:
+def test_squeezenet_has_caffes_sizes_and_input(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
     shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
     assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
     assert [len(m) for m in squeezenet(torch.rand(2, 3, 35, 35))] == [2] * 4
@@ -103,25 +100,6 @@ def test_squeezenet_has_caffes_sizes_and_convolves_bgr_less_the_mean(
     window = bgr[:, 2 * 4 : 2 * 4 + 7, 2 * 9 : 2 * 9 + 7]
     cell = np.maximum((squeezed["conv1.w"] * window).sum((1, 2, 3)) + squeezed["conv1.b"], 0)
     np.testing.assert_allclose(squeezenet(image[None])[0][0, :, 4, 9].numpy(), cell, rtol=1e-4, atol=1e-3)
-
-
-def test_squeezenet_is_its_layers_in_order(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
-    tensors = {name: torch.from_numpy(value) for name, value in squeezed.items()}
-
-    def fire(name: str, x: Tensor) -> Tensor:
-        x = F.conv2d(x, tensors[f"{name}/conv1x1_1.w"], tensors[f"{name}/conv1x1_1.b"]).relu()
-        one = F.conv2d(x, tensors[f"{name}/conv1x1_2.w"], tensors[f"{name}/conv1x1_2.b"])
-        three = F.conv2d(x, tensors[f"{name}/conv3x3_2.w"], tensors[f"{name}/conv3x3_2.b"], padding=1)
-        return torch.cat([one, three], 1).relu()
-
-    maps = squeezenet(torch.rand(1, 3, 70, 52, generator=torch.Generator().manual_seed(4)))
-    x = maps[0]
-    stages = (["fire2", "fire3", "fire4"], ["fire5", "fire6", "fire7", "fire8"], ["fire9"])
-    for names, expected in zip(stages, maps[1:], strict=True):
-        x = F.max_pool2d(x, 3, 2, ceil_mode=True)
-        for name in names:
-            x = fire(name, x)
-        torch.testing.assert_close(x, expected)
 
 
 def test_networks_are_frozen_and_pass_gradients_on(squeezenet: SqueezeNet) -> None:

@@ -51,7 +51,7 @@ def grad(tensor: Tensor) -> Tensor:
     return tensor.grad
 
 
-def test_color_is_the_mean_difference_in_each_images_hole_then_over_images() -> None:
+def test_color_is_the_mean_difference_in_each_images_hole() -> None:
     hole = torch.tensor([[[True, False]], [[True, True]], [[False, False]]])
     each = [0.4 / 3, (0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6, 0]
     assert [color_loss(RGB, TARGET, part[None]).item() for part in hole] == pytest.approx(each)
@@ -59,7 +59,7 @@ def test_color_is_the_mean_difference_in_each_images_hole_then_over_images() -> 
     assert color_loss(rgb, target, hole).item() == pytest.approx(sum(each) / 3)
 
 
-def test_a_blurred_color_loss_sees_the_low_frequencies_of_the_holes_differences_alone() -> None:
+def test_a_blurred_color_loss_sees_low_frequencies_alone() -> None:
     rgb, target = pictures(2, 7, 9)
     hole, sigma = torch.rand(2, 7, 9, generator=torch.Generator().manual_seed(4)) < 0.5, 1.2
     each = []
@@ -77,7 +77,7 @@ def test_a_blurred_color_loss_sees_the_low_frequencies_of_the_holes_differences_
     assert color_loss(stripes + 0.5, stripes, middle, 2.0).item() == pytest.approx(0.5)
 
 
-def test_alpha_is_cross_entropy_towards_one_clamped_and_counts_images_alike() -> None:
+def test_alpha_is_clamped_cross_entropy_towards_one() -> None:
     alpha, hole = torch.tensor([[[0.5, 0.9]], [[0.25, 0.25]]]), torch.tensor([[[True, False]], [[True, True]]])
     assert alpha_loss(alpha, hole).item() == pytest.approx((0.693147 + 1.386294) / 2)
     alpha = torch.tensor([[[0.0, 1 / 255]]], requires_grad=True)  # nothing, and a faint splat, which has a gradient
@@ -87,7 +87,7 @@ def test_alpha_is_cross_entropy_towards_one_clamped_and_counts_images_alike() ->
     assert grad(alpha).flatten().tolist() == pytest.approx([0, -255 / 2])
 
 
-def test_preserve_is_the_mean_difference_outside_and_leaves_the_base_alone() -> None:
+def test_preserve_is_the_mean_difference_outside_of_the_hole() -> None:
     rgb, base = RGB.clone().requires_grad_(), TARGET.clone().requires_grad_()
     loss = preserve_loss(rgb, base, LEFT)
     loss.backward()
@@ -109,9 +109,7 @@ GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1
 
 @pytest.mark.parametrize("gram", [1.0, 0.25, 0.0])
 @pytest.mark.parametrize("factors", [(1,), (1, 100, 0.01)])
-def test_perceptual_sums_feature_and_gram_terms_of_layers_and_counts_images_alike(
-    factors: tuple[float, ...], gram: float
-) -> None:
+def test_perceptual_sums_feature_and_gram_terms_of_layers(factors: tuple[float, ...], gram: float) -> None:
     rgb, target = perceptual_example()
     expected = len(factors) * (FEATURE_TERM + gram * GRAM_TERM)
     loss = perceptual_loss(Pixels(*factors), rgb, target, LEFT, dilation=1, size=None, gram=gram)
@@ -122,9 +120,7 @@ def test_perceptual_sums_feature_and_gram_terms_of_layers_and_counts_images_alik
 
 
 @pytest.mark.parametrize(("size", "seen"), [(4, (3, 4)), (16, (12, 16)), (None, (6, 8))])
-def test_perceptual_resizes_to_the_longer_side_and_looks_only_near_the_hole(
-    size: int | None, seen: tuple[int, int]
-) -> None:
+def test_perceptual_resizes_and_looks_only_near_the_hole(size: int | None, seen: tuple[int, int]) -> None:
     sizes = []
 
     class Watching(Pixels):
@@ -167,7 +163,7 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     assert torch.autograd.gradcheck(lambda rgb: LOSSES[name](rgb, target, hole), (rgb,))
 
 
-def test_without_a_hole_there_is_nothing_to_fill_and_all_to_preserve() -> None:
+def test_without_a_hole_there_is_nothing_to_fill() -> None:
     rgb, target = RGB.clone().requires_grad_(), TARGET
     alpha = torch.tensor([[[0.0, 0.5]]], requires_grad=True)
     loss, terms = total_loss(rgb, alpha, target, RGB, NO_HOLE, features=Pixels(1))

@@ -25,7 +25,7 @@ def written(folder: Path, text: str = PLAIN) -> Path:
 
 
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
-def test_every_packaged_recipe_can_be_read_and_all_but_the_small_machines_have_the_papers_weights(name: str) -> None:
+def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
     recipe = load_recipe(Recipe, name, ["loss.features_path=weights"])
     papers = {**PAPER_WEIGHTS, "color_blur": 0, "gram": 1}
     assert (vars(recipe.loss).items() >= papers.items()) == (name != "cpu")
@@ -48,7 +48,7 @@ def test_resnet50_comes_from_the_folder_of_weights(tmp_path: Path, monkeypatch: 
     assert load_recipe(Recipe, "paper").loss.features_file == fetched
 
 
-def test_a_recipe_is_what_its_file_says_and_then_what_the_command_says(tmp_path: Path) -> None:
+def test_a_command_overrides_the_recipes_file(tmp_path: Path) -> None:
     text = """
         data:
           photos: some/photos
@@ -120,7 +120,7 @@ def test_what_cannot_be_is_named_with_its_file_or_option(
         load_recipe(Recipe, "cpus")
 
 
-def test_runs_differ_by_what_is_learned_and_not_by_how_long_it_takes(tmp_path: Path) -> None:
+def test_runs_differ_by_what_is_learned_not_by_length(tmp_path: Path) -> None:
     path = written(tmp_path)
     one = load_recipe(Recipe, path).model_dump(mode="json")
     same = ["optim.steps=9", "run.validate_every=2", "run.save_every=2", "data.cache=elsewhere", "data.photos=moved"]
@@ -131,7 +131,7 @@ def test_runs_differ_by_what_is_learned_and_not_by_how_long_it_takes(tmp_path: P
     assert json.loads(json.dumps(one)) == one
 
 
-def test_the_rate_warms_up_and_falls_as_a_cosine_and_the_average_forgets_quickly_at_first() -> None:
+def test_learning_rate_and_average_follow_their_schedules() -> None:
     optim = OptimRecipe(lr=1.0, min_lr=0.1, warmup=4, steps=14)
     assert [learning_rate(step, optim) for step in range(4)] == pytest.approx([0.25, 0.5, 0.75, 1])
     assert learning_rate(4, optim) == pytest.approx(1)

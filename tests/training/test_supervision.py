@@ -140,7 +140,7 @@ def test_holes_are_what_a_line_to_the_eye_says(seed: int | None, eye: tuple[floa
     assert not (~hole & outside(scene, viewer, margin=1)).any()
 
 
-def test_a_viewer_in_the_photos_place_leaves_no_hole_and_one_turned_away_nothing_else() -> None:
+def test_the_photos_camera_sees_no_hole_one_turned_away_no_base() -> None:
     scene, box = wall(), box_before_wall()
     views = [reverse(scene, scene.camera), reverse(scene, away(scene.camera))]
     assert not views[0].hole.any()
@@ -192,7 +192,7 @@ def whole(request: pytest.FixtureRequest) -> Sample:
 
 
 @pytest.mark.parametrize(("row", "column"), PLACES)
-def test_a_crop_is_a_part_of_the_view_and_so_is_what_completes_it(whole: Sample, row: int, column: int) -> None:
+def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: int, column: int) -> None:
     crop = whole.crop(row, column, CROP, CROP)
     part = slice(CELL * row, CELL * (row + CROP)), slice(CELL * column, CELL * (column + CROP))
     cells = slice(row, row + CROP), slice(column, column + CROP)
@@ -291,7 +291,7 @@ def plain_composite(seed: int, objects: int, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_cut_out_stands_before_what_it_covers_and_has_its_outline(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = [plain_composite(seed, count, monkeypatch) for count in range(5)]
     assert all(map(torch.equal, steps[-1], plain_composite(seed, 4, monkeypatch)))
     for count, ((rgb, inverse), (next_rgb, next_inverse)) in enumerate(itertools.pairwise(steps)):
@@ -326,7 +326,7 @@ def test_a_random_crop_fills_the_frame_whatever_the_photos_shape(size: tuple[int
 # Files --------------------------------------------------------------------------------------------
 
 
-def test_a_sample_comes_back_from_its_file_unless_that_is_damaged(tmp_path: Path) -> None:
+def test_a_sample_comes_back_from_its_file_unless_damaged(tmp_path: Path) -> None:
     scene = box_before_wall()
     scene = dataclasses.replace(scene, rgb=(255 * scene.rgb).round() / 255)
     sample = reverse(scene, shifted(scene.camera, 0.3)).crop(4, 6, 24, 32)
@@ -372,7 +372,7 @@ def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[fl
     return [file.name for file in files], asked
 
 
-def test_a_killed_fill_leaves_whole_files_and_goes_on_to_the_same_ones(tmp_path: Path) -> None:
+def test_a_killed_fill_goes_on_to_the_same_files(tmp_path: Path) -> None:
     files, asked = fill(tmp_path / "whole")
     expected, part = contents(tmp_path / "whole"), tmp_path / "part"
     assert len(set(asked)) == 5
@@ -473,7 +473,7 @@ def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any
     return folder
 
 
-def test_a_pair_gives_what_the_right_camera_saw_and_in_reverse_the_left_photo(tmp_path: Path) -> None:
+def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) -> None:
     folder = write_stereo(tmp_path, disparity="maps/left.npy")  # which may lie in another folder
     (folder / "maps").mkdir()
     (folder / "disparity.npy").rename(folder / "maps" / "left.npy")

@@ -109,7 +109,7 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
     assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_the_run_goes_on_from_there(
+def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(
     place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rate = training.learning_rate
@@ -129,9 +129,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_the_run_goes_on_from_there(
     assert_same_weights(tmp_path / "out", whole[0])
 
 
-def test_where_the_newest_checkpoint_is_damaged_the_one_before_it_counts(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path
-) -> None:
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
     out = shutil.copytree(whole[0], tmp_path / "out")
     (out / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
     done = train(place, out)
@@ -160,7 +158,7 @@ def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, whole: tupl
     assert not (out / "checkpoint.previous.pt").exists()
 
 
-def test_an_old_run_stays_until_the_one_that_overwrites_it_is_whole(
+def test_an_old_run_stays_until_its_successor_is_whole(
     place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def content() -> dict[str, bytes]:
