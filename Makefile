@@ -55,8 +55,7 @@ types: $(VENV)/.installed
 check: lint types test
 
 bench: $(VENV)/.installed
-	rm -rf bench-suite
-	$(BIN)/spackle bench --suite --only renderer,video -o bench-suite
+	$(BIN)/python benchmarks/suite.py --only renderer,video -o bench-suite
 
 # The documentation as a site: build/site/index.html.
 docs: pyproject.toml

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import torch
+from suite_scenes import SIDE, find_view, holed_scene, photo_scene
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
@@ -29,7 +30,6 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.device import Precision
 from spackle.errors import InputError
-from spackle.evaluation.suite_sections import SIDE, find_view, holed_scene, photo_scene
 from spackle.evaluation.timing import TOTAL, Task, measure
 from spackle.files import write_whole
 from spackle.gaussians import Gaussians
@@ -295,7 +295,7 @@ def suite(options: argparse.Namespace) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as folder:
         weights = [] if options.checkpoint is None else ["-c", str(options.checkpoint)]
         asked = ["--device", "cuda", "--only", "limits,completion,photo,video" + (",sharp" if weights else "")]
-        list(run(sys.executable, "-m", "spackle", "bench", "--suite", *asked, *weights, "-o", folder))
+        list(run(sys.executable, str(REPOSITORY / "benchmarks" / "suite.py"), *asked, *weights, "-o", folder))
         yield from (Path(folder) / "suite.md").read_text(encoding="utf-8").splitlines()[2:]
 
 

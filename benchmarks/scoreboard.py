@@ -47,6 +47,7 @@ from unittest import mock
 import numpy as np
 import torch
 import torch.nn.functional as F
+from niqe import NiqeModel, load_niqe, niqe
 from PIL import Image
 from torch import Tensor
 
@@ -58,7 +59,6 @@ from spackle.bases.lift import lift
 from spackle.bases.silhouettes import Layers
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import GREY, sharpness
-from spackle.evaluation.niqe import NiqeModel, load_niqe, niqe
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.training.features import FeatureNet, load_features
 from spackle.training.losses import covered, dilate, hole_psnr

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+
+from spackle.evaluation.rows import Row, Run
 
 WIDTH, HEIGHT, FOCAL = 72, 48, 60.0
 NEAR_PX, FAR_PX = 10, 4  # disparities of a box and of the wall behind it
@@ -52,18 +54,31 @@ def write_boxes(folder: Path, seed: int) -> None:
     (folder / "scene.json").write_text(json.dumps(names | lens))
 
 
-def run_config(title: str, near: bool, methods: Sequence[str]) -> dict[str, Any]:
-    """A configuration as an evaluation stores it."""
-    return {
+Figures = Mapping[str, Mapping[str, float | None]]  # method, metric
+
+
+def results(title: str, near: bool, figures: Callable[[int], Figures], count: int = 2, name: str = "scene_{}") -> Run:
+    """An evaluation of some images with two views a setting, whose figures go by the image, and one without any."""
+    config: dict[str, Any] = {
+        "kind": "evaluate",
         "title": title,
         "terms": f"cite {title}",
         "protocol": "near-view" if near else "large-view",
-        "methods": list(methods),
+        "methods": list(figures(0)),
         "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
         "disparities": None if near else [0.3, 0.4, 0.5],
         "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
         "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
     }
+    rows = []
+    for image in range(count):
+        known = Row(title, name.format(image), "", "", "", "base_gaussians", 50000)
+        rows.append(known)
+        for setting in Run(config, ()).settings:
+            for method, measured in figures(image).items():
+                for view in ("left", "right"):
+                    rows += [Row(title, known.image, setting, view, method, *one) for one in measured.items()]
+    return Run(config, [*rows, Row(title, "gone", "", "", "", "problem", "gone.png: <b>damaged</b>")])
 
 
 def fake_pyiqa(patch: pytest.MonkeyPatch, create: Callable[..., object]) -> None:

@@ -112,7 +112,7 @@ def test_an_evaluation_of_lite_and_of_a_model(
         root = ("--dataset", "middlebury", "--root", stereo)
         result = run("evaluate", *root, *words, "--base", base, "--precision", "fp32")
         assert result.code == 0, result.err
-        said = json.loads((folder / "out" / "results.json").read_text())["config"]["base"]
+        said = json.loads((folder / "out" / "config.json").read_text())["base"]
         assert (said["name"], said["title"], said["weights"]) == (title, title, weights)
         assert "not SHARP, so not the paper's base" in said["says"]
         assert f"| {title} alone |" in (folder / "out" / "tables.md").read_text()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import json
 import math
 import os
 import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from command import Run, names_in, refuses, run
-from evaluation_data import fake_pyiqa, run_config, write_boxes
+from evaluation_data import Figures, fake_pyiqa, results, write_boxes
 from scenes import box_before_wall, shifted
 from torch import Tensor
 
@@ -29,24 +29,24 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.evaluation import paper
 from spackle.evaluation.case import Case, load_case
-from spackle.evaluation.methods import Shot, make_method
+from spackle.evaluation.evaluate import measure_case
+from spackle.evaluation.folder import load_run, problem_of
+from spackle.evaluation.methods import Comparison
 from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim_average, ssim_map
-from spackle.evaluation.protocols import Gauges, large_views, measure
-from spackle.evaluation.results import ImageResult, Mean, Row
-from spackle.evaluation.results import Run as Results
-from spackle.evaluation.run import examine, problem_of
+from spackle.evaluation.protocols import Gauges, large_views, measure_views
+from spackle.evaluation.rows import Mean, Row, mean, median, pivot
+from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
-from spackle.evaluation.table import Line, Table, mark_best, to_latex, to_markdown
+from spackle.evaluation.table import Table, mark_best, write_table
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
+from spackle.render.protocol import Rendering
 from spackle.residual import hole_mask
 
 TABLES = ("tables.md", "tables.tex")
 FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package
-OUTPUTS = {"results.json", "times.json", "config.json", "worst.png", "best.png", "images", *TABLES}
-Figures = dict[str, dict[str, float | None]]
+OUTPUTS = {"rows.jsonl", "config.json", "worst.png", "best.png", "images", *TABLES}
 
 
 # --- metrics
@@ -140,17 +140,7 @@ def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatc
     assert math.isnan(metrics["clipiqa"](torch.zeros(4, 4, 3), None))
 
 
-# --- tables
-
-
-def results(title: str, protocol: str, methods: list[str], figures: Figures) -> Results:
-    """A run of two images with two views each, and one that was passed over."""
-    settings = ["near"] if protocol == "near-view" else ["0.3", "0.4", "0.5"]
-    rows = tuple(Row(s, v, m, figures[m]) for s in settings for m in methods for v in ("left", "right"))
-    facts = {"base_gaussians": 1000}
-    records = (ImageResult("a", facts, rows), ImageResult("b", facts, rows), ImageResult("c", problem="c: broken"))
-    config = run_config(title, near=protocol == "near-view", methods=methods)
-    return Results(config, records)
+# --- rows and tables
 
 
 LARGE: Figures = {
@@ -159,48 +149,66 @@ LARGE: Figures = {
 }
 
 
-def cells(table: Table, dataset: str) -> list[tuple[str, ...]]:
+def cells(table: Table, dataset: str) -> list[Sequence[str]]:
     """The rows of a dataset, without its name."""
-    names = [line.cells[0] for line in table.lines]
-    start = names.index(dataset)
-    end = next((k for k in range(start + 1, len(names)) if names[k]), len(names))
-    return [line.cells[1:] for line in table.lines[start:end]]
+    return next([row[1:] for row in rows] for rows in table.bodies if rows[0][0] == dataset)
 
 
-def test_the_large_view_tables_have_the_papers_layout_and_its_numbers() -> None:
-    quality, holes, gaussians = make_tables([results("Middlebury", "large-view", ["base", "spackle"], LARGE)])
+def test_the_large_view_tables_have_the_papers_layout_and_figures() -> None:
+    quality, holes, gaussians = make_tables([results("Middlebury", False, lambda image: LARGE)])
     base, spackle, sharp, _ = cells(quality, "Middlebury")
-    assert base[:5] == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
-    assert spackle[:4] == ("Spackle (rgbd)", "2/23", "", "**4.2500**")
-    assert sharp == ("SHARP (paper)", "23", *(f"{n:.4f}" for n in paper.QUALITY["Middlebury", "SHARP"]))
-    assert [row[2:5] for row in cells(holes, "Middlebury")[:1]] == [("0.2000", "0.0500", "75.00%")]
-    assert cells(gaussians, "Middlebury")[0][2:5] == ("30", "3.00", "1,030")
-    assert cells(quality, "Tanks")[0] == ("not run", *[""] * 10)
-    assert any("1 of 3 images gave no figures: c." in note for note in quality.notes)
+    assert [name for name, _ in quality.heads[3::3]] == [f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)]
+    assert tuple(base[:5]) == ("rgbd alone", "2/23", "", "4.5000", "(4 NaN)")
+    assert tuple(spackle[:4]) == ("Spackle (rgbd)", "2/23", "", "**4.2500**")
+    assert tuple(sharp[:5]) == ("SHARP (paper)", "23", "0.3904", "4.3102", "58.2782")
+    ours, theirs = cells(holes, "Middlebury")
+    assert tuple(ours[2:5]) == ("0.2000", "0.0500", "75.00%")
+    assert tuple(theirs[:5]) == ("Spackle on SHARP (paper)", "23", "0.0121", "0.0011", "90.47%")
+    ours, theirs = cells(gaussians, "Middlebury")
+    assert (tuple(ours[2:5]), tuple(theirs[2:5])) == (("30", "3.00", "1,030"), ("3,387", "0.29", "1,183,035"))
+    assert tuple(cells(quality, "Tanks")[0]) == ("not run", *[""] * 10)
+    assert any("1 of 3 images gave no figures: gone." in note for note in quality.notes)
 
 
-def test_results_that_do_not_go_together_and_means_of_what_is_not_finite() -> None:
-    one = results("LLFF", "large-view", ["base"], LARGE)
-    other = Results({**one.config, "title": "Tanks", "disparities": [0.3]}, one.records)
+def test_the_near_view_tables_have_the_papers_layout_and_figures() -> None:
+    figures: Figures = {"dense": {"aux": 200, "dists": 0.25}, "spackle": {"aux": 50, "dists": 0.125}}
+    near, _, ablation = make_tables([results("Booster", True, lambda image: figures)])
+    assert [tuple(row[:5]) for row in near.bodies[0]] == [
+        ("dense grid (rgbd)", "", "", "0.2500", ""), ("Spackle (rgbd)", "", "", "0.1250", "")
+    ]  # fmt: skip
+    assert [row[-1] for row in near.bodies[1]] == ["0.7154", "0.7325", "0.7180"]
+    dense, guided, *papers = cells(ablation, "Booster")
+    assert tuple(dense) == ("Dense grid init (rgbd)", "2/228", "50,000", "200.00", "", "0.2500", "")
+    assert tuple(guided) == ("Mask guided init (rgbd)", "2/228", "50,000", "50.00", "75.00%", "0.1250", "")
+    expected = ("Mask guided init (paper)", "228", "1,179,648", "144.17", "99.97%", "0.0871", "0.3075")
+    assert tuple(papers[1]) == expected
+
+
+def test_what_does_not_go_together_and_means_of_what_is_not_finite() -> None:
+    one = results("LLFF", False, lambda image: LARGE)
+    other = dataclasses.replace(one, config={**one.config, "title": "Tanks", "disparities": [0.3]})
     for second, why in ((one, "two results for LLFF"), (other, "different disparities")):
         with pytest.raises(InputError, match=why):
             make_tables([one, second])
-    rows = tuple(Row("near", str(k), "base", {"psnr": value}) for k, value in enumerate((10.0, None, 20.0)))
-    assert Results({}, (ImageResult("a", {}, rows),)).mean("psnr", "base", "near") == Mean(15.0, 2, 1)
-    assert Results({}, ()).mean("psnr", "base", "near") == Mean(None, 0, 0)
+    rows = [Row("d", "a", "near", str(k), "base", "psnr", v) for k, v in enumerate((10.0, None, 30.0, 20.0))]
+    values = pivot(rows, "method", "metric")["base", "psnr"]
+    assert (mean(values), median(values), mean([None])) == (Mean(20.0, 1), Mean(20.0, 1), Mean(None, 1))
 
 
-def test_a_table_as_markdown_and_as_latex() -> None:
-    table = Table("tab:x", "Ours & theirs, 5 %.", ("A", "B", "C"), (("", 1), ("both", 2)),
-                  (Line(("x_1", "**1**", "a|b")), Line(("", "2", "±3"), rule=True)), notes=("n.",))  # fmt: skip
-    assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in to_markdown([table])
-    text = to_latex([table])
+def test_a_table_as_markdown_latex_and_html() -> None:
+    heads, bodies = [("", "A"), ("both", "B"), ("both", "C")], [[("x_1", "**1**", "a|b")], [("", "2", "±<3")]]
+    table = Table("tab:x", "X", "Ours & theirs, 5 %.", heads, bodies, notes=("n.",))
+    assert "| A | both: B | both: C |\n|---|---|---|\n| x_1 | **1** | a\\|b |" in write_table(table, "md")
+    text = write_table(table, "tex")
     assert r"\caption{Ours \& theirs, 5 \%. n.}" in text
-    assert r" & \multicolumn{2}{c}{both} \\" in text
-    assert r"\cmidrule(lr){2-3}" in text
-    assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$3 \\\\" in text
+    assert " & \\multicolumn{2}{c}{both} \\\\\n\\cmidrule(lr){2-3}" in text
+    assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$$<$3 \\\\" in text
+    page = write_table(table, "html")
+    assert '<th colspan="2" scope="colgroup">both</th>' in page
+    assert '<th scope="row">x_1</th><td><strong>1</strong></td><td>a|b</td>' in page
+    assert "<td>±&lt;3</td>" in page
     with pytest.raises(ValueError, match="different lengths"):
-        Table("t", "", ("A",), (("", 1),), (Line(("1", "2")),))
+        Table("t", "", "", [("", "A")], [[("1", "2")]])
     assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
     assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
     assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
@@ -209,18 +217,21 @@ def test_a_table_as_markdown_and_as_latex() -> None:
 # --- methods and views
 
 
-def shot_of(*sides: float) -> Shot:
-    """A box before a wall, from elsewhere."""
+def compared(*sides: float) -> tuple[Comparison, list[Camera], list[Rendering]]:
+    """A box before a wall, and its base from elsewhere."""
     prediction, renderer = box_before_wall().lift(), get_renderer()
     cameras: list[Camera] = [shifted(box_before_wall().camera, side) for side in sides]
-    return Shot(prediction, cameras, [renderer.render(prediction.gaussians, camera) for camera in cameras], renderer)
+    before = [renderer.render(prediction.gaussians, camera) for camera in cameras]
+    return Comparison(prediction, renderer), cameras, before
 
 
 def test_each_method_starts_from_the_same_base() -> None:
-    shot = shot_of(0.4, -0.4)
+    comparison, cameras, renderings = compared(0.4, -0.4)
     names = ("base", "seeds", "spackle-scene", "dense", "network", "spackle")
-    alone, per_view, scene, dense, network, spackle = (list(make_method(name, None)(shot)) for name in names)
-    for index, before in enumerate(shot.before):
+    alone, per_view, scene, dense, network, spackle = (
+        list(comparison.method(name)(cameras, renderings)) for name in names
+    )
+    for index, before in enumerate(renderings):
         covered = ~hole_mask(before.alpha)
         assert torch.equal(alone[index].rgb, before.rgb)
         assert alone[index].aux == 0
@@ -239,16 +250,16 @@ def test_each_method_starts_from_the_same_base() -> None:
 
 
 def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
-    shot = shot_of(0.4)
-    base, g = shot.prediction, shot.base
+    comparison, cameras, before = compared(0.4)
+    base, g = comparison.prediction, comparison.prediction.gaussians
     double = dataclasses.replace(base, gaussians=dataclasses.replace(g, means=2 * g.means, scales=2 * g.scales))
-    same = next(make_method("direct-ft", None, lambda: (base, 1.0))(shot))
-    other = next(make_method("direct-ft", None, lambda: (double, 2.0))(shot))
-    assert torch.equal(same.rgb, shot.before[0].rgb)
-    assert float((other.rgb - shot.before[0].rgb).abs().max()) < 1e-3
+    for other, unit, most in ((base, 1.0, 0.0), (double, 2.0, 1e-3)):
+        method = dataclasses.replace(comparison, direct_ft=lambda other=other, unit=unit: (other, unit))
+        (view,) = method.method("direct-ft")(cameras, before)
+        assert float((view.rgb - before[0].rgb).abs().max()) <= most
 
 
-def test_large_views_are_the_ends_of_a_swipe_and_a_metric_that_fails_is_a_remark() -> None:
+def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     prediction = box_before_wall(width=95, height=71).lift()
     views = large_views(prediction, (0.3, 0.5))
     assert [(view.setting, view.name) for view in views] == [(s, n) for s in ("0.3", "0.5") for n in ("left", "right")]
@@ -261,11 +272,13 @@ def test_large_views_are_the_ends_of_a_swipe_and_a_metric_that_fails_is_a_remark
     def broken(picture: Tensor, truth: Tensor | None) -> float:
         raise RuntimeError("svd did not converge")
 
-    gauges, methods = Gauges(("niqe",), {"niqe": broken}, None), {"base": make_method("base", None)}
-    found = measure(prediction, views, methods, gauges, get_renderer())
-    assert found.remarks == ["niqe failed: svd did not converge"]
-    assert [row.figures["niqe"] for row in found.rows] == [None] * 4
-    assert found.pictures["base"].shape == (72, 96, 3)  # both sides even
+    gauges, image = Gauges(("niqe",), {"niqe": broken}, None), Row("Boxes", "box", "", "", "", "", None)
+    methods = {"base": Comparison(prediction, get_renderer()).method("base")}
+    rows, pictures = measure_views(image, prediction, views, methods, gauges, get_renderer())
+    assert [row.value for row in rows if row.metric == "remark"] == ["niqe failed: svd did not converge"]
+    assert [row.value for row in rows if row.metric == "niqe"] == [None] * 4
+    assert {row[:2] for row in rows} == {("Boxes", "box")}
+    assert pictures["base"].shape == (72, 96, 3)  # both sides even
 
 
 # --- the command
@@ -284,17 +297,13 @@ def evaluate(root: Path, output: Path, *more: object) -> Run:
     return run("evaluate", root, "--dataset", "middlebury", "--base", "rgbd", "-o", output, *more)
 
 
-def read(output: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((output / "results.json").read_text())
-    return found
+def mean_of(run: Results, setting: str, method: str, metric: str) -> float:
+    value = mean([row.value for row in run.rows if row[2:3] + row[4:6] == (setting, method, metric)]).value
+    assert value is not None
+    return value
 
 
-def mean_of(found: dict[str, Any], setting: str, method: str, figure: str) -> Any:
-    keys = {"setting": setting, "method": method, "figure": figure}
-    return next(mean for mean in found["means"] if keys.items() <= mean.items())["value"]
-
-
-def same_files(one: Path, other: Path, names: tuple[str, ...] = ("results.json", *TABLES)) -> None:
+def same_files(one: Path, other: Path, names: tuple[str, ...] = ("rows.jsonl", *TABLES)) -> None:
     for name in names:
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
@@ -308,8 +317,8 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     done = evaluate(scenes, tmp_path, "--methods", methods, "--metrics", "niqe,musiq", "--disparity", "0.3", "0.5")
     assert done.code == 0, done.err
     assert names_in(tmp_path) == OUTPUTS
-    found = read(tmp_path)
-    assert (found["problems"], found["config"]["disparities"]) == ({}, [0.3, 0.5])
+    found = load_run(tmp_path)
+    assert (found.problems, found.settings, len(found.measured)) == ({}, ["0.3", "0.5"], 3)
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")
         assert before > 0.02
@@ -328,7 +337,7 @@ def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None
     words = ("--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim")
     done = evaluate(scenes, tmp_path / "out", *words)
     assert done.code == 0, done.err
-    found = read(tmp_path / "out")
+    found = load_run(tmp_path / "out")
     hole, outside = (
         {name: mean_of(found, "near", name, f"psnr_{place}") for name in methods.split(",")}
         for place in ("hole", "outside")
@@ -344,20 +353,20 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: P
     place = ("--root", str(scenes), "--base", "rgbd", "-o", str(killed))
     code = (
         "import os\n"
-        "from spackle.evaluation import run as job\n"
-        "save = job.save_part\n"
-        "def once(*rest):\n"
-        "    save(*rest)\n"
-        "    if rest[0].name.startswith('00001'):\n"
+        "from spackle.evaluation import folder\n"
+        "write = folder.write_whole\n"
+        "def once(path, content):\n"
+        "    write(path, content)\n"
+        "    if path.name.startswith('00001'):\n"
         "        os.kill(os.getpid(), 9)\n"
-        "job.save_part = once\n"
+        "folder.write_whole = once\n"
         "from spackle.cli import main\n"
         "main()\n"
     )
     words = [sys.executable, "-c", code, "evaluate", "--dataset", "middlebury", *place, *choices]
     ended = subprocess.run(words, capture_output=True, check=False, env=dict(os.environ))
     assert ended.returncode == -9, ended.stderr
-    assert not (killed / "results.json").exists()
+    assert not (killed / "rows.jsonl").exists()
     again = evaluate(scenes, killed, *choices)
     assert again.code == 0
     assert "going on, 2 of 3" in again.err
@@ -365,7 +374,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: P
     before = {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
     assert evaluate(scenes, killed, *choices).code == 0
     assert before == {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
-    same_files(whole, killed, ("results.json", "worst.png", "best.png", *TABLES))
+    same_files(whole, killed, ("rows.jsonl", "worst.png", "best.png", *TABLES))
     refused = evaluate(scenes, killed, *choices[:-1], "0.5")
     assert (refused.code, "disparities: [0.4] -> [0.5]" in refused.err) == (2, True)
 
@@ -385,13 +394,12 @@ def test_a_broken_image_is_named_and_the_others_go_on(
             assert done.code == 0, done.err
             (line,) = [line for line in done.lines if "passed over:" in line]
             assert "Chair/left.png: " in line
-            found = read(where)
-            assert list(found["problems"]) == ["Chair"]
-            assert str(tmp_path) not in json.dumps(found)
+            assert list(load_run(where).problems) == ["Chair"]
+            assert str(tmp_path) not in (where / "rows.jsonl").read_text()
     assert "1 of 3 images gave no figures: Chair." in (output / "tables.md").read_text()
     photo.write_bytes(whole)
     assert evaluate(root, output, *choices).code == 0
-    assert read(output)["problems"] == {}
+    assert load_run(output).problems == {}
     for scene in root.iterdir():
         (scene / "left.png").write_bytes(b"")
     done = evaluate(root, tmp_path / "none", *choices)
@@ -401,11 +409,13 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     error = InputError(f"{tmp_path}/fern/images/007.jpg: not\nan image")
     assert problem_of(case, error, tmp_path) == "fern/003: fern/images/007.jpg: not an image"
     load, lack = load_case, f"{scenes}/Chair/third.png: not\nan image"
-    monkeypatch.setattr("spackle.evaluation.run.load_case", lambda case: dataclasses.replace(load(case), lacks=(lack,)))
+    monkeypatch.setattr(
+        "spackle.evaluation.evaluate.load_case", lambda case: dataclasses.replace(load(case), lacks=(lack,))
+    )
     done = evaluate(scenes, tmp_path / "lacks", *choices[:4], "--protocol", "near-view", "--limit", 1)
     remark = "without one of its second photos: Chair/third.png: not an image"
     assert f"Chair: {remark}" in done.lines
-    assert [record["remarks"] for record in read(tmp_path / "lacks")["images"]] == [[remark]]
+    assert [row.value for row in load_run(tmp_path / "lacks").rows if row.metric == "remark"] == [remark]
 
 
 def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
@@ -426,7 +436,7 @@ def test_infinite_gaussians_fail_an_image_and_a_memory_shortage_stops_the_run(
     for broken, kind in ((too_large, InputError), (too_little, BaseError)):
         monkeypatch.setattr(RgbdBase, "predict", broken)
         with pytest.raises(InputError) as caught:
-            examine(evaluation.cases[0], evaluation)
+            measure_case(evaluation.cases[0], evaluation)
         assert type(caught.value) is kind
 
 
@@ -435,8 +445,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0
     assert evaluate(scenes, two, *choices[:-2], "--protocol", "near-view").code == 0
-    found = read(one)
-    assert (len(found["images"]), found["config"]["disparities"]) == (1, [0.3, 0.5])
+    assert len(load_run(one).images) == 1
     done = run("tables", one, two, "-o", both)
     assert done.code == 0, done.err
     text = (both / "tables.md").read_text()
@@ -444,7 +453,11 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     assert run("tables", one, "-o", tmp_path / "again").code == 0
     same_files(one, tmp_path / "again", TABLES)
     refuses(run("tables", one, one, "-o", both), "two results")
-    refuses(run("tables", scenes, "-o", both), "results.json is missing")
+    refuses(run("tables", scenes, "-o", both), "rows.jsonl is missing")
+    for file, content in (("rows.jsonl", "[1]\n"), ("config.json", "{}"), ("config.json", "x")):
+        damaged = shutil.copytree(one, tmp_path / f"damaged {content.strip()}")
+        (damaged / file).write_text(content)
+        refuses(run("tables", damaged, "-o", both), file, "run it again")
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from niqe import NiqeModel, block_features, fit_aggd, halved, load_niqe, mscn, niqe, picture_features
 
 from spackle.errors import InputError
-from spackle.evaluation.niqe import NiqeModel, block_features, fit_aggd, halved, load_niqe, mscn, niqe, picture_features
 
 WINDOW = np.outer(*2 * [np.exp(-0.5 * (np.arange(-3, 4) / (7 / 6)) ** 2)])
 WINDOW /= WINDOW.sum()

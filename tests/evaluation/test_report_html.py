@@ -5,23 +5,21 @@ from __future__ import annotations
 import base64
 import importlib.util
 import io
-import json
 import re
-from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
+import evaluation_data
 import pytest
 from command import refuses, run
-from evaluation_data import run_config, write_boxes
+from evaluation_data import write_boxes
 from PIL import Image
 
+from spackle.evaluation.folder import image_file
 from spackle.evaluation.plots import STYLES, evenly, overhead_plot
-from spackle.evaluation.report import BUDGET, ReportSource, encode, fitting, make_report
-from spackle.evaluation.results import ImageResult, Row
-from spackle.evaluation.results import Run as Results
+from spackle.evaluation.report import BUDGET, encode, fitting, make_report
+from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
 
 pytest.importorskip("matplotlib")
@@ -82,30 +80,27 @@ def figures(near: bool, method: str, scene: int) -> dict[str, float | None]:
 
 def results(near: bool, count: int = 11, title: str = "Middlebury", name: str = "scene_{}") -> Results:
     """A run of some images, the last of which has none."""
-    settings = ["near"] if near else ["0.3", "0.4", "0.5"]
-    facts = {"base_gaussians": 50000, "shown": {"setting": settings[-1], "view": "right"}}
-    records = []
-    for scene in range(count):
-        views = [(s, m, v) for s in settings for m in METHODS for v in ("left", "right")]
-        rows = tuple(Row(s, v, m, figures(near, m, scene)) for s, m, v in views)
-        records.append(ImageResult(name.format(scene), facts, rows))
-    config = run_config(title, near, METHODS)
-    return Results(config, (*records, ImageResult("gone", problem="gone.png: <b>damaged</b>", remarks=())))
+    return evaluation_data.results(
+        title, near, lambda image: {method: figures(near, method, image) for method in METHODS}, count, name
+    )
 
 
-def picture(index: int, size: tuple[int, int] = (48, 32)) -> Mapping[str, bytes]:
-    return {n: encode(Image.new("RGB", size, (20 * index % 256, 9 * k, 90))) for k, n in enumerate((*METHODS, "truth"))}
+def report(folder: Path, *runs: Results) -> str:
+    """A page of these runs, with the same pictures for each."""
+    for index in range(len(runs[0].measured)):
+        for k, method in enumerate((*METHODS, "truth")):
+            color = (20 * index % 256, 9 * k, 90)
+            file = image_file(folder, index, runs[0].images[index], f".{method}.webp")
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(encode(Image.new("RGB", (48, 32), color)))
+    return make_report([(one, folder) for one in runs])
 
 
-def report(*runs: Results, **more: Any) -> str:
-    return make_report([ReportSource(one, picture, {"spackle": "9.9"}, {"cpu": EVIL}) for one in runs], **more)
-
-
-def test_a_page_is_well_formed_needs_nothing_else_and_is_the_same_bytes_again() -> None:
+def test_a_page_is_well_formed_and_needs_nothing_else(tmp_path: Path) -> None:
     runs = results(near=True), results(near=False)
-    text = report(*runs)
+    text = report(tmp_path, *runs)
     page, tables = Page(text), make_tables(runs)
-    assert text == report(*runs)
+    assert text == report(tmp_path, *runs)
     assert len(page.drawings()) == 5  # near views: overhead, PSNR, distance; large views: holes, overhead
     sections = [part["id"] for part in page.named("section")]
     assert sections == ["summary", "plots", "pictures", "tables", "setup"]
@@ -122,7 +117,8 @@ def test_a_page_is_well_formed_needs_nothing_else_and_is_the_same_bytes_again() 
                 assert opened.format == "WEBP"
 
     written = [word for around, word in page.words if {"td", "th"} & set(around)]
-    cells = [cell.strip("*") for table in tables for line in table.lines for cell in line.cells[table.words - 1 :]]
+    rows = [(table, cells) for table in tables for body in table.bodies for cells in body]
+    cells = [cell.strip("*") for table, line in rows for cell in line[table.words - 1 :]]
     assert all(written.count(cell) >= cells.count(cell) for cell in set(cells) - {""})
     for table in tables:
         assert table.caption in page.text("figcaption")
@@ -130,10 +126,8 @@ def test_a_page_is_well_formed_needs_nothing_else_and_is_the_same_bytes_again() 
     assert page.text("strong")  # the best of a column
 
 
-def test_every_string_from_outside_is_escaped() -> None:
-    text = report(
-        results(near=True, title=EVIL, name=f"{EVIL}{{}}".replace("{$", "{{$")), bench={EVIL: [EVIL, {EVIL: 1}]}
-    )
+def test_every_string_from_outside_is_escaped(tmp_path: Path) -> None:
+    text = report(tmp_path, results(near=True, title=EVIL, name=f"{EVIL}{{}}".replace("{$", "{{$")))
     page = Page(text)
     assert text.count("<script") == 1
     assert "<b>damaged" not in text
@@ -143,9 +137,9 @@ def test_every_string_from_outside_is_escaped() -> None:
     assert page.drawings()
 
 
-def test_many_evaluations_and_images_still_fit() -> None:
+def test_many_evaluations_and_images_still_fit(tmp_path: Path) -> None:
     titles = ("Middlebury", "Booster", "WildRGBD", "Tanks", "ETH3D", "LLFF")
-    page = Page(report(*(results(near, 3, title) for title in titles for near in (True, False))))
+    page = Page(report(tmp_path, *(results(near, 3, title) for title in titles for near in (True, False))))
     assert len(page.named("article")) == 2 * 12
     noise = Image.effect_noise((960, 720), 90).convert("RGB")
     fits = fitting([{"base": encode(noise), "spackle": encode(noise)}] * 12)
@@ -185,11 +179,10 @@ def test_the_command_writes_it_and_tables_write_the_same(tmp_path: Path, monkeyp
     assert str(tmp_path) not in text
     assert run("tables", out, "-o", tmp_path / "again", "--html").code == 0
     assert (tmp_path / "again" / "report.html").read_text(encoding="utf-8") == text
-    bench.mkdir()
-    (bench / "bench.json").write_text(json.dumps({"stages": [{"name": "<predict>", "seconds": 1.5}]}))
-    assert run("tables", out, bench, "-o", tmp_path / "old", "--html").code == 0
-    assert "<predict>" in Page((tmp_path / "old" / "report.html").read_text(encoding="utf-8")).text("dd")
-    assert run("tables", out, bench, "-o", tmp_path / "old").code == 2  # without a page, what for?
+    assert run("bench", root, "--dataset", "middlebury", "--base", "rgbd", "--runs", 1, "-o", bench).code == 0
+    assert run("tables", out, bench, "-o", tmp_path / "both", "--html").code == 0
+    both = Page((tmp_path / "both" / "report.html").read_text(encoding="utf-8"))
+    assert "Efficiency and Gaussian overhead" in both.text("figcaption")
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name))
     for command in (choices, ("tables", out, "-o", tmp_path / "none")):

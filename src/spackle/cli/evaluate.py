@@ -89,9 +89,9 @@ def evaluate(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Measure on a dataset, in the paper's protocols: results.json, tables.md, tables.tex, worst.png, best.png."""
+    """Measure on a dataset, in the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
     from spackle.bases.open import BaseSettings
-    from spackle.evaluation.run import evaluate as run
+    from spackle.evaluation.evaluate import evaluate as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
 
@@ -122,12 +122,14 @@ def evaluate(
 
 
 def tables(
-    results: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate` wrote.")],
+    results: Annotated[
+        list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate` and `spackle bench` wrote.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="T", help="A folder for the files.")],
     html: Html = False,
 ) -> None:
-    """Put several evaluations into the same tables: tables.md and tables.tex."""
-    from spackle.evaluation.run import merge_tables
+    """Put several evaluations and benchmarks into the same tables: tables.md and tables.tex."""
+    from spackle.evaluation.evaluate import merge_tables
     from spackle.progress import Reporter
 
     merge_tables(results, output, Reporter(), html)
@@ -135,18 +137,9 @@ def tables(
 
 def bench(
     context: typer.Context,
-    dataset: Annotated[str | None, _DATASET] = None,
+    dataset: Annotated[str, _DATASET],
     folder: Folder = None,
     root: Root = None,
-    suite: Annotated[
-        bool, typer.Option("--suite", help="Time every stage on this machine instead, without a dataset.")
-    ] = False,
-    only: Annotated[
-        str | None, typer.Option(metavar="A,B,…", help="Of the suite's sections: an unknown one lists all.")
-    ] = None,
-    side: Annotated[
-        int, typer.Option(help="In the suite: pixels along its scenes; smaller is for trying it out.")
-    ] = 1536,
     disparity: Disparity = "0.3,0.4,0.5",
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
@@ -163,62 +156,26 @@ def bench(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Count and time what Spackle adds to the base, in the paper's tables: bench.json, bench.md, bench.tex.
-
-    With --suite: time every stage on this machine, without a dataset: suite.json, suite.md.
-    """
+    """Count and time what Spackle adds to the base, in the paper's tables: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.open import BaseSettings
     from spackle.evaluation.bench import bench as run
-    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
-    from spackle.evaluation.suite import SuiteOptions, run_suite
-    from spackle.pipeline import FillOptions
+    from spackle.evaluation.setup import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter
 
-    given, reporter = _given(context), Reporter(verbose, as_json=as_json)
     source, numbers = _sorted_words(context, folder, root, disparity)
-    _check_choice(suite, given, source or root)
-    disparities = parse_disparities(numbers)
-    bases = BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp))
-    if dataset is None:
-        asked = SuiteOptions(
-            only=split_words(only or ""),
-            runs=runs,
-            device=device,
-            sharp=bases if {"--base", "--checkpoint"} & given else None,
-            base_runs=base_runs,
-            residual=FillOptions(residual).file,
-            side=side,
-        )
-        end = run_suite(asked, output or Path("bench-suite"), reporter)
-    else:
-        options = EvaluateOptions(
-            dataset,
-            given_input("FOLDER", source, root),
-            methods=("spackle",),
-            disparities=disparities,
-            metrics=(),
-            base=bases,
-            residual=residual,
-            limit=limit,
-        )
-        end = run(options, runs, base_runs, output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}"), reporter)
-    if end == "stopped":
+    options = EvaluateOptions(
+        dataset=dataset,
+        root=given_input("FOLDER", source, root),
+        methods=("spackle",),
+        disparities=parse_disparities(numbers),
+        metrics=(),
+        base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
+        residual=residual,
+        limit=limit,
+    )
+    results = output or Path(f"bench-{dataset}-{UNFIT.sub('-', base)}")
+    if run(options, runs, base_runs, results, Reporter(verbose, as_json=as_json)) == "stopped":
         raise typer.Exit(INTERRUPTED)
-
-
-def _check_choice(suite: bool, given: set[str], folder: Path | None) -> None:
-    """InputError where the options `given`, by their long names, ask for no dataset and no suite, or for both."""
-    of_dataset = ("--dataset", "--root", "--limit", "--disparity")
-    of_suite = ("--only", "--side")
-    if not suite and ("--dataset" not in given or folder is None):
-        raise InputError("FOLDER or --dataset missing: give FOLDER --dataset NAME, or --suite")
-    if suite and folder is not None and "--root" not in given:
-        raise InputError(f"{folder}: a folder is not for --suite: leave one of them out")
-    for name in of_dataset if suite else of_suite:
-        if name in given:
-            raise InputError(f"{name} is {'not for --suite' if suite else 'for --suite alone'}: leave one of them out")
-    if suite and "--sharp" in given and not {"--base", "--checkpoint"} & given:
-        raise InputError("--sharp is of SHARP, which is not timed: give -c FILE or --base sharp, or leave it out")
 
 
 def _given(context: typer.Context) -> set[str]:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import importlib.util
 import io
 import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spackle.errors import InputError
-from spackle.evaluation import paper
 from spackle.evaluation.methods import METHODS
-from spackle.evaluation.results import Run
-from spackle.evaluation.sheets import UP, mean_of
-from spackle.evaluation.tables import ADDING, FILLING, method_name
+from spackle.evaluation.paper import paper_rows
+from spackle.evaluation.rows import Row, Run, mean, pivot
+from spackle.evaluation.sheets import ranked
+from spackle.evaluation.tables import method_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -55,8 +54,17 @@ SCENE_FIGURES = {  # titles of the plot and of its axis
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Plot:
+class Series(NamedTuple):
+    """Points of one method."""
+
+    title: str
+    method: str  # of `STYLES`
+    points: Sequence[tuple[float, float]]
+    hollow: bool = False
+    line: str = ""  # "", "-" or "--"
+
+
+class Plot(NamedTuple):
     """A drawing below its title."""
 
     title: str
@@ -73,17 +81,6 @@ class Plot:
     def address(self) -> str:
         """The drawing as a data address."""
         return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Series:
-    """Points of one method."""
-
-    title: str
-    method: str  # of `STYLES`
-    points: Sequence[tuple[float, float]]
-    hollow: bool = False
-    line: str = ""  # "", "-" or "--"
 
 
 def check_matplotlib(option: str) -> None:
@@ -119,7 +116,7 @@ def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None
 
 def plots_of(run: Run) -> list[Plot]:
     """The plots of an evaluation that its figures allow."""
-    scenes = [scenes_plot(run, figure) for figure in SCENE_FIGURES] if run.near else []
+    scenes = [scenes_plot(run, metric) for metric in SCENE_FIGURES] if run.near else []
     made = [*([] if run.near else [holes_plot(run)]), overhead_plot(run), *scenes]
     return [plot for plot in made if plot]
 
@@ -127,19 +124,21 @@ def plots_of(run: Run) -> list[Plot]:
 def holes_plot(run: Run) -> Plot | None:
     """HAR against disparity, before and after, and the paper's."""
 
-    def means(figure: str, method: str) -> list[tuple[float, float]]:
-        moves = sorted(map(float, run.config["disparities"]))
-        found = [(move, run.mean(figure, method, f"{move:g}").value) for move in moves]
-        return [(move, value) for move, value in found if value is not None]
+    def means(rows: Sequence[Row], metric: str, method: str) -> list[tuple[float, float]]:
+        own = (row for row in rows if (row.method, row.metric) == (method, metric))
+        found = {float(setting): mean(values).value for (setting,), values in pivot(own, "setting").items()}
+        return [(move, value) for move, value in sorted(found.items()) if value is not None]
 
-    def papers(place: int) -> list[tuple[float, float]]:
-        return list(zip(paper.DISPARITIES, paper.HOLES.get(run.title, ())[place::3], strict=False))
-
-    series = [Series(f"before: {run.base} alone", "base", means("har_before", run.methods[0]), line="--")]
-    filling = [method for method in run.methods if method in FILLING]
-    series += [Series(f"after: {method_name(run, m)}", m, means("har", m), line="-") for m in filling]
-    series.append(Series("before: SHARP (paper)", "base", papers(0), True, "--"))
-    series.append(Series("after: Spackle on SHARP (paper)", "spackle", papers(1), True, "-"))
+    before = means(run.rows, "har_before", run.methods[0])
+    series = [Series(f"before: {run.base} alone", "base", before, line="--")]
+    filling = [method for method in run.methods if method != "base"]
+    series += [Series(f"after: {method_name(run, m)}", m, means(run.rows, "har", m), line="-") for m in filling]
+    papers = [row for row in paper_rows("tab:controlled_disocclusion") if row.dataset == run.title]
+    for title, method, metric, line in (
+        ("before: SHARP (paper)", "base", "har_before", "--"),
+        ("after: Spackle on SHARP (paper)", "spackle", "har", "-"),
+    ):
+        series.append(Series(title, method, means(papers, metric, "Spackle on SHARP (paper)"), True, line))
     series = [one for one in series if one.points]
     if not series:
         return None
@@ -163,26 +162,30 @@ def holes_plot(run: Run) -> Plot | None:
 def overhead_plot(run: Run) -> Plot | None:
     """Added Gaussians against the size of the hole: a dot for each image and view."""
     series, count = [], 0
-    for method in (name for name in run.methods if name in ADDING):
-        dots = [
-            (100 * before, 100 * share)
-            for row in run.rows
-            if row.method == method
-            and (before := row.figures.get("har_before")) is not None
-            and (share := row.figures.get("aux_share")) is not None
-        ]
+    found = pivot(run.rows, "method", "image", "setting", "view", "metric")
+    adding = dict.fromkeys(row.method for row in run.rows if row.metric == "aux" and row.method != "base")
+    for method in (name for name in run.methods if name in adding):
+        views = [key[:-1] for key in found if key[0] == method and key[-1] == "aux_share"]
+        pairs = [(found[(*view, "har_before")][0], found[(*view, "aux_share")][0]) for view in views]
+        dots = [(100 * float(one), 100 * float(two)) for one, two in pairs if one is not None and two is not None]
         count += len(dots)
-        kept = [dots[k] for k in evenly(len(dots), DOTS // len(ADDING))]
+        kept = [dots[k] for k in evenly(len(dots), DOTS // len(adding))]
         series.append(Series(method_name(run, method), method, kept))
     series = [one for one in series if one.points]
     if not series:
         return None
     shown = sum(len(one.points) for one in series)
     note = "One dot for each image and view." if shown == count else f"{shown:,} of {count:,} images and views."
-    if not run.near and run.title in paper.HOLES:
-        holes, shares = paper.HOLES[run.title][::3], paper.GAUSSIANS[run.title][1::3]
-        means = [(100 * hole, share) for hole, share in zip(holes, shares, strict=True)]
-        series.append(Series("Spackle on SHARP (paper), means", "spackle", means, True))
+    holes, shares = (
+        [100 * float(row.value or 0) for row in paper_rows(label) if (row.dataset, row.metric) == (run.title, metric)]
+        for label, metric in (
+            ("tab:controlled_disocclusion", "har_before"),
+            ("tab:expanded_efficiency_gaussian_overhead", "aux_share"),
+        )
+    )
+    if not run.near and holes:
+        points = list(zip(holes, shares, strict=True))
+        series.append(Series("Spackle on SHARP (paper), means", "spackle", points, True))
 
     def finish(axes: Axes) -> None:
         axes.set_xlim(left=0)
@@ -192,18 +195,13 @@ def overhead_plot(run: Run) -> Plot | None:
     return Plot("Added Gaussians against hole size", series, svg, note)
 
 
-def scenes_plot(run: Run, figure: str) -> Plot | None:
+def scenes_plot(run: Run, metric: str) -> Plot | None:
     """A figure of each scene by each method, in the order of Spackle, or else of the last method."""
-    values = {
-        method: {r.name: v for r in run.measured if (v := mean_of(r, figure, method)) is not None}
-        for method in run.methods
-    }
-    values = {method: found for method, found in values.items() if found}
+    values = {method: found for method in run.methods if (found := run.by_image(metric, method))}
     if not values:
         return None
     leader = "spackle" if "spackle" in values else list(values)[-1]
-    lead, sign = values[leader], -1 if figure in UP else 1
-    order = sorted(lead, key=lambda name: (sign * lead[name], name))
+    order = ranked(values[leader], metric)
     names = [order[k] for k in evenly(len(order), SCENES)]
     series = []
     for method, found in values.items():
@@ -214,10 +212,10 @@ def scenes_plot(run: Run, figure: str) -> Plot | None:
         axes.set_yticks(range(len(names)), [_short(name) for name in names])
         axes.set_ylim(len(names) - 0.5, -0.5)
 
-    title, axis = SCENE_FIGURES[figure]
+    title, axis = SCENE_FIGURES[metric]
     svg = draw(series, axis, "", finish, HEIGHT / 2 + ROW * len(names))
     some = f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
-    return Plot(title, series, svg, f"In the order of {METHODS[leader].title}, best first.{some}")
+    return Plot(title, series, svg, f"In the order of {METHODS[leader][0]}, best first.{some}")
 
 
 def _short(name: str) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,20 +14,16 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError, reason_in_a_line
-from spackle.evaluation.methods import Method, Shot
+from spackle.evaluation.methods import Method
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
-from spackle.evaluation.results import Row
+from spackle.evaluation.rows import REMARK, Row
 from spackle.render import Renderer
-from spackle.render.protocol import Rendering
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.training.features import FeatureNet
 from spackle.training.losses import hole_distance
 
-NEAR = "near"
 
-
-@dataclasses.dataclass(frozen=True)
-class Wanted:
+class Viewpoint(NamedTuple):
     """A view to look at."""
 
     setting: str
@@ -43,18 +40,31 @@ class Gauges:
     published: Mapping[str, Metric]  # those of them that pyiqa measures, where it can
     features: FeatureNet | None  # for "distance"
 
+    def measure(self, rgb: Tensor, truth: Tensor | None, hole: Tensor) -> Iterator[tuple[str, float | str]]:
+        """Figures of a picture [H, W, 3], by their names; a metric that failed gives NaN and a remark.
 
-@dataclasses.dataclass(frozen=True)
-class Measured:
-    """A photo's figures, and pictures of the view with the largest hole."""
+        Metrics of a truth are left out where there is none; `hole` [H, W] is the base's.
+        """
+        places: dict[str, Tensor | None] = {"": None, "_hole": hole, "_outside": ~hole}
+        for name in self.metrics:
+            if METRICS[name].truth and truth is None:
+                continue
+            if name in self.published:
+                try:
+                    yield name, self.published[name](rgb, truth if METRICS[name].truth else None)
+                except Exception as error:  # a stranger's package on an odd picture: the figure is missing, and shows
+                    yield name, math.nan
+                    yield REMARK, f"{name} failed: {reason_in_a_line(error)}"
+            elif truth is not None and name == "psnr":
+                yield from ((f"psnr{place}", psnr(rgb, truth, mask)) for place, mask in places.items())
+            elif truth is not None and name == "ssim":
+                similarity = ssim_map(rgb, truth)
+                yield from ((f"ssim{place}", ssim_average(similarity, mask)) for place, mask in places.items())
+            elif truth is not None and name == "distance" and self.features is not None:
+                yield name, hole_distance(self.features, rgb, truth, hole)
 
-    rows: list[Row]
-    remarks: list[str]
-    shown: Wanted
-    pictures: dict[str, Tensor]  # method → [H, W, 3]
 
-
-def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> list[Wanted]:
+def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> list[Viewpoint]:
     """The paper's controlled rendering (section 4.1); it says which disparities, but not which views.
 
     Here they are the two ends of the `swipe` path at each disparity m: the eye moves sideways by m · ‖(W/f, H/f)‖ ·
@@ -67,7 +77,7 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
     try:
         even, reach = prediction.camera.even(), DepthRange.of(prediction.gaussians)
         return [
-            Wanted(f"{disparity:g}", name, camera)
+            Viewpoint(f"{disparity:g}", name, camera)
             for disparity in disparities
             for name, camera in zip(("left", "right"), extremes(even, disparity, reach), strict=True)
         ]
@@ -76,60 +86,48 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
 
 
 @torch.no_grad()
-def measure(
+def measure_views(
+    image: Row,
     prediction: BasePrediction,
-    wanted: Sequence[Wanted],
+    viewpoints: Sequence[Viewpoint],
     methods: Mapping[str, Method],
     gauges: Gauges,
     renderer: Renderer,
-) -> Measured:
-    """Every method on every view; views of one setting are a method's to see together."""
-    before = [renderer.render(prediction.gaussians, view.camera) for view in wanted]
+) -> tuple[list[Row], dict[str, Tensor]]:
+    """Every method on every view; views of one setting are a method's to see together.
+
+    Returns:
+        Rows, which take dataset and name from `image`; and the view with the largest hole by each method,
+        [H, W, 3], the truth last where there is one.
+    """
+    before = [renderer.render(prediction.gaussians, view.camera) for view in viewpoints]
     holes = [hole_area_ratio(view.alpha) for view in before]
-    shown, base = max(range(len(wanted)), key=holes.__getitem__), len(prediction.gaussians)
+    shown, base = max(range(len(viewpoints)), key=holes.__getitem__), len(prediction.gaussians)
     rows: list[Row] = []
-    remarks: list[str] = []
+    remarks: dict[Row, None] = {}
     pictures: dict[str, Tensor] = {}
-    for setting in dict.fromkeys(view.setting for view in wanted):
-        own = [index for index, view in enumerate(wanted) if view.setting == setting]
-        shot = Shot(prediction, [wanted[i].camera for i in own], [before[i] for i in own], renderer)
+    for setting in dict.fromkeys(view.setting for view in viewpoints):
+        own = [index for index, view in enumerate(viewpoints) if view.setting == setting]
+        cameras, renderings = [viewpoints[index].camera for index in own], [before[index] for index in own]
         for name, method in methods.items():
-            for index, view in zip(own, method(shot), strict=True):
-                figures = {"har_before": holes[index]}
-                if view.alpha is not None:  # of what is left open (paper, eq. 11 and 10)
-                    open_share = hole_area_ratio(view.alpha)
-                    figures |= {"har": open_share, "coverage": 1 - open_share}
-                if view.aux is not None:
-                    figures |= {"aux": view.aux, "aux_share": view.aux / base, "merged": base + view.aux}
-                figures |= _quality(view.rgb, wanted[index].truth, before[index], gauges, remarks)
-                finite = {key: value if math.isfinite(value) else None for key, value in figures.items()}
-                rows.append(Row(setting, wanted[index].name, name, finite))
+            for index, filled in zip(own, method(cameras, renderings), strict=True):
+                figures: list[tuple[str, float | str]] = [("har_before", holes[index])]
+                if filled.alpha is not None:  # of what is left open (paper, eq. 11 and 10)
+                    open_share = hole_area_ratio(filled.alpha)
+                    figures += [("har", open_share), ("coverage", 1 - open_share)]
+                if filled.aux is not None:
+                    figures += [("aux", filled.aux), ("aux_share", filled.aux / base), ("merged", base + filled.aux)]
+                view, hole = viewpoints[index], hole_mask(before[index].alpha)
+                for metric, value in (*figures, *gauges.measure(filled.rgb, view.truth, hole)):
+                    if isinstance(value, str):
+                        remarks[image._replace(metric=metric, value=value)] = None
+                        continue
+                    finite = value if math.isfinite(value) else None
+                    rows.append(Row(image.dataset, image.image, setting, view.name, name, metric, finite))
                 if index == shown:
-                    pictures[name] = view.rgb
-    return Measured(rows, list(dict.fromkeys(remarks)), wanted[shown], pictures)
+                    pictures[name] = filled.rgb
+    truth = viewpoints[shown].truth
+    return [*rows, *remarks], pictures | ({} if truth is None else {TRUTH: truth})
 
 
-def _quality(
-    rgb: Tensor, truth: Tensor | None, before: Rendering, gauges: Gauges, remarks: list[str]
-) -> dict[str, float]:
-    """The metrics that were asked for and can be: those with a truth want one."""
-    figures: dict[str, float] = {}
-    hole = hole_mask(before.alpha)
-    places: dict[str, Tensor | None] = {"": None, "_hole": hole, "_outside": ~hole}
-    for name in gauges.metrics:
-        if METRICS[name].truth and truth is None:
-            continue
-        if name in gauges.published:
-            try:
-                figures[name] = gauges.published[name](rgb, truth if METRICS[name].truth else None)
-            except Exception as error:  # a stranger's package on an odd picture: the figure is missing, and it shows
-                figures[name] = math.nan
-                remarks.append(f"{name} failed: {reason_in_a_line(error)}")
-        elif truth is not None and name == "psnr":
-            figures |= {f"psnr{place}": psnr(rgb, truth, mask) for place, mask in places.items()}
-        elif truth is not None and name == "ssim":
-            similarity = ssim_map(rgb, truth)
-            figures |= {f"ssim{place}": ssim_average(similarity, mask) for place, mask in places.items()}
-        elif truth is not None and name == "distance" and gauges.features is not None:
-            figures[name] = hole_distance(gauges.features, rgb, truth, hole)
-    return figures
+TRUTH = "truth"  # among the pictures of a view

@@ -175,9 +175,8 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
         config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
-    base, renderer = open_base(options.opened), get_renderer(options.base.device)
-    gauges = Gauges(wanted, published, features)
-    return Evaluation(options, cases, base, direct, network, inpainter, renderer, gauges, config)
+    renderer, gauges = get_renderer(options.base.device), Gauges(wanted, published, features)
+    return Evaluation(options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config)
 
 
 def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
@@ -201,6 +200,7 @@ def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequen
         "precision": None if file is None else str(pick_dtype(base.precision, torch.device("cpu")))[len("torch.") :],
     }
     return {
+        "kind": "evaluate",
         "spackle": spackle.__version__,
         "dataset": dataset.name,
         "title": dataset.title,

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn.functional import pad
 
+from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
-from spackle.evaluation.results import ImageResult, Run
+from spackle.evaluation.protocols import TRUTH
+from spackle.evaluation.rows import Run
+from spackle.files import atomic_path
 from spackle.formats.png import thumbnail
 
+WORST, BEST = "worst.png", "best.png"
 SIDE = 320  # pixels of a thumbnail's longer side
 GAP, LINE = 6, 22  # pixels between pictures, and of a line of text
 FONT = 14
 CASES = 6
-TRUTH = "truth"
 # A sheet is ordered by the first of these that was measured for the method in question.
 ORDER = {"near-view": ("distance", "lpips", "psnr_hole"), "large-view": ("clipiqa", "musiq", "har", "har_before")}
 UP = ("psnr_hole", "clipiqa", "musiq")  # higher is better
 NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Ranking:
+class Ranking(NamedTuple):
     """Images from best to worst."""
 
     names: list[str]
@@ -47,29 +48,38 @@ def columns(run: Run) -> list[str]:
     return [*run.methods, *([TRUTH] if run.near else [])]
 
 
+def column_title(run: Run, name: str) -> str:
+    """What a picture is called."""
+    return TRUTH if name == TRUTH else f"base ({run.base})" if name == "base" else METHODS[name][0]
+
+
+def ranked(values: Mapping[str, float], metric: str) -> list[str]:
+    """Images from best to worst."""
+    sign = -1 if metric in UP else 1
+    return sorted(values, key=lambda name: (sign * values[name], name))
+
+
 def rank(run: Run) -> Ranking | None:
     """By the method that matters: Spackle if it was run, else the last one. None where nothing was measured."""
     method = "spackle" if "spackle" in run.methods else run.methods[-1]
-    for figure in ORDER[str(run.config["protocol"])]:
-        values = {r.name: value for r in run.measured if (value := mean_of(r, figure, method)) is not None}
-        if values:
-            sign = -1 if figure in UP else 1
-            names = sorted(values, key=lambda name: (sign * values[name], name))
-            title = METRICS[figure].title if figure in METRICS else NAMES[figure]
-            return Ranking(names, f"{title} of {METHODS[method].title}", values)
+    for metric in ORDER[str(run.config["protocol"])]:
+        if values := run.by_image(metric, method):
+            title = METRICS[metric].title if metric in METRICS else NAMES[metric]
+            return Ranking(ranked(values, metric), f"{title} of {METHODS[method][0]}", values)
     return None
 
 
-def mean_of(record: ImageResult, figure: str, method: str) -> float | None:
-    """Over an image's views; None where no view has a number."""
-    values = [row.figures.get(figure) for row in record.rows if row.method == method]
-    known = [value for value in values if value is not None]
-    return math.fsum(known) / len(known) if known else None
+def write_sheets(run: Run, folder: Path) -> None:
+    """best.png and worst.png of the strips in a folder; none where nothing was measured."""
+    if ranking := rank(run):
+        strips = {name: image_file(folder, k, name, ".png") for k, name in enumerate(run.images)}
+        for name, order in ((BEST, ranking.names), (WORST, ranking.names[::-1])):
+            with atomic_path(folder / name) as temporary:
+                sheet(run, ranking, order[:CASES], strips).save(temporary)
 
 
 def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str, Path]) -> Image.Image:
     """A row for each image, captioned; a column for each method, and the truth where there is one."""
-    facts = {record.name: record.facts for record in run.measured}
     pictures = {name: Image.open(strips[name]).convert("RGB") for name in names}
     titles = [column_title(run, name) for name in columns(run)]
     width = max(max(picture.width for picture in pictures.values()), SIDE * 2)
@@ -81,8 +91,7 @@ def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str,
     draw.text((4, 3), title, "black", font_size=FONT)
     y = LINE
     for name in names:
-        shown = facts[name]["shown"]
-        text = f"{name}, {shown['setting']} {shown['view']}: {ranking.values[name]:.4g}"
+        text = f"{name}, {' '.join(run.largest_hole(name))}: {ranking.values[name]:.4g}"
         draw.text((4, y + 3), text, "black", font_size=FONT)
         canvas.paste(pictures[name], (0, y + LINE))
         for index, title in enumerate(titles):
@@ -92,10 +101,3 @@ def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str,
             draw.text(at, title, "white", font_size=FONT)
         y += pictures[name].height + LINE + GAP
     return canvas
-
-
-def column_title(run: Run, name: str) -> str:
-    """What a picture is called."""
-    if name == TRUTH:
-        return TRUTH
-    return f"base ({run.base})" if name == "base" else METHODS[name].title

@@ -1,39 +1,48 @@
-"""A table as values, and as Markdown and LaTeX."""
+"""A table as values, and its three forms: Markdown, LaTeX and HTML."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from html import escape
+from typing import Literal
 
 EMPTY = ""  # not run, or nothing that could be
+NOT_RUN = "not run"  # of a whole row
+PAPER = "(paper)"  # ends what a row of the paper's figures is called
 BEST = "**"  # around a cell's text
-
-
-@dataclasses.dataclass(frozen=True)
-class Line:
-    """A row of cells; a rule above it where it opens a new group."""
-
-    cells: tuple[str, ...]
-    rule: bool = False
+Cells = Sequence[str]
+Text = Callable[[float], str]
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Cells under a head of one or two levels."""
+    """Cells under heads of one or two levels."""
 
     label: str  # as in the paper's source, where the paper has it
+    title: str
     caption: str
-    columns: tuple[str, ...]
-    groups: tuple[tuple[str, int], ...]  # heads over so many columns each; "" over those that have none
-    lines: tuple[Line, ...]
-    words: int = 1  # columns of text on the left
-    notes: tuple[str, ...] = ()
+    heads: Sequence[tuple[str, str]]  # of each column: what it has in common with its neighbours, or "", and its own
+    bodies: Sequence[Sequence[Cells]]  # rows, in groups with a rule between them
+    words: int = 1  # columns of text on the left; where there are two, the first one names a group in its first row
+    notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        widths = {len(line.cells) for line in self.lines} | {len(self.columns), sum(count for _, count in self.groups)}
+        widths = {len(cells) for rows in self.bodies for cells in rows} | {len(self.heads)}
         if len(widths) > 1:
             raise ValueError(f"table {self.label}: rows of different lengths: {sorted(widths)}")
+
+
+def count_text(value: float) -> str:
+    """With commas between thousands."""
+    return f"{value:,.0f}"
+
+
+def percent_text(share: float) -> str:
+    """Without the sign."""
+    return f"{100 * share:.2f}"
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:
@@ -45,21 +54,26 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
     return [f"{BEST}{text}{BEST}" if text == best else text for text in texts]
 
 
-def to_markdown(tables: Sequence[Table]) -> str:
-    """One after the other; a group's head is put before the heads of its columns."""
-    return "\n".join(_markdown(table) for table in tables)
+def write_table(table: Table, form: Literal["md", "tex", "html"]) -> str:
+    """For a page of Markdown; for a LaTeX document with the packages booktabs and graphicx; or for a page of HTML."""
+    return {"md": _markdown, "tex": _latex, "html": _html}[form](table)
+
+
+def _groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
+    """The upper level: a name, and over how many columns it stands."""
+    return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
 
 def _markdown(table: Table) -> str:
-    over = [name for name, count in table.groups for _ in range(count)]
-    head = [f"{group}: {column}" if group else column for group, column in zip(over, table.columns, strict=True)]
+    """A group's head is put before the heads of its columns."""
+    head = [f"{group}: {column}" if group else column for group, column in table.heads]
     lines = [f"**{table.label}.** {table.caption}", "", _row(head), "|" + "---|" * len(head)]
-    lines += [_row(line.cells) for line in table.lines]
+    lines += [_row(cells) for rows in table.bodies for cells in rows]
     lines += ["", *(f"- {note}" for note in table.notes)] if table.notes else []
     return "\n".join(lines) + "\n"
 
 
-def _row(cells: Sequence[str]) -> str:
+def _row(cells: Cells) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -67,6 +81,7 @@ SIGNS = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "×": r"$\times$",
     "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
+    "†": r"$\dagger$", "→": r"$\to$",
 }  # fmt: skip
 
 
@@ -76,31 +91,46 @@ def tex(text: str) -> str:
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 
-def to_latex(tables: Sequence[Table]) -> str:
-    """For a document with the packages booktabs and graphicx."""
-    return "% needs \\usepackage{booktabs,graphicx}\n" + "\n".join(_latex(table) for table in tables)
-
-
 def _latex(table: Table) -> str:
-    shape = "l" * table.words + "c" * (len(table.columns) - table.words)
+    shape = "l" * table.words + "c" * (len(table.heads) - table.words)
     caption = " ".join([table.caption, *table.notes])
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(caption)}}}"]
     lines += [rf"\label{{{table.label}}}", r"\resizebox{\textwidth}{!}{", rf"\begin{{tabular}}{{{shape}}}", r"\toprule"]
-    lines += _heads(table.groups)
-    lines += [" & ".join(tex(column) for column in table.columns) + r" \\", r"\midrule"]
-    for number, line in enumerate(table.lines):
-        lines += [r"\midrule"] if line.rule and number else []
-        lines.append(" & ".join(tex(cell) for cell in line.cells) + r" \\")
+    groups, column, over, rules = _groups(table.heads), 1, [], []
+    for name, count in groups:
+        over.append(rf"\multicolumn{{{count}}}{{c}}{{{tex(name)}}}" if name else " & ".join([""] * count))
+        rules += [rf"\cmidrule(lr){{{column}-{column + count - 1}}}"] if name else []
+        column += count
+    lines += [" & ".join(over) + r" \\", *rules] if rules else []
+    lines.append(" & ".join(tex(head) for _, head in table.heads) + r" \\")
+    for rows in table.bodies:
+        lines += [r"\midrule", *(" & ".join(map(tex, cells)) + r" \\" for cells in rows)]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", "}", r"\end{table*}"]) + "\n"
 
 
-def _heads(groups: Sequence[tuple[str, int]]) -> list[str]:
-    """The upper level of the head with its rules; nothing where no column has one."""
-    if not any(name for name, _ in groups):
-        return []
-    cells, rules, column = [], [], 1
-    for name, count in groups:
-        cells.append(rf"\multicolumn{{{count}}}{{c}}{{{tex(name)}}}" if name else " & ".join([""] * count))
-        rules += [rf"\cmidrule(lr){{{column}-{column + count - 1}}}"] if name else []
-        column += count
-    return [" & ".join(cells) + r" \\", *rules]
+def _html(table: Table) -> str:
+    """Where there are groups, a group's name stands above its rows: on a phone it costs no width."""
+    grouped = table.words > 1
+    heads = table.heads[grouped:]
+    lines = ["<table>", "<thead>"]
+    if any(group for group, _ in heads):
+        lines.append("<tr>")
+        for name, count in _groups(heads):
+            kind = f'th colspan="{count}" scope="colgroup"' if name else f'td colspan="{count}"'
+            lines.append(f"<{kind}>{escape(name)}</{kind[:2]}>")
+        lines.append("</tr>")
+    columns = [f'<th scope="col">{escape(head)}</th>' if head else "<td></td>" for _, head in heads]
+    lines += [f"<tr>{''.join(columns)}</tr>", "</thead>"]
+    for rows in table.bodies:
+        idle = any(cells[grouped] == NOT_RUN for cells in rows)
+        lines.append('<tbody class="idle">' if idle else "<tbody>")
+        if grouped and rows:
+            name = f"<span>{escape(rows[0][0])}</span>"
+            lines.append(f'<tr class="group"><th colspan="{len(heads)}" scope="rowgroup">{name}</th></tr>')
+        for cells in (row[grouped:] for row in rows):
+            words = cells[: table.words]
+            kind = "paper" if any(word.endswith(PAPER) for word in words) else "none" if cells[0] == NOT_RUN else ""
+            others = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", "</td><td>".join(map(escape, cells[1:])))
+            lines.append(f'<tr class="{kind}"><th scope="row">{escape(cells[0])}</th><td>{others}</td></tr>')
+        lines.append("</tbody>")
+    return "\n".join([*lines, "</table>"])

@@ -1,29 +1,31 @@
-"""The paper's tables, and one of ours, for the protocols that were run; the paper's numbers beside them."""
+"""The paper's tables, and one of ours, as pivots of rows; the paper's figures in rows beside ours."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from spackle.errors import InputError
-from spackle.evaluation import paper
+from spackle.evaluation.efficiency import efficiency_tables
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, SPLIT, definitions, reduction
-from spackle.evaluation.protocols import NEAR
-from spackle.evaluation.results import Mean, Run
-from spackle.evaluation.table import EMPTY, Line, Table, mark_best
+from spackle.evaluation.paper import IMAGES, PAPER, datasets, images_text, paper_rows, setting_title
+from spackle.evaluation.rows import NEAR, Mean, Row, Run, mean, pivot
+from spackle.evaluation.table import (
+    EMPTY,
+    NOT_RUN,
+    Cells,
+    Table,
+    Text,
+    count_text,
+    mark_best,
+    percent_text,
+    write_table,
+)
+from spackle.files import write_whole
 
-NOT_RUN = "not run"
-PAPER_ROW = "{} (paper)"
-FILLING = (
-    "spackle",
-    "spackle-scene",
-    "network",
-    "seeds",
-    "dense",
-    "direct-ft",
-)  # methods that leave an opacity to measure
-ADDING = ("spackle", "spackle-scene", "network", "seeds", "dense")
+FILES = ("tables.md", "tables.tex")
 LARGE_VIEWS = (
     "Views: the two ends of a swipe at that disparity, where the eye is farthest left and farthest right and looks at "
     "the focus point (spackle.camera_path.extremes), at the photo's working size with both sides even; means over views"
@@ -31,117 +33,84 @@ LARGE_VIEWS = (
 NEAR_VIEWS = (
     "Views: the dataset's other photos of the scene, from their own cameras, at their working size; means over views"
 )
+HEAD = "{}: disparity {}"  # above the columns of a setting
+QUALITY = ("clipiqa", "niqe", "musiq")
 PAIR = ("dists", "lpips")
 PLACES = (("", "image"), ("_hole", "in the hole"), ("_outside", "outside"))
 ABLATED = {"dense": "Dense grid init", "spackle": "Mask guided init"}
-Cells = tuple[str, ...]
+# Relative decreases: of which method (None: the row's own) which figure, and by which of the row's it is replaced.
+REDUCED: dict[str, tuple[str | None, str, str]] = {
+    "reduction": (None, "har_before", "har"),
+    "aux_reduction": ("dense", "aux", "aux"),
+}
+
+
+class Column(NamedTuple):
+    """A figure of one setting."""
+
+    group: str
+    title: str
+    setting: str
+    metric: str
+    text: Text
+    lower: bool | None = None  # is better; None: no best one is set off
 
 
 def make_tables(runs: Sequence[Run]) -> list[Table]:
     """All tables; InputError for a dataset twice with one protocol and base, or for different disparities."""
-    large, near = [run for run in runs if not run.near], [run for run in runs if run.near]
-    seen: set[tuple[bool, str, str]] = set()
+    seen: set[tuple[str, str, str]] = set()
     for run in runs:
-        if (run.near, run.title, run.base) in seen:
-            raise InputError(
-                f"two results for {run.title} under {run.config['protocol']} with the base {run.base}: give one of them"
-            )
-        seen.add((run.near, run.title, run.base))
-    tables: list[Table] = []
-    if large:
-        disparities = list(large[0].config["disparities"])
-        if any(list(run.config["disparities"]) != disparities for run in large):
+        key = str(run.config["protocol"]), run.title, run.base
+        if key in seen:
+            raise InputError(f"two results for {run.title} under {key[0]} with the base {run.base}: give one of them")
+        seen.add(key)
+    timed, measured = [run for run in runs if run.timed], [run for run in runs if not run.timed]
+    large, near = [run for run in measured if not run.near], [run for run in measured if run.near]
+    for kind in (large, timed):
+        if any(run.settings != kind[0].settings for run in kind):
             raise InputError("the results have different disparities: make their tables apart")
-        tables += [make(large, disparities) for make in (quality_table, holes_table, gaussians_table)]
-    if near:
-        tables += [make(near) for make in (near_table, detail_table, ablation_table)]
-    return tables
+    tables = [make(large) for make in (_quality_table, _holes_table, _gaussians_table)] if large else []
+    tables += [make(near) for make in (_near_table, _detail_table, _ablation_table)] if near else []
+    return tables + (efficiency_tables(timed) if timed else [])
 
 
-# --- what the tables have in common
+def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES) -> None:
+    """As a file of Markdown and one of LaTeX."""
+    write_whole(folder / files[0], "\n".join(write_table(table, "md") for table in tables).encode())
+    head = "% needs \\usepackage{booktabs,graphicx}\n"
+    write_whole(folder / files[1], (head + "\n".join(write_table(table, "tex") for table in tables)).encode())
+
+
+# --- texts of figures, and of rows
 
 
 def method_name(run: Run, method: str) -> str:
     """What a row is called; the base's name is always in it."""
-    return f"{run.base} alone" if method == "base" else f"{METHODS[method].title} ({run.base})"
+    return f"{run.base} alone" if method == "base" else f"{METHODS[method][0]} ({run.base})"
 
 
-def count_text(value: float | None, digits: int = 0) -> str:
-    """With commas between thousands."""
-    return EMPTY if value is None else f"{value:,.{digits}f}"
-
-
-def ratio_text(value: float | None) -> str:
+def ratio_text(value: float) -> str:
     """Four digits, as in the paper; what would round to nothing keeps its first two."""
-    if value is None:
-        return EMPTY
     return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
 
 
-def _percent_text(value: float | None, sign: str = "%") -> str:
-    return EMPTY if value is None else f"{value:.2f}{sign}"
-
-
-def _metric_text(mean: Mean, metric: str) -> str:
-    """A mean of a metric; views without a finite value are shown."""
-    return _with_bad(EMPTY if mean.value is None else METRICS[metric].text(mean.value), mean.bad)
-
-
-def _with_bad(text: str, bad: int) -> str:
-    return f"{text} ({bad} NaN)".strip() if bad else text
-
-
-def _share(run: Run) -> str:
-    """How many of the paper's images were measured."""
-    wanted = paper.IMAGES.get(run.title)
-    return str(len(run.measured)) if wanted is None else f"{len(run.measured)}/{wanted}"
-
-
-def _datasets(runs: Sequence[Run]) -> list[str]:
-    """Titles: the paper's in its order, whether they were run or not, then others."""
-    return list(dict.fromkeys([*paper.DATASETS, *(run.title for run in runs)]))
-
-
-def _lines(
-    runs: Sequence[Run], width: int, ours: Callable[[Run], list[Cells]], papers: Callable[[str], list[Cells]]
-) -> tuple[Line, ...]:
-    """For each dataset the rows of its runs, or one that says "not run", and the paper's; its name in the first."""
-    lines: list[Line] = []
-    for title in _datasets(runs):
-        rows = [row for run in runs if run.title == title for row in ours(run)]
-        rows = [*(rows or [(NOT_RUN, *[EMPTY] * (width - 1))]), *papers(title)]
-        lines += [Line((title if k == 0 else EMPTY, *row), rule=k == 0) for k, row in enumerate(rows)]
-    return tuple(lines)
-
-
-def _notes(runs: Sequence[Run], metrics: Iterable[str] = ()) -> tuple[str, ...]:
-    """Notes under a table: definitions, what was not run and why, what was passed over, terms of pyiqa."""
-    names = tuple(metrics)
-    notes = definitions(names)
-    for run in runs:
-        state = run.config["metrics"]
-        idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]
-        notes += [f"{run.title}: {METRICS[name].title[:-2]} {state[name]}." for name in idle]
-        passed = [record.name for record in run.records if record.problem is not None]
-        if passed:
-            more = f" and {len(passed) - 5} more" if len(passed) > 5 else ""
-            listed = f"{', '.join(passed[:5])}{more}"
-            notes.append(f"{run.title}: {len(passed)} of {len(run.records)} images gave no figures: {listed}.")
-    if any(name in DEFINITIONS for name in names):
-        notes.append(f"{NOTICE}.")
-    return tuple(dict.fromkeys(notes))
+def _text(found: Mean | None, text: Text) -> str:
+    """A mean; views without a finite value are counted behind it."""
+    if found is None:
+        return EMPTY
+    return f"{EMPTY if found.value is None else text(found.value)} {f'({found.bad} NaN)' if found.bad else ''}".strip()
 
 
 def _bases(runs: Sequence[Run]) -> str:
     """Which base the rows stand on, for a caption."""
     bases = dict.fromkeys(f"{run.base}: {run.config['base']['says']}" for run in runs)
-    return f"Base {'; '.join(bases)}." if bases else "No run."
+    return f"Base {'; '.join(bases)}."
 
 
 def _rows_of(runs: Sequence[Run]) -> str:
     """What the rows are, and whose weights the residual has."""
     names = dict.fromkeys(method for run in runs for method in run.methods)
-    rows = "; ".join(f"{METHODS[name].title}: {METHODS[name].description}" for name in names)
+    rows = "; ".join(": ".join(METHODS[name]) for name in names)
     residuals = [run.config["residual"] for run in runs]
     weights = dict.fromkeys(
         f"{one['weights']} weights {one['sha256'][:8]}" if one["sha256"] else "no weights, seeds alone"
@@ -150,215 +119,207 @@ def _rows_of(runs: Sequence[Run]) -> str:
     return f"Rows: {rows}. Residual: {' and '.join(weights)}."
 
 
-def _best_marked(run: Run, figures: Sequence[tuple[str, str, str]]) -> list[list[str]]:
-    """A column of texts for each (metric, figure, setting), a row for each method, the best set off."""
-    columns = []
-    for metric, figure, setting in figures:
-        means = [run.mean(figure, method, setting) for method in run.methods]
-        texts = [_metric_text(mean, metric) for mean in means]
-        columns.append(mark_best([mean.value for mean in means], texts, METRICS[metric].lower))
-    return columns
+def _notes(runs: Sequence[Run], metrics: Iterable[str] = ()) -> list[str]:
+    """Notes under a table: definitions, what was not run and why, what was passed over, terms of pyiqa."""
+    names = tuple(metrics)
+    notes = definitions(names)
+    for run in runs:
+        state = run.config["metrics"]
+        idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]
+        notes += [f"{run.title}: {METRICS[name].title[:-2]} {state[name]}." for name in idle]
+        if passed := list(run.problems):
+            more = f" and {len(passed) - 5} more" if len(passed) > 5 else ""
+            listed = f"{', '.join(passed[:5])}{more}"
+            notes.append(f"{run.title}: {len(passed)} of {len(run.images)} images gave no figures: {listed}.")
+    if any(name in DEFINITIONS for name in names):
+        notes.append(f"{NOTICE}.")
+    return list(dict.fromkeys(notes))
+
+
+# --- the pivots
+
+
+def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str]) -> list[list[str]]:
+    """A row of figures for each method, the best of a column set off."""
+    values_of = pivot(rows, "method", "setting", "metric")
+
+    def find(method: str, setting: str, metric: str) -> Mean | None:
+        """Derived figures, too; what is known of images alone is all methods'."""
+        if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
+            return mean(values)
+        if metric in REDUCED:
+            of, figure, after = REDUCED[metric]
+            base, left = find(of or method, setting, figure), find(method, setting, after)
+            if method != of and base and base.value and left and left.value is not None:
+                return Mean(reduction(base.value, left.value), 0)
+        return None
+
+    texts = []
+    for column in columns:
+        found = [find(method, column.setting, column.metric) for method in methods]
+        cells = [_text(one, column.text) for one in found]
+        values = [None if one is None else one.value for one in found]
+        texts.append(cells if column.lower is None else mark_best(values, cells, column.lower))
+    return [list(cells) for cells in zip(*texts, strict=True)]
+
+
+def _dataset_table(
+    label: str,
+    title: str,
+    caption: str,
+    runs: Sequence[Run],
+    columns: Sequence[Column],
+    names: Callable[[Run], dict[str, str]],
+    metrics: Iterable[str] = (),
+) -> Table:
+    """For each dataset a row for each method of `names` (and what it is called), and the paper's rows."""
+    heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
+    bodies = []
+    for dataset in datasets(runs):
+        rows: list[Cells] = []
+        for run in (run for run in runs if run.title == dataset):
+            methods = names(run)
+            for name, cells in zip(methods.values(), _cells(run.rows, columns, methods), strict=True):
+                rows.append((name, images_text(run), *cells))
+        rows = rows or [(NOT_RUN, *[EMPTY] * (1 + len(columns)))]
+        papers = [row for row in paper_rows(label) if row.dataset == dataset]
+        for name in dict.fromkeys(row.method for row in papers):
+            rows.append((name, str(IMAGES[dataset]), *_cells(papers, columns, [name])[0]))
+        bodies.append([(EMPTY if k else dataset, *cells) for k, cells in enumerate(rows)])
+    return Table(label, title, caption, heads, bodies, words=2, notes=_notes(runs, metrics))
+
+
+def _named(run: Run, metric: str = "") -> dict[str, str]:
+    """The methods of a run, or those that fill holes and have a figure, and what they are called."""
+    having = {row.method for row in run.rows if row.metric == metric} - {"base"} if metric else run.methods
+    return {method: method_name(run, method) for method in run.methods if method in having}
 
 
 # --- large views
 
 
-def quality_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
+def _quality_table(runs: Sequence[Run]) -> Table:
     """No-reference metrics (tab:large_view_nr_iqa)."""
-    figures = [(name, name, f"{disparity:g}") for disparity in disparities for name in paper.QUALITY_FIGURES]
-
-    def ours(run: Run) -> list[Cells]:
-        names = [method_name(run, method) for method in run.methods]
-        return [(n, _share(run), *cells) for n, *cells in zip(names, *_best_marked(run, figures), strict=True)]
-
-    def papers(title: str) -> list[Cells]:
-        rows = []
-        for name in paper.METHODS if title in paper.DATASETS else ():
-            values = [value for d in disparities for value in paper.at(paper.QUALITY.get((title, name)), d)]
-            texts = [EMPTY if v is None else METRICS[m].text(v) for (m, _, _), v in zip(figures, values, strict=True)]
-            rows.append((PAPER_ROW.format(name), str(paper.IMAGES[title]), *texts))
-        return rows
-
-    return _large_table(
+    return _dataset_table(
         "tab:large_view_nr_iqa",
+        "Quality of large views, without a truth",
         f"No-reference quality under controlled large views. {LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
         "n: images, of those in the paper. Bold: best of a run's rows.",
-        [METRICS[name].title for name in paper.QUALITY_FIGURES],
-        (runs, disparities, ours, papers),
-        paper.QUALITY_FIGURES,
+        runs,
+        [
+            Column(setting_title(setting, HEAD), figure.title, setting, name, figure.text, figure.lower)
+            for setting in runs[0].settings
+            for name, figure in ((name, METRICS[name]) for name in QUALITY)
+        ],
+        _named,
+        QUALITY,
     )
 
 
-def holes_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
+def _holes_table(runs: Sequence[Run]) -> Table:
     """Hole Area Ratio before and after (paper, eq. 11; tab:controlled_disocclusion)."""
-
-    def three(run: Run, method: str, setting: str) -> Cells:
-        before, after = (run.mean(figure, method, setting) for figure in ("har_before", "har"))
-        less = None
-        if before.value and after.value is not None:
-            less = 100 * reduction(before.value, after.value)
-        return ratio_text(before.value), _with_bad(ratio_text(after.value), after.bad), _percent_text(less)
-
-    return _large_table(
+    figures = (("base HAR ↓", "har_before", ratio_text), ("HAR ↓", "har", ratio_text))
+    return _dataset_table(
         "tab:controlled_disocclusion",
+        "Hole Area Ratio before and after",
         "Hole Area Ratio (HAR), 1 − coverage: the share of pixels whose rendered opacity is below 0.95. Reduction: of "
         f"the mean HAR, 1 − after / before. {LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
         "n: images, of those in the paper.",
-        ("base HAR ↓", "HAR ↓", "Reduction ↑"),
-        _threes(runs, disparities, FILLING, three, paper.HOLES, (ratio_text, ratio_text, _percent_text)),
+        runs,
+        _threes(runs, *figures, ("Reduction ↑", "reduction", lambda share: f"{percent_text(share)}%")),
+        lambda run: _named(run, "har"),
     )
 
 
-def gaussians_table(runs: Sequence[Run], disparities: Sequence[float]) -> Table:
+def _gaussians_table(runs: Sequence[Run]) -> Table:
     """Added and merged Gaussians (tab:expanded_efficiency_gaussian_overhead, without its times)."""
-    share_text = functools.partial(_percent_text, sign="")
-
-    def three(run: Run, method: str, setting: str) -> Cells:
-        added, share, merged = (run.mean(figure, method, setting).value for figure in ("aux", "aux_share", "merged"))
-        return count_text(added), share_text(None if share is None else 100 * share), count_text(merged)
-
-    return _large_table(
+    figures = (("Added GS", "aux", count_text), ("Added GS (%)", "aux_share", percent_text))
+    return _dataset_table(
         "tab:expanded_efficiency_gaussian_overhead",
+        "Gaussians added and merged",
         "Gaussians added for a view, their share of the base's and both together; means over views. "
-        f"{LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} The paper's base has {paper.BASE_GAUSSIANS:,} Gaussians.",
-        ("Added GS", "Added GS (%)", "Merged GS"),
-        _threes(runs, disparities, ADDING, three, paper.GAUSSIANS, (count_text, share_text, count_text)),
+        f"{LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} The paper's base has {PAPER['base_gaussians']:,} Gaussians.",
+        runs,
+        _threes(runs, *figures, ("Merged GS", "merged", count_text)),
+        lambda run: _named(run, "aux"),
     )
 
 
-Filling = tuple[Sequence[Run], Sequence[float], Callable[[Run], list[Cells]], Callable[[str], list[Cells]]]
-
-
-def _threes(
-    runs: Sequence[Run],
-    disparities: Sequence[float],
-    methods: Sequence[str],
-    three: Callable[[Run, str, str], Cells],
-    theirs: Mapping[str, tuple[float, ...]],
-    texts: Sequence[Callable[[float | None], str]],
-) -> Filling:
-    """Rows with three cells for each disparity: a row for each of the methods that was run, and one of the paper's."""
-
-    def ours(run: Run) -> list[Cells]:
-        rows = []
-        for method in (name for name in run.methods if name in methods):
-            cells = [cell for disparity in disparities for cell in three(run, method, f"{disparity:g}")]
-            rows.append((method_name(run, method), _share(run), *cells))
-        return rows
-
-    def papers(title: str) -> list[Cells]:
-        if title not in theirs:
-            return []
-        found = [zip(texts, paper.at(theirs[title], disparity), strict=True) for disparity in disparities]
-        cells = [text(value) for three in found for text, value in three]
-        return [(PAPER_ROW.format("Spackle on SHARP"), str(paper.IMAGES[title]), *cells)]
-
-    return runs, disparities, ours, papers
-
-
-def _large_table(
-    label: str, caption: str, heads: Sequence[str], filling: Filling, metrics: Sequence[str] = ()
-) -> Table:
-    """Three columns for each disparity behind dataset, method and number of images."""
-    runs, disparities, ours, papers = filling
-    named = [
-        f"S{1 + paper.DISPARITIES.index(d)}: disparity {d:g}" if d in paper.DISPARITIES else f"disparity {d:g}"
-        for d in disparities
-    ]
-    columns = ("Dataset", "Method", "n", *[*heads] * len(disparities))
-    groups = (("", 3), *((name, 3) for name in named))
-    lines = _lines(runs, len(columns) - 1, ours, papers)
-    return Table(label, caption, columns, groups, lines, words=2, notes=_notes(runs, metrics))
+def _threes(runs: Sequence[Run], *figures: tuple[str, str, Text]) -> list[Column]:
+    groups = {setting: setting_title(setting, HEAD) for setting in runs[0].settings}
+    return [Column(group, title, key, name, text) for key, group in groups.items() for title, name, text in figures]
 
 
 # --- near views
 
 
-def near_table(runs: Sequence[Run]) -> Table:
+def _near_table(runs: Sequence[Run]) -> Table:
     """DISTS and LPIPS, a row for each method (tab:near_view)."""
-    titles = _datasets(runs)
-    rows: dict[str, list[str]] = {}
-    for name, method, base in dict.fromkeys((method_name(r, m), m, r.base) for r in runs for m in r.methods):
-        rows[name] = []
-        for title in titles:
-            own = [run for run in runs if run.title == title and run.base == base and method in run.methods]
-            rows[name] += [_metric_text(own[0].mean(m, method, NEAR), m) if own else EMPTY for m in PAIR]
-    lines = [Line((name, *cells)) for name, cells in rows.items()]
-    for number, name in enumerate(paper.NEAR_METHODS):
-        found = (paper.NEAR.get((name, title), (None, None)) for title in titles)
-        lines.append(Line((PAPER_ROW.format(name), *(ratio_text(v) for pair in found for v in pair)), rule=number == 0))
+    columns, titles = [Column("", "", NEAR, m, METRICS[m].text) for m in PAIR], datasets(runs)
+    bodies: list[list[Cells]] = []
+    found: dict[str, dict[str, list[str]]] = {}
+    for run in runs:
+        names = _named(run)
+        for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
+            found.setdefault(name, {})[run.title] = cells
+    papers = paper_rows("tab:near_view")
+    theirs = {
+        name: {title: _cells((r for r in papers if r.dataset == title), columns, [name])[0] for title in IMAGES}
+        for name in dict.fromkeys(row.method for row in papers)
+    }
+    for rows in (found, theirs):
+        empty = [EMPTY] * len(PAIR)
+        bodies.append([(n, *(c for title in titles for c in by.get(title, empty))) for n, by in rows.items()])
     return Table(
         "tab:near_view",
+        "Distance from true second photos",
         f"Distance from true second photos; lower is better. {NEAR_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
         f"Images: {_images(runs)}. Empty: not run.",
-        ("Method", *("DISTS", "LPIPS") * len(titles)),
-        (("", 1), *((title, 2) for title in titles)),
-        tuple(lines),
+        [("", "Method"), *((title, name.upper()) for title in titles for name in PAIR)],
+        bodies,
         notes=_notes(runs, PAIR),
     )
 
 
-def detail_table(runs: Sequence[Run]) -> Table:
+def _detail_table(runs: Sequence[Run]) -> Table:
     """PSNR and SSIM over the image, in the hole and outside; the masked distance. Not in the paper."""
-    figures = [(name, f"{name}{place}", NEAR) for name in SPLIT for place, _ in PLACES] + [
-        ("distance", "distance", NEAR)
+    places = [(name, f"{name}{place}", where) for name in SPLIT for place, where in PLACES]
+    columns = [
+        Column(METRICS[name].title, where, NEAR, figure, METRICS[name].text, METRICS[name].lower)
+        for name, figure, where in (*places, ("distance", "distance", "in the hole"))
     ]
-
-    def ours(run: Run) -> list[Cells]:
-        heads = [
-            (method_name(run, m), _share(run), ratio_text(run.mean("har_before", m, NEAR).value)) for m in run.methods
-        ]
-        return [(*head, *cells) for head, *cells in zip(heads, *_best_marked(run, figures), strict=True)]
-
-    return Table(
+    return _dataset_table(
         "tab:near_view_holes",
+        "Against true second photos, in the hole and outside",
         "Against true second photos, where it matters. The hole is where the base's opacity is below 0.95. HAR: its "
         f"share of the pixels. {NEAR_VIEWS}. {_bases(runs)} {_rows_of(runs)} Bold: best of a run's rows. "
         "n: images, of those in the paper, which has no such table.",
-        ("Dataset", "Method", "n", "base HAR", *[place for _, place in PLACES] * 2, "in the hole"),
-        (("", 4), *((METRICS[name].title, 3) for name in SPLIT), (METRICS["distance"].title, 1)),
-        _lines(runs, 10, ours, lambda title: []),
-        words=2,
-        notes=_notes(runs, (*SPLIT, "distance")),
+        runs,
+        [Column("", "base HAR", NEAR, "har_before", ratio_text), *columns],
+        _named,
+        (*SPLIT, "distance"),
     )
 
 
-def ablation_table(runs: Sequence[Run]) -> Table:
+def _ablation_table(runs: Sequence[Run]) -> Table:
     """A Gaussian for every cell against those of the mask (tab:mask_guided_init)."""
-
-    def ours(run: Run) -> list[Cells]:
-        dense, guided = (run.mean("aux", method, NEAR).value for method in ABLATED)
-        less = None if not dense or guided is None else 100 * reduction(dense, guided)
-        rows = []
-        for method, title in ((method, title) for method, title in ABLATED.items() if method in run.methods):
-            count = count_text(guided if method == "spackle" else dense, 2)
-            reduced = _percent_text(less) if method == "spackle" else "–"
-            pair = [_metric_text(run.mean(metric, method, NEAR), metric) for metric in PAIR]
-            rows.append((f"{title} ({run.base})", count_text(run.base_gaussians), count, reduced, *pair))
-        return rows
-
-    def papers(title: str) -> list[Cells]:
-        if title not in paper.ABLATION:
-            return []
-        many, dists, lpips, few, less, few_dists, few_lpips = paper.ABLATION[title]
-        base, (dense, guided) = count_text(paper.BASE_GAUSSIANS), map(PAPER_ROW.format, ABLATED.values())
-        return [
-            (dense, base, count_text(many, 2), "–", ratio_text(dists), ratio_text(lpips)),
-            (guided, base, count_text(few, 2), _percent_text(less), ratio_text(few_dists), ratio_text(few_lpips)),
-        ]
-
-    return Table(
+    return _dataset_table(
         "tab:mask_guided_init",
+        "Dense grid against mask guided",
         "Dense grid initialisation against mask guided one. Dense: an aux Gaussian for each cell of 2×2 pixels, in "
         "one pass; mask guided: for the masked cells, with a second pass where that leaves holes. The same network for "
-        f"both. Reduction: of the mean count. {NEAR_VIEWS}. {_bases(runs)} Images: {_images(runs)}.",
-        ("Dataset", "Method", "Base GS", "Aux. GS ↓", "Reduction ↑", *(METRICS[name].title for name in PAIR)),
-        (("", 7),),
-        _lines(runs, 6, ours, papers),
-        words=2,
-        notes=_notes(runs, PAIR),
+        f"both. Reduction: of the mean count. {NEAR_VIEWS}. {_bases(runs)} n: images, of those in the paper.",
+        runs,
+        [
+            Column("", "Base GS", NEAR, "base_gaussians", count_text),
+            Column("", "Aux. GS ↓", NEAR, "aux", lambda count: f"{count:,.2f}"),
+            Column("", "Reduction ↑", NEAR, "aux_reduction", lambda share: f"{percent_text(share)}%"),
+            *(Column("", METRICS[name].title, NEAR, name, METRICS[name].text) for name in PAIR),
+        ],
+        lambda run: {m: f"{title} ({run.base})" for m, title in ABLATED.items() if m in run.methods},
+        PAIR,
     )
 
 
 def _images(runs: Sequence[Run]) -> str:
-    return ", ".join(f"{run.title} {_share(run)}" for run in runs)
+    return ", ".join(f"{run.title} {images_text(run)}" for run in runs)

@@ -1,4 +1,4 @@
-"""The clock of every benchmark: tasks that take turns, stage by stage; and the stages of a view's completion."""
+"""The clock of the benchmarks: tasks that take turns, stage by stage; and the stages of a view's completion."""
 
 from __future__ import annotations
 
@@ -20,6 +20,16 @@ from spackle.scene_fill import FillContext, fill_view
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")
+# Stages of a view in the order of the work, as the tables call them.
+STAGES = {
+    "base": "photo to base Gaussians",
+    "view": "render of the view",
+    "photo": "render at the photo's camera",
+    "completion": "mask, seeds, network, placing",
+    "rerender": "re-render of touched tiles, after each pass",
+}
+BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
+EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
 
 Lap = Callable[[str], None]
 Task = Callable[[Lap], Any]
@@ -33,35 +43,29 @@ def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *,
     The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up. A stage ends
     when the device has done its work. One run more, which compiles and warms up, comes first, unless they are `warm`.
     """
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return MS * time.perf_counter()
+
     times: dict[tuple[str, str], list[float]] = {}
     for run in range(1 if warm else 0, runs + 1):
         for name, task in tasks.items():
-            laps = _laps(task, device)
+            laps: dict[str, float] = {}
+            start = last = now()
+
+            def lap(stage: str, laps: dict[str, float] = laps) -> None:
+                nonlocal last
+                end = now()
+                laps[stage] = laps.get(stage, 0.0) + end - last
+                last = end
+
+            task(lap)
+            laps[TOTAL] = now() - start
             for stage, milliseconds in laps.items() if run else ():
                 times.setdefault((name, stage), []).append(milliseconds)
     return {key: np.array(values) for key, values in times.items()}
-
-
-def _laps(task: Task, device: torch.device) -> dict[str, float]:
-    """Milliseconds of one run's stages, and of the whole run."""
-    laps: dict[str, float] = {}
-    start = last = now(device)
-
-    def lap(stage: str) -> None:
-        nonlocal last
-        end = now(device)
-        laps[stage] = laps.get(stage, 0.0) + MS * (end - last)
-        last = end
-
-    task(lap)
-    return {**laps, TOTAL: MS * (now(device) - start)}
-
-
-def now(device: torch.device = CPU) -> float:
-    """Seconds, once the device has done what it was given."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 
 Array = NDArray[np.float64]
@@ -40,15 +40,12 @@ class NiqeModel:
 def load_niqe(path: Path) -> NiqeModel:
     """Read `mu_pris_param`, `cov_pris_param` and `gaussian_window` from an .npz file; InputError for any other."""
     check_file(path, "NIQE model")
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-            mean, covariance, window = (
-                arrays[name].astype(np.float64) for name in ("mu_pris_param", "cov_pris_param", "gaussian_window")
-            )
+    problem = "no NIQE model ({reason}): give niqe_pris_params.npz as BasicSR has it"
+    with reading(path, problem), open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
+        mean, covariance, window = (
+            arrays[name].astype(np.float64) for name in ("mu_pris_param", "cov_pris_param", "gaussian_window")
+        )
         model = NiqeModel(mean.reshape(FEATURES), covariance.reshape(FEATURES, FEATURES), window.reshape(7, 7))
-    except Exception as error:  # a stranger's bytes can raise anything
-        reason = reason_in_a_line(error)
-        raise InputError(f"{path}: no NIQE model ({reason}): give niqe_pris_params.npz as BasicSR has it") from error
     if not all(np.isfinite(part).all() for part in (model.mean, model.covariance, model.window)):
         raise InputError(f"{path}: no NIQE model (numbers that are not finite): get the file again")
     return model

@@ -1,0 +1,348 @@
+"""Time every stage on this machine: its limits, the renderer, completion, a video, SHARP.
+
+python benchmarks/suite.py [-o FOLDER] [--only SECTION,...] [--runs N] [--device cuda] [-c SHARP.pt] [--residual FILE]
+
+Needs no dataset and no weights; SHARP is timed with -c, whose file `spackle weights make` makes. Writes suite.json
+(every run's value) and suite.md after each section. A section that cannot run here is listed with its reason. What is
+compared takes turns within one process, after one turn that compiles and does not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from naive_renderer import naive_render
+from suite_scenes import SIDE, find_view, holed_scene, photo_scene
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
+
+from spackle.bases.lift import lift
+from spackle.bases.open import BaseSettings, open_base
+from spackle.bases.protocol import BasePrediction
+from spackle.bases.sharp import SharpBase
+from spackle.bases.sharp.base import to_metric, to_processor
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange, trajectory
+from spackle.errors import InputError, check_name
+from spackle.evaluation.motorcycle import load_motorcycle
+from spackle.evaluation.timing import CPU, EXTRA, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
+from spackle.files import make_folder, write_json, write_whole
+from spackle.formats import save_ply, save_video
+from spackle.gaussians import Gaussians
+from spackle.image import Photo
+from spackle.machine import commit, hardware, load_average, versions
+from spackle.render import CpuRenderer, Renderer, get_renderer
+from spackle.render.binning import list_tiles, sort_by_depth
+from spackle.render.pipeline import blend, project, wanted_tiles
+from spackle.render.project import KernelCamera
+from spackle.residual import ResidualNet, hole_area_ratio
+from spackle.residual.network import load_residual
+from spackle.scene_fill import FillContext, fill_scene, fill_view
+
+LIMIT_RUNS = 7  # at least: the best run counts
+MATRIX_SIDE, COPY_MB = 2048, 256
+PRODUCT, COPY = "matrix product, {}", "copy of memory"
+RENDER_STAGES = ("project", "sort", "bin", "blend")
+GAUSSIAN_BYTES, PIXEL_BYTES = 4 * (3 + 4 + 3 + 1 + 3), 4 * (3 + 1 + 1)
+VIDEO_RUNS, FRAMES, DISPARITY = 3, 60, 0.3
+LIFT, COMPLETE, DRAW, ENCODE = "photo and depth to Gaussians", "completion of the path", "frames drawn", "video encoded"
+EACH, GUARDS = "frames rendered and completed, each by itself", "the photo's occlusion guard, for each of them"
+FORWARD, UNPROJECT, SAVE = "forward", "unprojection", "save as PLY"
+
+Peaks = Mapping[str, float]  # a figure of the limits -> its best run, operations or bytes a millisecond
+
+
+class Timed(NamedTuple):
+    """One measured figure."""
+
+    name: str
+    values: Values
+    unit: str = "ms"
+    limit_ms: float | None = None  # the least time that it needs, at the measured limit that holds for it
+
+
+Section = tuple[list[Timed], dict[str, Any]]  # figures; sizes and settings, ready for JSON
+
+
+def limits_section(runs: int, device: torch.device = CPU, share: float = 1.0) -> Section:
+    """Products of square matrices, 2·side³ operations each, and copies, whose bytes are read and written.
+
+    `share` is of the full sizes.
+    """
+    side = round(share * MATRIX_SIDE)
+    figures: list[Timed] = []
+
+    def add(name: str, unit: str, amount: float, task: Task) -> None:
+        times = measure(max(runs, LIMIT_RUNS), {name: task}, device)[name, TOTAL]
+        figures.append(Timed(name, amount / (times / MS) / 1e9, unit))
+
+    for name, dtype in {"fp32": torch.float32, "bf16": torch.bfloat16}.items():
+        a, b = (torch.rand(side, side, generator=torch.Generator().manual_seed(k)).to(device, dtype) for k in range(2))
+        product = functools.partial(torch.mm, a, b, out=torch.empty_like(a))
+        add(PRODUCT.format(name), "GFLOP/s", 2 * side**3, lambda _, product=product: product())  # type: ignore[misc]
+    source = torch.zeros(round(share * COPY_MB * 2**20) // 4, device=device)
+    target = torch.ones_like(source)
+    add(COPY, "GB/s", 2 * source.nbytes, lambda _: target.copy_(source))
+    return figures, {"matrices": side, "copy_mb": share * COPY_MB}
+
+
+def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
+    """The CPU renderer on a scene of SHARP's size: stages, a whole call, and the naive renderer of the same picture."""
+    scene, camera = photo_scene(side)
+    tasks: dict[str, Task] = {
+        "ours": lambda lap: render_in_laps(scene, camera, lap),
+        "call": lambda _: CpuRenderer().render(scene, camera),
+        "naive": lambda lap: naive_render(scene, camera, lap),
+    }
+    times = measure(runs, tasks)
+    call, naive = times["call", TOTAL], times["naive", TOTAL]
+    least = len(scene) * GAUSSIAN_BYTES + side * side * PIXEL_BYTES  # bytes that are read once or written once
+    figures = [Timed(stage, times["ours", stage]) for stage in RENDER_STAGES]
+    figures.append(Timed("whole call: RGB, depth, alpha", call, limit_ms=least / peaks[COPY]))
+    figures += [Timed(f"naive: {stage}", times["naive", stage]) for stage in RENDER_STAGES]
+    figures += [Timed("naive: whole call", naive), Timed("naive over ours", naive / call, "×")]
+    return figures, {"gaussians": len(scene), "width": side, "height": side}
+
+
+def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
+    """What `spackle.render.pipeline.draw` does, step by step."""
+    view = KernelCamera.of(camera, 0.0)
+    wanted = wanted_tiles(view, None)
+    splats, spans = project([scene], view, wanted)
+    lap("project")
+    order = sort_by_depth(splats.keys, splats.ids, spans)
+    lap("sort")
+    lists = list_tiles(order, splats.boxes, wanted)
+    lap("bin")
+    blend(splats, lists, view, wanted, None, False)
+    lap("blend")
+
+
+def completion_section(
+    runs: int,
+    base: Gaussians,
+    photo_camera: Camera,
+    renderer: Renderer,
+    network: ResidualNet | None,
+    device: torch.device = CPU,
+) -> Section:
+    """One view, 5 % of which are holes, beside the base's render of it; without a network the seeds fill the holes."""
+    disparity, camera = find_view(base, photo_camera, renderer)
+    context = FillContext(base, photo_camera, renderer, network)
+    times = measure(runs, {"": lambda lap: complete_in_laps(context, camera, lap)}, device)
+    render, guard, place, redraw = (times["", stage] for stage in ("view", *EXTRA))
+    figures = [
+        Timed("base render of the view", render),
+        Timed("photo's occlusion guard, once a photo", guard),
+        Timed("mask, seeds, network, placing", place),
+        Timed("redraw", redraw),
+        Timed("added time", place + redraw),
+        Timed("added time over base render", (place + redraw) / render, "×"),
+    ]
+    holes = hole_area_ratio(renderer.render(base, camera).alpha)
+    facts = {"gaussians": len(base), "width": camera.width, "height": camera.height, "disparity": disparity}
+    return figures, {**facts, "holes": holes, "added": len(fill_view(context, camera).aux)}
+
+
+def video_section(
+    runs: int,
+    lift: Callable[[], BasePrediction],
+    renderer: Renderer,
+    network: ResidualNet | None,
+    frames: int = FRAMES,
+    device: torch.device = CPU,
+) -> Section:
+    """A photo, which `lift` makes Gaussians of, to an MP4 along `rotate-forward`: as one scene, and frame by frame.
+
+    Frame by frame, each is rendered and completed from scratch, its occlusion guard included, and shares nothing with
+    the others but the photo's Gaussians. Lifting and encoding are the same in both ways, and count in both. At most
+    `VIDEO_RUNS`.
+    """
+    prediction, aux = lift(), Gaussians.empty()
+    depths = DepthRange.of(prediction.gaussians)
+    path = trajectory("rotate-forward", prediction.camera.even(), DISPARITY, depths, frames)
+    context = FillContext(prediction.gaussians, prediction.camera, renderer, network)
+
+    def scene(lap: Lap) -> None:
+        nonlocal aux
+        base = lift()
+        lap(LIFT)
+        aux = fill_scene(FillContext(base.gaussians, base.camera, renderer, network), path).aux
+        lap(COMPLETE)
+        with torch.no_grad():  # as bytes, so that all frames fit into memory
+            views = (renderer.render([base.gaussians, aux], camera).rgb for camera in path)
+            pictures: list[Tensor] = [(rgb * 255).round().to(torch.uint8) for rgb in views]
+        lap(DRAW)
+        with tempfile.TemporaryDirectory() as folder:
+            save_video((picture / 255 for picture in pictures), Path(folder) / "video.mp4")
+        lap(ENCODE)
+
+    def scratch(lap: Lap) -> None:
+        for camera in path:
+            guard = context.photo_guard()
+            lap(GUARDS)
+            fill_view(context, camera, [guard])
+            lap(EACH)
+
+    times = measure(min(runs, VIDEO_RUNS), {"scene": scene, "scratch": scratch}, device)
+    whole, each, guards = times["scene", TOTAL], times["scratch", EACH], times["scratch", GUARDS]
+    anew = times["scene", LIFT] + each + guards + times["scene", ENCODE]
+    kept = anew - guards * (frames - 1) / frames
+    figures = [Timed(name, times["scene", name]) for name in (LIFT, COMPLETE, DRAW, ENCODE)]
+    figures += [Timed("one scene: photo to video", whole), Timed(EACH, each), Timed(GUARDS, guards)]
+    figures.append(Timed("frame by frame: photo to video", anew))
+    figures.append(Timed("frame by frame over one scene", anew / whole, "×"))
+    figures.append(Timed("the same, the photo's occlusion guard made once", kept / whole, "×"))
+    facts = {"gaussians": len(prediction.gaussians), "added": len(aux), "frames": frames, "disparity": DISPARITY}
+    return figures, {**facts, "width": path[0].width, "height": path[0].height}
+
+
+def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device: torch.device = CPU) -> Section:
+    """A photo to a scene on disk by SHARP, stage by stage; its time does not depend on what the photo shows."""
+    count = 0
+
+    def whole(lap: Lap) -> None:
+        nonlocal count
+        output = base.look(photo)
+        lap(FORWARD)
+        gaussians = to_processor(to_metric(output, photo))
+        count = len(gaussians)
+        lap(UNPROJECT)
+        with tempfile.TemporaryDirectory() as folder:
+            save_ply(gaussians, Path(folder) / "scene.ply", camera=photo.camera)
+        lap(SAVE)
+
+    # The run that is counted warms up; a compiled network hides its operations, and warms up within `measure`.
+    flops = 0.0 if base.compiled else count_flops(lambda: whole(lambda name: None))
+    times = measure(runs, {"": whole}, device, warm=flops > 0)
+    least = flops / peaks[PRODUCT.format(base.precision)] if flops else None
+    figures = [Timed(FORWARD, times["", FORWARD], limit_ms=least)]
+    figures += [Timed(name, times["", name]) for name in (UNPROJECT, SAVE)]
+    figures.append(Timed("photo to scene", times["", TOTAL]))
+    facts = {"weights": base.weights, "precision": base.precision, "side": base.network.config.side}
+    facts |= {"windows": base.windows, "compiled": base.compiled, "compile_problem": base.compile_problem or None}
+    return figures, {**facts, "gaussians": count}
+
+
+def count_flops(call: Callable[[], Any]) -> float:
+    """Operations of the products, convolutions and attention in a call: two for each multiplication and addition."""
+
+    def attention(query: Any, key: Any, value: Any, *rest: Any, **more: Any) -> Any:
+        return sdpa_flop_count(query, key, value)  # type: ignore[no-untyped-call]
+
+    flash = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu  # which PyTorch does not count
+    with FlopCounterMode(display=False, custom_mapping={flash: attention}) as counter:
+        call()
+    return float(counter.get_total_flops())
+
+
+def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
+    """Measure a section of `TITLES`; InputError where it cannot run here, and why."""
+    runs, side, device = options.runs, options.side, torch.device(options.device)
+    if name == "limits":
+        return limits_section(runs, device, min(1.0, side / SIDE))
+    if name == "renderer":
+        return renderer_section(runs, side, peaks)
+    if name == "sharp":
+        if options.checkpoint is None:
+            raise InputError("no weights: name them by -c FILE")
+        photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, "", Path("photo.png"))
+        speed = {"windows": options.windows, "compiled": options.compile, "precision": options.precision}
+        settings = BaseSettings("sharp", checkpoint=options.checkpoint, device=device.type, **speed)
+        base = open_base(settings).load(photo).load()
+        assert isinstance(base, SharpBase)
+        return sharp_section(options.base_runs, base, photo, peaks, device)
+    renderer = get_renderer(device.type)
+    residual = None if options.residual is None else load_residual(options.residual)
+    if name == "completion":
+        return completion_section(runs, *holed_scene(side), renderer, residual, device)
+    pair = load_motorcycle()
+    lifting = functools.partial(lift, pair.left, pair.depth, pair.left_camera)
+    if name == "video":
+        return video_section(runs, lifting, renderer, residual, FRAMES if side >= SIDE else 4, device)
+    scene = lifting()
+    return completion_section(runs, scene.gaussians, scene.camera, renderer, residual, device)
+
+
+TITLES = {
+    "limits": "Matrix products and copies of memory: the most that any stage can reach",
+    "renderer": "CPU renderer: one view of a scene of SHARP's size",
+    "completion": "Completion of one view of a scene of SHARP's size",
+    "photo": "Completion of one view of a real photo with depth (Motorcycle)",
+    "video": "A video of a real photo with depth (Motorcycle), as one scene and frame by frame",
+    "sharp": "SHARP: photo to scene",
+}
+
+
+def main(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench-suite"))
+    parser.add_argument("--only", default=",".join(TITLES), help=f"sections: {', '.join(TITLES)}")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--side", type=int, default=SIDE, help="pixels along the synthetic scenes, even; for a trial")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of all but the renderer's section")
+    parser.add_argument("--residual", type=Path, help="weights of the residual; default: the seeds alone")
+    parser.add_argument("-c", "--checkpoint", type=Path, help="weights of SHARP")
+    parser.add_argument("--base-runs", type=int, default=1, help="of SHARP")
+    parser.add_argument("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of SHARP")
+    parser.add_argument("--windows", type=int, help="of SHARP, at once")
+    parser.add_argument("--compile", action="store_true", help="compile SHARP by torch.compile")
+    options = parser.parse_args(arguments)
+    chosen = ["limits", *(name for name in options.only.split(",") if name != "limits")]
+    try:
+        for name in chosen:
+            check_name("--only", name, tuple(TITLES))
+        make_folder(options.output)
+    except InputError as error:
+        parser.error(str(error))
+    about = {**hardware(torch.device(options.device)), **versions()}
+    record: dict[str, Any] = {"commit": commit(), "about": about, "runs": options.runs, "sections": {}}
+    lines = [f"# Speed\n\n{', '.join(f'{k} {v}' for k, v in about.items())}; commit {commit()}; {options.runs} runs."]
+    peaks: dict[str, float] = {}
+    for name in chosen:
+        load, start = load_average(), time.perf_counter()
+        try:
+            figures, facts = section(name, options, peaks)
+        except InputError as error:
+            figures, facts = [], {"not run": str(error)}
+        if name == "limits":
+            peaks |= {figure.name: 1e6 * float(figure.values.max()) for figure in figures}
+        facts |= {"load_before": load, "seconds": round(time.perf_counter() - start, 1)}
+        values = [{**figure._asdict(), "values": figure.values.tolist()} for figure in figures]
+        record["sections"][name] = {"figures": values, "facts": facts}
+        lines.append(_table(name, figures, facts))
+        print(f"{name}: {len(figures)} figures in {facts['seconds']} s", file=sys.stderr)
+        write_whole(options.output / "suite.md", ("\n\n".join(lines) + "\n").encode())
+        write_json(record, options.output / "suite.json")
+
+
+def _table(name: str, figures: list[Timed], facts: Mapping[str, Any]) -> str:
+    known = {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in facts.items()}
+    about = ", ".join(f"{key} {value}" for key, value in known.items() if value is not None)
+    rows = ["what | median | quartiles | limit | time over limit", "---|---|---|---|---"] if figures else []
+    for what, values, unit, limit in figures:
+        low, median, high = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+        over = " | " if limit is None else f"{_number(limit)} ms | {median / limit:.1f}×"
+        rows.append(f"{what} | {_number(median)} {unit} | {_number(low)} – {_number(high)} | {over}")
+    return "\n".join([f"**{name}.** {TITLES[name]}. {about}.", "", *(f"| {row} |" for row in rows)]).rstrip()
+
+
+def _number(value: float) -> str:
+    """Three digits at least, without a power of ten where one can do without."""
+    if not math.isfinite(value) or abs(value) >= 100 or value == 0:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

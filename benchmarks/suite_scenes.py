@@ -1,0 +1,83 @@
+"""Synthetic scenes of SHARP's size for benchmarks, and views of them with holes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.camera_path import MAX_DISPARITY, DepthRange, extremes
+from spackle.errors import InputError
+from spackle.gaussians import Gaussians
+from spackle.render import Renderer
+from spackle.residual import hole_area_ratio
+
+SIDE = 1536  # pixels along SHARP's picture
+CELL = 2
+HOLES, HALVINGS, CLOSE = 0.05, 14, 0.01  # of a view; of the search for it, and its relative tolerance
+# Boxes in front of the wall: left, top, right, bottom as shares of the picture, and their depth in metres.
+# They cover less than a tenth, so that paths look at the wall.
+BOXES = ((0.15, 0.20, 0.30, 0.40, 3.5), (0.60, 0.35, 0.80, 0.55, 3.0), (0.35, 0.70, 0.50, 0.80, 4.0))
+WALL_M = 6.0
+BEHIND = 1.02  # the second layer's depth over the first's
+SPREAD_PX = 1.3
+
+
+def photo_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
+    """Two layers of (side/2)² Gaussians, aligned with the pixels of a photo, over smooth but varied depths.
+
+    Opacities lie between 0.04 and 0.99, so that more Gaussians are drawn than a surface would need.
+    """
+    generator = torch.Generator().manual_seed(0)
+    camera, uv, xs, ys, grid = _pixels(side)
+    layers, n = [], grid * grid
+    for layer in range(2):
+        waves = 1.5 * torch.sin(9 * xs / grid) * torch.cos(7 * ys / grid)
+        z = 3 + 2 * layer + waves + 0.05 * torch.rand(grid, grid, generator=generator)
+        scales = (0.6 + 0.8 * torch.rand(n, 3, generator=generator)) * z.reshape(n, 1) / camera.focal[0]
+        quats, opacities = torch.randn(n, 4, generator=generator), 0.04 + 0.95 * torch.rand(n, generator=generator)
+        colors = torch.rand(n, 3, generator=generator)
+        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, opacities, colors))
+    return Gaussians.cat(layers), camera
+
+
+def holed_scene(side: int = SIDE) -> tuple[Gaussians, Camera]:
+    """As many Gaussians, closed as the photo's camera sees them: boxes before a wall, which show holes from aside."""
+    camera, uv, xs, ys, grid = _pixels(side)
+    n, depth = grid * grid, torch.full((grid, grid), WALL_M)
+    for left, top, right, bottom, metres in BOXES:
+        depth[int(top * grid) : int(bottom * grid), int(left * grid) : int(right * grid)] = metres
+    hues = (0.4, 0.45, 0.55)
+    waves = [0.5 + hue * torch.sin(20 * k * xs / grid + 3 * depth + k * ys / 9) / 2 for k, hue in enumerate(hues, 1)]
+    quats, colors = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1), torch.stack(waves, dim=-1).reshape(n, 3)
+    layers = []
+    for z in (depth, BEHIND * depth):
+        scales = (SPREAD_PX * z.reshape(n, 1) / camera.focal[0]).expand(n, 3).contiguous()
+        layers.append(Gaussians(camera.unproject(uv, z).reshape(n, 3), quats, scales, torch.full((n,), 0.99), colors))
+    return Gaussians.cat(layers), camera
+
+
+def _pixels(side: int) -> tuple[Camera, Tensor, Tensor, Tensor, int]:
+    """The photo's camera; centres of its cells [g, g, 2]; their columns and rows [g, g]; how many there are a side."""
+    grid = side // CELL
+    ys, xs = torch.meshgrid(torch.arange(grid), torch.arange(grid), indexing="ij")
+    uv = (torch.stack([xs, ys], dim=-1) + 0.5) * (side / grid)
+    return Camera.from_focal(1.2 * side, side, side), uv, xs, ys, grid
+
+
+def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float = HOLES) -> tuple[float, Camera]:
+    """The disparity at which a share of the view from the right is holes, by bisection; and that view.
+
+    Raises:
+        InputError: there is no such view.
+    """
+    even, depths = camera.even(), DepthRange.of(base)
+    low, high = 0.0, MAX_DISPARITY
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        view = extremes(even, middle, depths)[1]
+        found = hole_area_ratio(renderer.render(base, view).alpha)
+        low, high = (middle, high) if found < share else (low, middle)
+        if abs(found / share - 1) < CLOSE:
+            return middle, view
+    raise InputError(f"no view up to disparity {MAX_DISPARITY:g} has {share:.0%} holes")

@@ -1,1 +1,0 @@
-"""The work behind the commands predict, render, export, view, weights and demo: files, resuming, reports, progress."""

@@ -1,0 +1,156 @@
+"""`spackle evaluate` and `spackle tables`: datasets into rows, tables, contact sheets and a page."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from spackle.bases.protocol import BasePrediction
+from spackle.errors import InputError
+from spackle.evaluation.alignment import Alignment, align, to_base
+from spackle.evaluation.case import Case, LoadedCase, load_case
+from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, open_folder, write_rows
+from spackle.evaluation.methods import Comparison
+from spackle.evaluation.metrics import NOTICE, definitions
+from spackle.evaluation.plots import check_matplotlib
+from spackle.evaluation.protocols import Viewpoint, large_views, measure_views
+from spackle.evaluation.report import REPORT, make_report, save_picture
+from spackle.evaluation.rows import NEAR, NOTE, REMARK, Row, Run
+from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
+from spackle.evaluation.sheets import BEST, WORST, strip, write_sheets
+from spackle.evaluation.table import NOT_RUN
+from spackle.evaluation.tables import FILES, make_tables, write_tables
+from spackle.files import results_folder, write_whole
+from spackle.formats import save_png
+from spackle.machine import hardware, versions
+from spackle.progress import Reporter
+from spackle.residual import hole_mask
+
+
+def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
+    """Evaluate a dataset, or resume that: "complete", or "stopped" by Ctrl-C.
+
+    Writes rows.jsonl, tables.md, tables.tex, worst.png, best.png and images/ into `output`, and report.html with
+    `html`. InputError for options, a dataset or a folder that cannot be used, for another evaluation in `output`, and
+    for too little memory.
+    """
+    if html:
+        check_matplotlib("--html")
+    evaluation = open_evaluation(options)
+    _log_missing(evaluation, reporter)
+    defined = definitions(options.wanted_metrics)
+    about = {"versions": versions(), "machine": hardware(options.device), "definitions": defined}
+    with results_folder(output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True):
+        open_folder(output, evaluation.config, about)
+
+        def measure(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+            rows, pictures = measure_case(case, evaluation)
+            for row in rows:
+                if row.metric == REMARK:
+                    reporter.log(f"{case.name}: {row.value}")
+            files = [image_file(output, index, case.name, f".{name}.webp") for name in pictures]
+            for file, picture in zip(files, pictures.values(), strict=True):
+                save_picture(picture, file)
+            joined = image_file(output, index, case.name, ".png")
+            save_png(strip(pictures), joined)
+            return rows, [*files, joined]
+
+        title = str(evaluation.config["title"])
+        rows = measure_images(evaluation.cases, measure, output, title, options.root, reporter)
+        if rows is None:
+            return "stopped"
+        run = Run(evaluation.config, rows, about)
+        write_tables(make_tables([run]), output)
+        write_sheets(run, output)
+        if html:
+            write_whole(output / REPORT, make_report([(run, output)]).encode())
+        write_rows(rows, output / ROWS)
+    count, passed = len(run.measured), len(run.problems)
+    more = f", {passed} passed over" if passed else ""
+    reporter.log(f"{title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")
+    reporter.result({"folder": output, "images": count + passed, "measured": count})
+    return "complete"
+
+
+def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
+    """Log why metrics are not run, and pyiqa's terms where it measures."""
+    reasons: dict[str, list[str]] = {}
+    for name, state in evaluation.config["metrics"].items():
+        if state.startswith(NOT_RUN):
+            reasons.setdefault(state, []).append(name)
+    for state, names in reasons.items():
+        reporter.log(f"{', '.join(names)}: {state}")
+    if evaluation.gauges.published:
+        reporter.log(NOTICE)
+
+
+def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[str, Tensor]]:
+    """All figures of an image, and what is shown of it: one view by each method, and the truth, [H, W, 3] each.
+
+    InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
+    """
+    options = evaluation.options
+    if options.near and not case.seconds and case.problem is None:
+        raise InputError(f"{case.name}: has no second photo")
+    loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
+    prediction = evaluation.open(loaded).predict(loaded.full)[0]
+    alignment = _align(loaded, prediction, evaluation, not options.base.kind.network) if options.near else None
+    if alignment:
+        cameras = [to_base(v.camera, loaded.camera, prediction.camera, alignment.scale) for v in loaded.seconds]
+        views = [Viewpoint(NEAR, v.name, camera, v.rgb) for v, camera in zip(loaded.seconds, cameras, strict=True)]
+    else:
+        views = large_views(prediction, options.disparities)
+
+    def direct_ft() -> tuple[BasePrediction, float]:
+        """The other base, and what its cameras' paths are to be multiplied by."""
+        assert evaluation.direct is not None
+        other = evaluation.direct.predict(loaded.full)[0]
+        if alignment is None:
+            return other, 1.0
+        return other, alignment.scale / _align(loaded, other, evaluation, False).scale
+
+    parts = (evaluation.renderer, evaluation.network, options.base.precision, evaluation.inpainter, direct_ft)
+    compared = Comparison(prediction, *parts)
+    methods = {name: compared.method(name) for name in options.methods}
+    image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
+    rows, pictures = measure_views(image, prediction, views, methods, evaluation.gauges, evaluation.renderer)
+    facts = {
+        "width": loaded.photo.width,
+        "height": loaded.photo.height,
+        "focal_px": round(prediction.camera.focal[0], 3),
+        "base_gaussians": len(prediction.gaussians),
+        **{f"{NOTE}{name}": value for name, value in prediction.notes.items()},
+        **{f"alignment_{name}": value for name, value in (dataclasses.asdict(alignment) if alignment else {}).items()},
+    }
+    lacks = [f"without one of its second photos: {from_root(lack, options.root)}" for lack in loaded.lacks]
+    known = [*facts.items(), *((REMARK, lack) for lack in lacks)]
+    return [*(image._replace(metric=metric, value=value) for metric, value in known), *rows], pictures
+
+
+@torch.no_grad()
+def _align(loaded: LoadedCase, prediction: BasePrediction, evaluation: Evaluation, is_truth: bool) -> Alignment:
+    """The base's scale, by what it sees at the photo's own camera."""
+    view = evaluation.renderer.render(prediction.gaussians, prediction.camera)
+    return align(loaded.case, view.depth, ~hole_mask(view.alpha), base_is_truth=is_truth)
+
+
+def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html: bool = False) -> None:
+    """Write the tables of several finished evaluations and benchmarks into `output`, and report.html with `html`.
+
+    InputError for a folder without results, results that do not go together, or an output that cannot be written to.
+    """
+    if html:
+        check_matplotlib("--html")
+    runs = [load_run(folder) for folder in folders]
+    tables = make_tables(runs)  # what does not go together is refused before anything is written
+    files = (*FILES, *([REPORT] if html else []))
+    with results_folder(output, files, alone=True):
+        write_tables(tables, output)
+        if html:
+            write_whole(output / REPORT, make_report(list(zip(runs, folders, strict=True))).encode())
+    names = ", ".join(f"{run.title} ({run.config['protocol']}, {run.base})" for run in runs)
+    reporter.log(f"{names} -> {', '.join(str(output / name) for name in files)}")

@@ -1,0 +1,168 @@
+"""A folder of results: config.json, images/ with a file for each finished image, and at last rows.jsonl.
+
+config.json is what decides the figures; rows.jsonl vouches that all images are done. A killed run goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from spackle.bases.open import BaseError
+from spackle.errors import InputError, reading
+from spackle.evaluation.case import Case
+from spackle.evaluation.rows import PROBLEM, Row, Run
+from spackle.files import (
+    as_recorded,
+    differences,
+    digest_of,
+    file_records,
+    fingerprint,
+    make_folder,
+    remove_half_written,
+    write_whole,
+)
+from spackle.progress import Reporter
+from spackle.signals import asked_to_stop
+
+CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
+FORMAT = 2
+KINDS = {"evaluate": "an evaluation", "bench": "a benchmark"}  # of a configuration: the command, and what it makes
+DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
+Measure = Callable[[int, Case], tuple[list[Row], list[Path]]]  # place, image to its rows and the files that it wrote
+
+
+def write_rows(rows: Iterable[Row], path: Path) -> None:
+    """One JSON object a line; whole or not at all."""
+    lines = (json.dumps(row._asdict(), allow_nan=False) + "\n" for row in rows)
+    write_whole(path, "".join(lines).encode())
+
+
+def read_rows(path: Path) -> list[Row]:
+    """InputError for a file that holds anything else."""
+    with reading(path, DAMAGED):
+        rows = [Row(**json.loads(line)) for line in path.read_text("utf-8").splitlines()]
+        if not all(isinstance(word, str) for row in rows for word in row[:-1]):
+            raise ValueError("a name that is no text")
+    return rows
+
+
+def load_run(folder: Path) -> Run:
+    """The finished results in a folder; InputError where there are none."""
+    if not (folder / ROWS).is_file():
+        state = "not finished: run its command again" if (folder / CONFIG).is_file() else "no results"
+        raise InputError(f"{folder}: {state}: {ROWS} is missing")
+    rows = read_rows(folder / ROWS)
+    with reading(folder / CONFIG, DAMAGED):
+        config = json.loads((folder / CONFIG).read_text("utf-8"))
+        del config["format"]
+        run = Run(config, rows, config.pop("about"))
+        _ = (run.title, run.base, run.timed, run.methods, run.settings)  # all are there
+    return run
+
+
+def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Make a folder for this configuration (its "kind" is in `KINDS`); InputError if it holds another one.
+
+    `about` is kept for readers, and need not be the same.
+    """
+    make_folder(output / IMAGES)
+    remove_half_written(output, output / IMAGES)
+    path, kind = output / CONFIG, config["kind"]
+    if not path.exists():
+        content = {"format": FORMAT, **config, "about": about}
+        write_whole(path, (json.dumps(content, indent=1) + "\n").encode())
+        return
+    with reading(path, "damaged, or not JSON ({reason}): choose another -o"):
+        old = json.loads(path.read_text("utf-8"))
+    if not isinstance(old, dict) or old.pop("format", None) != FORMAT or old.get("kind") != kind:
+        raise InputError(f"{path}: not of `spackle {kind}`: choose another -o")
+    old.pop("about", None)
+    if lines := differences(old, json.loads(json.dumps(config))):
+        raise InputError(f"{output}: holds {KINDS[kind]} of another kind ({'; '.join(lines)}): choose another -o")
+
+
+def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
+    """One of an image's files: its rows (.json), its strip (.png), or its picture by a method (.METHOD.webp)."""
+    return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
+
+
+def measure_images(
+    cases: Sequence[Case], measure: Measure, output: Path, dataset: str, root: Path, reporter: Reporter
+) -> list[Row] | None:
+    """Measure the images that no earlier run has finished: the rows of all; None where Ctrl-C came.
+
+    An image that cannot be used gives one row, its problem, and is tried again by the next run.
+
+    Raises:
+        BaseError: no image can be worked on.
+        InputError: not one image gave figures.
+    """
+    found: list[Row] = []
+    begun, measured = False, 0
+    with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
+        for index, case in enumerate(cases):
+            if stop():
+                reporter.log("stopped; the same command goes on from here")
+                return None
+            part, inputs = image_file(output, index, case.name, ".json"), inputs_digest(case)
+            rows = _load_part(part, inputs)
+            if rows is None:
+                if index and not begun:
+                    reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
+                begun, start = True, time.perf_counter()
+                try:
+                    rows, files = measure(index, case)
+                except BaseError:  # no other image would fare better; too little memory is one, too
+                    raise
+                except InputError as error:
+                    problem = problem_of(case, error, root)
+                    reporter.log(f"passed over: {problem}")
+                    rows = [Row(dataset, case.name, "", "", "", PROBLEM, problem)]
+                else:
+                    seconds = round(time.perf_counter() - start, 3)
+                    content = {"inputs": inputs, "seconds": seconds, "files": file_records(part.parent, files)}
+                    write_whole(part, (json.dumps({**content, "rows": rows}, allow_nan=False) + "\n").encode())
+                    reporter.detail(f"  {case.name}: {seconds:.1f} s")
+            measured += rows[0].metric != PROBLEM
+            found += rows
+            step(index + 1, len(cases))
+    if not measured:
+        raise InputError(f"{root}: none of {len(cases)} images gave figures (the lines above say why)")
+    return found
+
+
+def _load_part(path: Path, inputs: str) -> list[Row] | None:
+    """An image's rows by an earlier run; None where they are not whole, or the photos have changed since."""
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        whole = not content["files"] or as_recorded(path.parent, path.name, content["files"])
+        return [Row(*row) for row in content["rows"]] if whole and content["inputs"] == inputs else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def inputs_digest(case: Case) -> str:
+    """What the photos of a case hold, in one digest; a missing one has its turn later."""
+    parts = []
+    for path in (case.photo, *(second.photo for second in case.seconds)):
+        try:
+            parts.append(fingerprint(path, "photo"))
+        except InputError:
+            parts.append("none")
+    return digest_of(parts)
+
+
+def problem_of(case: Case, error: InputError, root: Path) -> str:
+    """Why a case is passed over, in one line that begins with its name: a photo may be the second one of several."""
+    problem = from_root(str(error), root)
+    return problem if problem.startswith(case.name) else f"{case.name}: {problem}"
+
+
+def from_root(problem: str, root: Path) -> str:
+    """A line about a file of a dataset, whose name does not say where that was unpacked."""
+    return " ".join(problem.replace(f"{root}/", "").splitlines())

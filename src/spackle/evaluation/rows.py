@@ -1,0 +1,121 @@
+"""What is measured: one row a figure; tables are pivots of rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+NEAR = "near"  # the setting of views from where a second photo was taken
+PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics whose values are text; a note's name follows
+Value = float | str | None
+
+
+class Row(NamedTuple):
+    """One figure. What is known of an image alone has no setting, view and method."""
+
+    dataset: str  # as the paper's tables call it
+    image: str
+    setting: str  # "0.3" (a disparity), or "near"
+    view: str
+    method: str
+    metric: str
+    value: Value  # None where the figure is not finite; text of a problem, a remark or a note
+
+
+class Mean(NamedTuple):
+    """Of a figure over views."""
+
+    value: float | None  # None where no view gave a number
+    bad: int  # views whose figure was not finite: they are left out, and counted
+
+
+def mean(values: Sequence[Value]) -> Mean:
+    """The mean of the finite values."""
+    known = [float(value) for value in values if value is not None]
+    return Mean(math.fsum(known) / len(known) if known else None, len(values) - len(known))
+
+
+def median(values: Sequence[Value]) -> Mean:
+    """The median of the finite values, as `mean` has the mean."""
+    known = [float(value) for value in values if value is not None]
+    return Mean(statistics.median(known) if known else None, len(values) - len(known))
+
+
+def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
+    """The values of the rows that agree in these columns."""
+    found: dict[tuple[str, ...], list[Value]] = {}
+    for row in rows:
+        found.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A dataset under a protocol, or its benchmark."""
+
+    config: Mapping[str, Any]
+    rows: Sequence[Row]
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # versions, machine, definitions
+
+    @property
+    def title(self) -> str:
+        """The dataset's."""
+        return str(self.config["title"])
+
+    @property
+    def base(self) -> str:
+        return str(self.config["base"]["title"])
+
+    @property
+    def timed(self) -> bool:
+        """Whether it is a benchmark."""
+        return bool(self.config["kind"] == "bench")
+
+    @property
+    def near(self) -> bool:
+        return bool(self.config["protocol"] == "near-view")
+
+    @property
+    def methods(self) -> list[str]:
+        return list(self.config["methods"])
+
+    @property
+    def settings(self) -> list[str]:
+        """Disparities, or "near"."""
+        return [NEAR] if self.near else [f"{disparity:g}" for disparity in self.config["disparities"]]
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """Images without figures, and why."""
+        return {row.image: str(row.value) for row in self.rows if row.metric == PROBLEM}
+
+    @property
+    def images(self) -> list[str]:
+        """All images, in the dataset's order."""
+        return list(dict.fromkeys(row.image for row in self.rows))
+
+    @property
+    def measured(self) -> list[str]:
+        """The images that gave figures."""
+        problems = self.problems
+        return [image for image in self.images if image not in problems]
+
+    def numbers(self, metric: str, setting: str = "") -> list[float]:
+        """A figure's finite values at a setting, by all methods."""
+        own = (row.value for row in self.rows if (row.setting, row.metric) == (setting, metric))
+        return [float(value) for value in own if value is not None]
+
+    def by_image(self, metric: str, method: str) -> dict[str, float]:
+        """Means of a figure over each image's views; without those where no view has a number."""
+        own = (row for row in self.rows if (row.method, row.metric) == (method, metric))
+        means = {image: mean(values).value for (image,), values in pivot(own, "image").items()}
+        return {image: value for image, value in means.items() if value is not None}
+
+    def largest_hole(self, image: str) -> tuple[str, str]:
+        """Setting and view of an image in which the base leaves most open: the one that is shown."""
+        own = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
+        shown = max(own, key=lambda row: float(row.value or 0))
+        return shown.setting, shown.view

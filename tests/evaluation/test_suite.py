@@ -1,0 +1,109 @@
+"""`benchmarks/suite.py`: its sections measure what they say, the naive renderer draws what ours draws, and NIQE."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import suite
+import torch
+from command import names_in
+from naive_renderer import naive_render
+from scenes import box_before_wall, same_bits
+from sharp_weights import MICRO, gaussians_of, micro_network
+from suite_scenes import find_view, holed_scene, photo_scene
+
+from spackle.bases.sharp import SharpBase
+from spackle.errors import InputError
+from spackle.evaluation.timing import complete_in_laps
+from spackle.image import Photo
+from spackle.render import CpuRenderer
+from spackle.residual import ResidualNet, hole_area_ratio
+from spackle.scene_fill import FillContext, fill_view
+
+SIDE = 64
+PEAKS = {suite.PRODUCT.format("fp32"): 1e6, suite.PRODUCT.format("bf16"): 4e6, suite.COPY: 2e6}
+
+
+def rows_of(section: suite.Section) -> dict[str, suite.Timed]:
+    return {row.name: row for row in section[0]}
+
+
+def test_the_renderers_section_has_all_stages_and_the_naive_renderer_draws_what_ours_draws() -> None:
+    section = suite.renderer_section(2, SIDE, PEAKS)
+    found, facts = rows_of(section), section[1]
+    whole, naive = "whole call: RGB, depth, alpha", "naive: whole call"
+    names = [*suite.RENDER_STAGES, *(f"naive: {stage}" for stage in suite.RENDER_STAGES), whole, naive]
+    assert all(len(found[name].values) == 2 and min(found[name].values) > 0 for name in names)
+    assert found["naive over ours"].values == pytest.approx(found[naive].values / found[whole].values)
+    scene, camera = photo_scene(SIDE)
+    difference = (CpuRenderer().render(scene, camera).rgb - naive_render(scene, camera)).abs()
+    assert float(difference.mean()) < 1e-5
+    assert float(difference.amax()) < 0.02
+    assert facts["gaussians"] == (count := len(scene)) == SIDE * SIDE // 2
+    assert found[whole].limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
+
+
+def test_what_completion_adds_to_a_view_with_holes_is_the_sum_of_its_stages() -> None:
+    torch.manual_seed(0)
+    network = ResidualNet().eval().requires_grad_(False)
+    base, camera = holed_scene(96)
+    assert hole_area_ratio(CpuRenderer().render(base, camera).alpha) == 0
+    disparity, view = find_view(base, camera, CpuRenderer())
+    assert 0 < disparity < 0.5
+    assert hole_area_ratio(CpuRenderer().render(base, view).alpha) == pytest.approx(0.05, rel=0.05)
+    with pytest.raises(InputError, match="no view"):
+        find_view(base, camera, CpuRenderer(), 0.999)
+    section = suite.completion_section(2, base, camera, CpuRenderer(), network)
+    found, facts = rows_of(section), section[1]
+    added = found["added time"].values
+    assert added == pytest.approx(found["mask, seeds, network, placing"].values + found["redraw"].values)
+    assert found["added time over base render"].values == pytest.approx(added / found["base render of the view"].values)
+    assert (facts["disparity"], facts["holes"]) == (disparity, pytest.approx(0.05, rel=0.05))
+    context = FillContext(base, camera, CpuRenderer(), network)
+    whole = fill_view(context, view).aux
+    assert same_bits(complete_in_laps(context, view, lambda name: None), whole)
+    assert facts["added"] == len(whole) > 0
+
+
+def test_a_video_in_one_scene_and_frame_by_frame() -> None:
+    section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
+    found = {name: float(row.values[0]) for name, row in rows_of(section).items()}
+    same = found[suite.LIFT] + found[suite.ENCODE] + found[suite.EACH]
+    anew, whole = found["frame by frame: photo to video"], found["one scene: photo to video"]
+    assert anew == pytest.approx(same + found[suite.GUARDS])
+    assert found["frame by frame over one scene"] == pytest.approx(anew / whole)
+    once = (same + found[suite.GUARDS] / 4) / whole
+    assert found["the same, the photo's occlusion guard made once"] == pytest.approx(once)
+    assert section[1]["added"] > 0
+
+
+def test_sharp_in_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    photo = Photo(torch.rand(MICRO.side, MICRO.side, 3), 1.2 * MICRO.side, "", Path("photo.png"))
+    section = suite.sharp_section(1, SharpBase(micro_network(), weights="micro"), photo, PEAKS)
+    found, facts = rows_of(section), section[1]
+    assert facts["gaussians"] == gaussians_of(MICRO)
+    assert (found[suite.FORWARD].limit_ms or 0) > 1e3  # 1e9 operations at 1e6 a millisecond
+    assert found["photo to scene"].values[0] >= found[suite.FORWARD].values[0]
+
+    def no_compiler(*arguments: object) -> Any:
+        raise RuntimeError("no compiler\nanywhere")
+
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
+    _, facts = suite.sharp_section(1, SharpBase(micro_network(), compiled=True, windows=9), photo, PEAKS)
+    assert (facts["windows"], facts["compile_problem"]) == (9, "no compiler anywhere")
+
+
+def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:
+    words = ["-o", str(tmp_path / "out"), "--side", str(SIDE), "--runs", "1"]
+    suite.main([*words, "--only", "renderer,sharp"])
+    assert names_in(tmp_path / "out") == {"suite.json", "suite.md"}
+    found = json.loads((tmp_path / "out" / "suite.json").read_text())["sections"]
+    assert set(found) == {"limits", "renderer", "sharp"}
+    assert "no weights" in found["sharp"]["facts"]["not run"]
+    text = (tmp_path / "out" / "suite.md").read_text()
+    assert all(f"**{name}.**" in text for name in found)
+    with pytest.raises(SystemExit):
+        suite.main([*words, "--only", "rendrer"])
