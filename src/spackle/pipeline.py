@@ -26,13 +26,14 @@ from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
-from spackle.inpaint import InpainterOptions, get_inpainter
+from spackle.inpaint.lama import LamaInpainter
+from spackle.inpaint.protocol import InpainterOptions
 from spackle.progress import Reporter, Step, progress_line
 from spackle.render import Renderer, get_renderer
-from spackle.residual import ResidualNet
-from spackle.residual.network import SHIPPED, load_residual, shipped_network
+from spackle.residual.network import SHIPPED, ResidualNet, load_residual, shipped_network
 from spackle.scene import Scene
-from spackle.scene_fill import FillContext, Texture, exemplar_texture, fill_scene, fill_view, painted_texture
+from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
+from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
 from spackle.views import PathOptions, PlannedViews, plan_views
 from spackle.weights import installed
 
@@ -134,12 +135,12 @@ class Pipeline:
         prediction, choice = self.predict(photo, reporter)
         views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
         with reporter.stage("complete") as step:
-            scene, pictures = self._fill(prediction, views, step)
+            scene, pictures = self.fill(prediction, views.cameras, step)
         if not scene.aux.finite:
             source = self.options.path.cameras or photo.path
             raise InputError(f"{source}: views too extreme to complete: check their K")
         scene = dataclasses.replace(scene, disparity=self._disparity(prediction))
-        done = CompletedPhoto(photo, prediction, choice, views, scene, pictures)
+        done = CompletedPhoto(photo, prediction, choice, views, scene, pictures if views.maker.plain else {})
         return done if scene.by_view is None else _with_farthest_view(done)
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, Choice]:
@@ -166,6 +167,21 @@ class Pipeline:
             reporter.log(f"{name}: the depth map is {size}, and was resampled to the photo's {width}×{height}")
         return prediction, choice
 
+    def fill(
+        self, prediction: BasePrediction, cameras: Sequence[Camera], progress: Step | None = None
+    ) -> tuple[Scene, Mapping[int, Tensor]]:
+        """The scene with the holes of these views filled, and the pictures that `fill_views` returns."""
+        fill, exact = self.options.fill, self.given_views is not None
+        context = FillContext(
+            prediction.gaussians,
+            prediction.camera,
+            self.renderer,
+            self.network,
+            open_texture(fill.texture),
+            precision=self.options.base.precision,
+        )
+        return fill_views(context, cameras if fill.texture != "none" else (), fill.mode, exact, progress)
+
     def disparity_source(self, choice: Choice) -> str:
         """Who says how far the camera goes."""
         return f"default of {choice.base}" if self.options.path.disparity is None else "--disparity"
@@ -174,22 +190,6 @@ class Pipeline:
         """How far the camera goes; None where views or keyframes say it."""
         given = self.given_views is not None or self.keyframes is not None
         return None if given else self.options.path.reach(prediction.disparity)
-
-    def _fill(self, prediction: BasePrediction, views: PlannedViews, step: Step) -> tuple[Scene, Mapping[int, Tensor]]:
-        seen: dict[int, Tensor] = {}
-        scene = complete(
-            prediction,
-            views.cameras,
-            mode=self.options.fill.mode,
-            exact=self.given_views is not None,
-            network=self.network,
-            fill=self.options.fill.texture,
-            renderer=self.renderer,
-            precision=self.options.base.precision,
-            progress=step,
-            seen=seen if views.maker.plain else None,
-        )
-        return scene, seen
 
 
 def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
@@ -292,7 +292,6 @@ def complete(
     renderer: Renderer | None = None,
     precision: Precision = "auto",
     progress: Callable[[int, int], None] | None = None,
-    seen: dict[int, Tensor] | None = None,
 ) -> Scene:
     """Fill the holes of all views: in scene mode with one set of aux Gaussians, see `fill_scene`.
 
@@ -306,24 +305,31 @@ def complete(
         renderer: the CPU's where None.
         precision: of the network.
         progress: called with views done and their number.
-        seen: in scene mode gets pictures of some views, for which they need not be drawn again; see `FilledScene`.
     """
-    base, camera = prediction.gaussians, prediction.camera
-    if fill == "none":
-        return Scene(base, Gaussians.empty(), camera)
     chosen = shipped_network() if network == "shipped" else network
-    context = FillContext(base, camera, renderer or get_renderer(), chosen, open_texture(fill), precision=precision)
-    if mode == "scene":
+    texture, drawer = open_texture(fill), renderer or get_renderer()
+    context = FillContext(prediction.gaussians, prediction.camera, drawer, chosen, texture, precision=precision)
+    return fill_views(context, cameras if fill != "none" else (), mode, exact, progress)[0]
+
+
+def fill_views(
+    context: FillContext,
+    cameras: Sequence[Camera],
+    mode: Mode,
+    exact: bool,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Scene, Mapping[int, Tensor]]:
+    """The scene, and pictures [H, W, 3] uint8 of the views that completion has drawn as they are, by their index."""
+    base, camera = context.base, context.photo_camera
+    if mode == "scene" or not cameras:
         filled = fill_scene(context, cameras, exact, progress)
-        if seen is not None:
-            seen.update(filled.pictures)
-        return Scene(base, filled.aux, camera)
+        return Scene(base, filled.aux, camera), filled.pictures
     guards, by_view = [context.photo_guard()], []
     for index, view in enumerate(cameras):
         by_view.append(fill_view(context, view, guards).aux)
         if progress:
             progress(index + 1, len(cameras))
-    return Scene(base, Gaussians.empty(), camera, tuple(by_view))
+    return Scene(base, Gaussians.empty(), camera, tuple(by_view)), {}
 
 
 def resolved(fill: Fill) -> Fill:
@@ -346,4 +352,4 @@ def open_texture(fill: Fill) -> Texture | None:
 
 @functools.cache
 def _lama() -> Texture:
-    return functools.partial(painted_texture, get_inpainter("lama", InpainterOptions()))
+    return functools.partial(painted_texture, LamaInpainter(InpainterOptions()))

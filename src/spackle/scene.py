@@ -14,9 +14,9 @@ from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind
 from spackle.files import write_whole
-from spackle.formats import save_ply, save_video
+from spackle.formats.ply import save_ply
 from spackle.formats.scene_files import SceneFile, Writer, at_origin, writer_of
-from spackle.formats.video import check_video
+from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer

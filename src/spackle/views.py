@@ -25,7 +25,7 @@ from spackle.camera_path import (
 )
 from spackle.color import DepthColors
 from spackle.errors import InputError
-from spackle.formats import load_cameras, load_path
+from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering

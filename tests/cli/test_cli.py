@@ -57,7 +57,7 @@ def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch
     def interrupted(*args: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spackle.pipeline.complete", interrupted)
+    monkeypatch.setattr("spackle.pipeline.fill_views", interrupted)
     result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", "-v", *SHORT)
     assert result.code == 130
     assert [line.split(":")[0] for line in result.lines[:2]] == ["  load", "  prepare"]  # -v times every stage
