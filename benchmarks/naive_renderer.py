@@ -15,7 +15,7 @@ from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.evaluation.timing import Lap
 from spackle.gaussians import Gaussians
-from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN
+from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, NEAR_PLANE, TILE, TRANSMITTANCE_STOP
 

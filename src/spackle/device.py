@@ -61,7 +61,7 @@ def memory_is_short(error: BaseException) -> bool:
 
 
 @contextmanager
-def enough_memory(*advice: str) -> Iterator[None]:
+def enough_memory(*advice: str, what: str = "for the network") -> Iterator[None]:
     """Turn a shortage of memory, which torch reports in many ways, into one `MemoryShort` line with advice."""
     try:
         yield
@@ -69,7 +69,7 @@ def enough_memory(*advice: str) -> Iterator[None]:
         if not memory_is_short(error):
             raise
         remedies = ", or ".join([*advice, "close other programs"])
-        raise MemoryShort(f"not enough memory for the network: {remedies}") from error
+        raise MemoryShort(f"not enough memory {what}: {remedies}") from error
 
 
 @contextmanager

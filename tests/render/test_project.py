@@ -12,7 +12,7 @@ from plain_project import project_plainly
 from scenes import random_scene, turned_camera
 
 from spackle.gaussians import Gaussians
-from spackle.render.pipeline import project, wanted_tiles
+from spackle.render.cpu import project, wanted_tiles
 from spackle.render.project import BLOCK, DEPTH, RECORD, KernelCamera, Splats, natural_log
 from spackle.render.protocol import ALPHA_MIN
 

@@ -9,8 +9,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import pipeline
-from spackle.render.cpu import CpuRenderer
+from spackle.render.cpu import CpuRenderer, touched_tiles
 from spackle.render.cuda import GsplatRenderer
 from spackle.render.protocol import TILE, Renderer, Rendering
 
@@ -59,16 +58,6 @@ def render_batch(
         return renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
     views = zip(scenes, cameras, tiles, onto, strict=True)
     return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]
-
-
-def touched_tiles(gaussians: Gaussians, camera: Camera, renderer: Renderer | None = None) -> Tensor:
-    """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go.
-
-    They lie where the renderer computes; on the processor where it is None.
-    """
-    find = getattr(renderer, "touched_tiles", pipeline.touched_tiles)
-    tiles: Tensor = find(gaussians, camera)
-    return tiles
 
 
 def place_of(renderer: Renderer) -> torch.device:

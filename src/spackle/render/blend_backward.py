@@ -167,28 +167,6 @@ def walk_back(
 
 
 @kernel
-def wanted_row(gaussian: int, ranges: Array) -> int:
-    """The row of the gradient table that belongs to a Gaussian, or -1.
-
-    Args:
-        ranges: [S, 3] int64; Gaussians from ranges[s, 0] to ranges[s, 1] own the rows from ranges[s, 2] on.
-    """
-    for s in range(len(ranges)):
-        if ranges[s, 0] <= gaussian < ranges[s, 1]:
-            return int(gaussian - ranges[s, 0] + ranges[s, 2])
-    return -1
-
-
-@kernel
-def count_wanted(first: int, last: int, ids: Array, starts: Array, ranges: Array, counts: Array) -> None:
-    """Count, in tiles first..last, the entries that want gradients."""
-    for tile in range(first, last):
-        for entry in range(starts[tile], starts[tile + 1]):
-            if wanted_row(ids[entry], ranges) >= 0:
-                counts[tile] += 1
-
-
-@kernel
 def load_gradients(
     work: Array, left: int, top: int, outputs: tuple[Array, ...], gradients: tuple[Array, ...], linear: Array
 ) -> None:
@@ -223,9 +201,9 @@ def backward_tile(
     first_notes: Array,
     records: Array,
     ids: Array,
+    rows: Array,
     left: int,
     top: int,
-    ranges: Array,
     sums: Array,
 ) -> None:
     """The gradients of one tile.
@@ -234,43 +212,30 @@ def backward_tile(
         work: [WORKSPACE], its gradients loaded.
         notes: [NOTES], room for notes, and `first_notes` [CHUNK], where each Gaussian's begin.
         ids: [n], the tile's list.
-        sums: [m, SUMS], one row for each entry of the list that wants gradients, in the list's order.
+        rows: [n], 0 or more for an entry whose Gaussian wants gradients.
+        sums: [m, SUMS], one row for each such entry, in the list's order.
     """
     chunks = (len(ids) + CHUNK - 1) // CHUNK
     before = np.empty((chunks, PLANE), np.float32)  # the light that reaches each chunk
-    fill(work, 0, ONE)
-    fill(work, BEHIND, ZERO)
+    work[:PLANE] = ONE
+    work[BEHIND : BEHIND + PLANE] = ZERO
     for chunk in range(chunks):
-        copy_plane(work, before[chunk])
+        before[chunk] = work[:PLANE]
         if chunk < chunks - 1:
             replay(work, notes, records, ids[chunk * CHUNK : (chunk + 1) * CHUNK], left, top, first_notes)
     slot = len(sums)
     for chunk in range(chunks - 1, -1, -1):
-        copy_plane(before[chunk], work)
+        work[:PLANE] = before[chunk]
         part = ids[chunk * CHUNK : (chunk + 1) * CHUNK]
         drawn = replay(work, notes, records, part, left, top, first_notes)
         for k in range(len(part) - 1, -1, -1):
             if slot == 0:
                 return
-            wanted = wanted_row(part[k], ranges) >= 0
+            wanted = rows[chunk * CHUNK + k] >= 0
             slot -= wanted
             if k < drawn:
                 own = sums[slot if wanted else 0]
                 walk_back(work, notes, first_notes[k], records[part[k]], left, top, wanted, own)
-
-
-@kernel
-def fill(work: Array, plane: int, value: np.float32) -> None:
-    """Set a plane of the workspace."""
-    for i in range(PLANE):
-        work[plane + i] = value
-
-
-@kernel
-def copy_plane(source: Array, target: Array) -> None:
-    """Copy the first plane of a buffer to the first of another."""
-    for i in range(PLANE):
-        target[i] = source[i]
 
 
 @kernel
@@ -280,20 +245,21 @@ def backward_tiles(
     tiles: Array,
     columns: int,
     ids: Array,
+    rows: Array,
     starts: Array,
     records: Array,
     outputs: tuple[Array, ...],
     gradients: tuple[Array, ...],
     linear: Array,
-    ranges: Array,
     slots: Array,
     sums: Array,
 ) -> None:
     """The gradients of tiles first..last of the list `tiles` [K].
 
     Args:
+        rows: [E] int32, the row of the gradient table that belongs to each entry's Gaussian; -1 for none.
         slots: [T + 1] int64, where each tile's rows in `sums` begin.
-        sums: [E, SUMS] float32, zeros.
+        sums: [M, SUMS] float32, zeros.
     """
     work, notes = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32)
     first_notes = np.empty(CHUNK, np.uint64)
@@ -301,27 +267,15 @@ def backward_tiles(
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         load_gradients(work, left, top, outputs, gradients, linear)
-        part, rows = ids[starts[tile] : starts[tile + 1]], sums[slots[tile] : slots[tile + 1]]
-        backward_tile(work, notes, first_notes, records, part, left, top, ranges, rows)
+        part, own = slice(starts[tile], starts[tile + 1]), sums[slots[tile] : slots[tile + 1]]
+        backward_tile(work, notes, first_notes, records, ids[part], rows[part], left, top, own)
 
 
 @kernel
-def collect_sums(
-    first: int, last: int, rows: int, tiles: Array, ids: Array, starts: Array, ranges: Array, sums: Array, table: Array
-) -> None:
-    """Add each entry's sums to its Gaussian's, for rows first..last of the table; tiles in order.
-
-    Args:
-        rows: the size of a share: shares first..last own the rows from first·rows to last·rows.
-        table: [G, SUMS] float32, zeros.
-    """
-    slot = 0
-    for k in range(len(tiles)):
-        for entry in range(starts[tiles[k]], starts[tiles[k] + 1]):
-            row = wanted_row(ids[entry], ranges)
-            if row < 0:
-                continue
-            if first * rows <= row < last * rows:
-                for s in range(SUMS):
-                    table[row, s] += sums[slot, s]
-            slot += 1
+def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
+    """Add sums [M, SUMS] to their rows [M] of the table [G, SUMS], for rows first·share to last·share, in order."""
+    for slot in range(len(rows)):
+        row = rows[slot]
+        if first * share <= row < last * share:
+            for s in range(SUMS):
+                table[row, s] += sums[slot, s]

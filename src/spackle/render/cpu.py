@@ -1,7 +1,8 @@
-"""The CPU renderer, differentiable by all tensors that it is given."""
+"""The CPU renderer, differentiable by all tensors that it is given: project, sort, deal out to tiles, blend."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,29 +15,20 @@ from spackle._numba import Array
 from spackle.camera import Camera
 from spackle.device import run_chunks, thread_count
 from spackle.gaussians import Gaussians
-from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums, count_wanted
-from spackle.render.pipeline import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array, draw, wanted_tiles
-from spackle.render.project import KernelCamera
+from spackle.render.binning import TileLists, list_tiles, sort_by_depth
+from spackle.render.blend import blend_tiles
+from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums
+from spackle.render.project import KernelCamera, Splats, count_before, project_chunk
 from spackle.render.project_backward import project_backward
-from spackle.render.projection_cache import ProjectionCache
-from spackle.render.protocol import Rendering, tile_mask
+from spackle.render.protocol import Rendering, check_tiles, tile_mask
 
 FIELDS = 5  # tensors in a set of Gaussians
+PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
+BLEND_GRAIN = 64  # tiles a thread blends at a time
 
 
 class CpuRenderer:
-    """Classic 3D Gaussian splatting on the CPU; a `Renderer`.
-
-    The last whole drawing is remembered: more sets on top of it, in some tiles, cost those tiles only. Changes that
-    PyTorch makes in place are noticed; writes to the same memory through NumPy or `.data` are not.
-    """
-
-    def __init__(self) -> None:
-        self._memory = ProjectionCache()
-
-    def __reduce__(self) -> tuple[type[CpuRenderer], tuple[()]]:
-        """Copies, as other processes get them, remember nothing."""
-        return CpuRenderer, ()
+    """Classic 3D Gaussian splatting on the CPU; a `Renderer`."""
 
     def render(
         self,
@@ -53,16 +45,113 @@ class CpuRenderer:
         wanted = wanted_tiles(view, tiles)
         onto = onto if tiles is not None else None
         inputs = [t for part in sets for t in part.tensors] + (list(onto.tensors) if onto else [])
-        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
-            under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
-            fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
-            return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
-        if tiles is not None:
-            redrawn = self._memory.redraw(sets, view, wanted, onto)
-            return (redrawn or draw(sets, view, wanted, onto)).rendering()
-        drawing = draw(sets, view, wanted, None)
-        self._memory.keep(sets, drawing)
-        return drawing.rendering()
+        if not (torch.is_grad_enabled() and any(t.requires_grad for t in inputs)):
+            return draw(sets, view, wanted, onto).rendering()
+        under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
+        fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
+        return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A finished drawing, and what its gradient needs to know."""
+
+    view: KernelCamera
+    wanted: Array  # [rows, columns] bool, the tiles that were drawn
+    splats: Splats
+    lists: TileLists
+    rgb: Array  # [H, W, 3] float32 sRGB
+    depth: Array  # [H, W] float32
+    alpha: Array  # [H, W] float32
+    linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
+
+    def rendering(self) -> Rendering:
+        """The images as tensors of the same memory."""
+        return Rendering(*(torch.from_numpy(image) for image in (self.rgb, self.depth, self.alpha)))
+
+
+def draw(
+    sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None, *, keep_linear: bool = False
+) -> Drawing:
+    """Draw sets of Gaussians as one, in the wanted tiles [rows, columns] bool, over a copy of `onto`.
+
+    The other tiles are black and empty where `onto` is None. The gradient needs the colour before sRGB (`keep_linear`).
+    """
+    splats, spans = project(sets, view, wanted)
+    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
+    return blend(splats, lists, view, wanted, onto, keep_linear)
+
+
+def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go."""
+    view = KernelCamera.of(camera, 0.0)
+    everywhere = wanted_tiles(view, None)
+    splats, spans = project([gaussians], view, everywhere)
+    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, everywhere)
+    return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
+
+
+def as_array(tensor: Tensor) -> Array:
+    """A tensor's values as contiguous float32, without a copy where they are that already."""
+    return tensor.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy()
+
+
+def wanted_tiles(view: KernelCamera, tiles: Tensor | None) -> Array:
+    """The tiles to draw, [rows, columns] bool."""
+    if tiles is None:
+        return np.ones(view.tiles, np.bool_)
+    check_tiles(tiles, view.height, view.width)
+    return tiles.detach().to(device="cpu", dtype=torch.bool).contiguous().numpy()
+
+
+def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, Array]:
+    """Project sets one after the other, without joining them first, as far as they touch wanted tiles.
+
+    Returns:
+        The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
+    """
+    splats = Splats.allocate(sum(len(part) for part in sets))
+    before, first = count_before(wanted), 0
+    spans: list[tuple[int, int]] = []
+    for part in sets:
+        arrays = [as_array(tensor) for tensor in part.tensors]
+
+        def chunk(start: int, stop: int, first: int = first, arrays: list[Array] = arrays) -> None:
+            found = project_chunk(
+                start, stop, first, *arrays, view.lens, view.pose, view.width, view.height, view.eps2d, before,
+                splats.records, splats.boxes, splats.keys, splats.ids,
+            )  # fmt: skip
+            spans.append((first + start, found))
+
+        run_chunks(chunk, len(part), PROJECT_GRAIN)
+        first += len(part)
+    return splats, np.array(sorted(spans), np.int64).reshape(-1, 2)
+
+
+def blend(
+    splats: Splats,
+    lists: TileLists,
+    view: KernelCamera,
+    wanted: Array,
+    onto: Rendering | None,
+    keep_linear: bool = False,
+) -> Drawing:
+    """Draw the wanted tiles; see `draw`."""
+    size = (view.height, view.width)
+    linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
+    if onto is None:
+        rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
+    else:
+        rgb, depth, alpha = (np.array(as_array(image)) for image in onto.tensors)
+    tiles = np.flatnonzero(wanted)
+
+    def chunk(start: int, stop: int) -> None:
+        blend_tiles(
+            start, stop, tiles, wanted.shape[1], lists.ids, lists.starts, splats.records, rgb, depth, alpha, linear
+        )
+
+    run_chunks(chunk, len(tiles), BLEND_GRAIN)
+    return Drawing(view, wanted, splats, lists, rgb, depth, alpha, linear)
 
 
 class Draw(torch.autograd.Function):
@@ -86,58 +175,50 @@ class Draw(torch.autograd.Function):
         """From the gradients of the three images to those of the tensors that asked for one."""
         outputs, fields = tuple(as_array(t) for t in ctx.saved_tensors[:3]), ctx.saved_tensors[3:]
         needs = ctx.needs_input_grad[2:]
-        under = [
-            keep_undrawn(gradient, ctx.drawing.wanted) if need else None
-            for gradient, need in zip(gradients, needs[:3], strict=True)
+        drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
+        under = [  # nothing where tiles were drawn over the image beneath
+            torch.where(mask, 0, gradient) if need else None
+            for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
         ]
-        wants = [k for k in range(len(ctx.sizes)) if any(needs[3 + k * FIELDS : 3 + (k + 1) * FIELDS])]
-        ranges = gradient_rows(ctx.sizes, wants)
-        table = pixel_sums(ctx.drawing, outputs, tuple(as_array(g) for g in gradients), ranges)
+        rows, count, parts = np.full(sum(ctx.sizes), -1, np.int32), 0, []
+        for k, size in enumerate(ctx.sizes):
+            if any(needs[3 + k * FIELDS : 3 + (k + 1) * FIELDS]):
+                first = sum(ctx.sizes[:k])
+                rows[first : first + size] = np.arange(count, count + size)
+                parts.append((slice(k * FIELDS, (k + 1) * FIELDS), slice(count, count + size)))
+                count += size
+        table = pixel_sums(ctx.drawing, outputs, tuple(as_array(g) for g in gradients), rows, count)
         results: list[Tensor | None] = [None] * len(fields)
-        for k, (_, _, row) in zip(wants, ranges, strict=True):
-            own = slice(k * FIELDS, (k + 1) * FIELDS)
-            results[own] = set_gradients(fields[own], ctx.drawing.view, table[row : row + ctx.sizes[k]])
+        for own, of in parts:
+            results[own] = set_gradients(fields[own], ctx.drawing.view, table[of])
         return None, None, *under, *(r if need else None for r, need in zip(results, needs[3:], strict=True))
 
 
-def gradient_rows(sizes: Sequence[int], wants: list[int]) -> Array:
-    """[S, 3] int64 of the sets that want gradients: first and last Gaussian (exclusive), first row of the table."""
-    all_sizes = np.array(sizes, np.int64)
-    own, last = all_sizes[wants], np.cumsum(all_sizes)[wants]
-    return np.stack([last - own, last, np.cumsum(own) - own], axis=1)
+def pixel_sums(
+    drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], rows: Array, count: int
+) -> Array:
+    """What the pixels give to each Gaussian that wants gradients, a table [count, SUMS] float32.
 
-
-def keep_undrawn(gradient: Tensor, wanted: Array) -> Tensor:
-    """The gradient of the image that was drawn onto: nothing where tiles were drawn over it."""
-    height, width = gradient.shape[:2]
-    drawn = tile_mask(torch.from_numpy(wanted), height, width)
-    return torch.where(drawn if gradient.ndim == 2 else drawn[..., None], 0, gradient)
-
-
-def pixel_sums(drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], ranges: Array) -> Array:
-    """What the pixels give to each Gaussian that wants gradients, [G, SUMS] float32, see `gradient_rows`.
-
-    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not
-    depend on which thread was faster.
+    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not depend on which
+    thread was faster. `rows` [N] int32 are the table's rows that belong to the Gaussians, -1 for none.
     """
     lists, columns = drawing.lists, drawing.wanted.shape[1]
-    counts = np.zeros(drawing.wanted.size, np.int64)
-    run_chunks(lambda a, b: count_wanted(a, b, lists.ids, lists.starts, ranges, counts), len(counts), BLEND_GRAIN)
-    slots = np.concatenate([[0], np.cumsum(counts)])
-    tiles = np.flatnonzero(counts)
-    sums = np.zeros((slots[-1], SUMS), np.float32)
-    table = np.zeros((int((ranges[:, 1] - ranges[:, 0]).sum()), SUMS), np.float32)
+    entry_rows = rows[lists.ids]
+    wanted = entry_rows >= 0
+    slots = np.concatenate([[0], np.cumsum(wanted)])[lists.starts]
+    tiles = np.flatnonzero(np.diff(slots))
+    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((count, SUMS), np.float32)
 
     def blend_chunk(start: int, stop: int) -> None:
         backward_tiles(
-            start, stop, tiles, columns, lists.ids, lists.starts, drawing.splats.records,
-            outputs, gradients, drawing.linear, ranges, slots, sums,
+            start, stop, tiles, columns, lists.ids, entry_rows, lists.starts, drawing.splats.records,
+            outputs, gradients, drawing.linear, slots, sums,
         )  # fmt: skip
 
     run_chunks(blend_chunk, len(tiles), BLEND_GRAIN)
-    shares = thread_count()
-    rows = -(-len(table) // shares)
-    run_chunks(lambda a, b: collect_sums(a, b, rows, tiles, lists.ids, lists.starts, ranges, sums, table), shares, 1)
+    shares, slot_rows = thread_count(), entry_rows[wanted]
+    share = -(-count // shares)
+    run_chunks(lambda a, b: collect_sums(a, b, share, slot_rows, sums, table), shares, 1)
     return table
 
 

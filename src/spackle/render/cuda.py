@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 from typing import NamedTuple
 
@@ -14,12 +13,11 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
-from spackle.device import MemoryShort, memory_is_short
+from spackle.device import enough_memory
 from spackle.errors import InputError, reason_in_a_line
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import FINITE
-from spackle.render.projection_cache import Snapshot
-from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, paste, tile_grid
+from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
 
 VERSIONS = ("1.5.3", "1.6")  # of gsplat, from and before: others do not build, or have another largest alpha
 INSTALL = "pip install 'spackle-nvs[cuda]'"
@@ -62,55 +60,34 @@ class Projection(NamedTuple):
     conics: Tensor  # [N, 3]
 
 
-@dataclasses.dataclass
-class _Entry:
-    snapshot: Snapshot
-    material: Material
-    key: Hashable = None
-    projection: Projection | None = None
-
-
 class SetStore:
-    """Each set's material, and its last projection: a scene travels once, and is projected once a camera.
+    """The material of each set, which travels once; it goes when the set's means go.
 
-    Both go when the set's tensors go. A set that asks for a gradient is not remembered: it changes at every step.
+    A set that asks for a gradient is not kept: it changes at every step.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._entries = WeakTensorKeyDictionary()
+        self._kept = WeakTensorKeyDictionary()
 
-    def seen(
-        self, part: Gaussians, key: Hashable, project: Callable[[Material], Projection]
-    ) -> tuple[Material, Projection]:
-        """The set on the GPU, and what `project` makes of it; not made again for the key of the last call."""
-        entry = self._entry(part)
-        if entry is None:
-            material = Material.of(part, self.device)
-            return material, project(material)
-        if entry.projection is None or entry.key != key:
-            with torch.inference_mode(False):
-                entry.key, entry.projection = key, project(entry.material)
-        return entry.material, entry.projection
-
-    def _entry(self, part: Gaussians) -> _Entry | None:
-        """What is remembered of a set, made where it is new or has changed; None for one that must not be."""
-        if any(tensor.requires_grad for tensor in part.tensors) or not Snapshot.possible(part.tensors):
-            return None
-        entry: _Entry | None = self._entries.get(part.means)  # type: ignore[no-untyped-call]
-        if entry is None or not entry.snapshot.shows(part.tensors):
+    def material(self, part: Gaussians) -> Material:
+        """The set on the GPU; brought there anew where PyTorch has changed it, or another tensor is in it."""
+        if any(t.requires_grad or t.is_inference() for t in part.tensors):  # tensors of inference mode count no changes
+            return Material.of(part, self.device)
+        others, state = part.tensors[1:], [(t._version, t.data_ptr()) for t in part.tensors]
+        kept = self._kept.get(part.means)  # type: ignore[no-untyped-call]
+        if kept is None or kept[1] != state or any(a is not b for a, b in zip(kept[0], others, strict=True)):
             with torch.inference_mode(False):  # who asks next may want gradients of something drawn with it
-                entry = _Entry(Snapshot(part.tensors), Material.of(part, self.device))
-            self._entries[part.means] = entry
-        return entry
+                kept = self._kept[part.means] = others, state, Material.of(part, self.device)
+        material: Material = kept[2]
+        return material
 
 
 class GsplatRenderer:
     """Classic 3D Gaussian splatting by gsplat on an NVIDIA GPU; a `Renderer`.
 
     Gaussians may lie on the processor or on the GPU: the images come back to where the first set lies. What asks for
-    no gradient is remembered on the GPU as long as its tensors live: a scene travels there once, and is projected once
-    for a camera however often some of its tiles are drawn again with more sets.
+    no gradient is kept on the GPU as long as its tensors live: a scene travels there once.
     """
 
     def __init__(self, device: str | torch.device = "cuda") -> None:
@@ -158,14 +135,14 @@ class GsplatRenderer:
         width, height = cameras[0].width, cameras[0].height
         if any((camera.width, camera.height) != (width, height) for camera in cameras):
             raise ValueError("views that are drawn together must be of one size")
-        grid = tile_grid(height, width)
         chosen = tiles or [None] * len(cameras)
-        for grid_of in chosen:
-            if grid_of is not None and tuple(grid_of.shape) != grid:
-                raise ValueError(f"tiles has shape {tuple(grid_of.shape)}, expected {grid}")
+        for each in chosen:
+            if each is not None:
+                check_tiles(each, height, width)
         wanted = [None if t is None else t.to(self.device, torch.bool, non_blocking=True) for t in chosen]
         count = sum(len(part) for parts in scenes for part in parts)
-        with _enough_memory(f"{count:,} Gaussians at {width}×{height}"):
+        what = f"to draw {count:,} Gaussians at {width}×{height} on the GPU"
+        with enough_memory("make the picture smaller", "use --device cpu", what=what):
             drawn = self._draw(scenes, cameras, eps2d, wanted)
             results = []
             for view, parts, here, under in zip(drawn, scenes, wanted, onto or [None] * len(cameras), strict=True):
@@ -174,19 +151,6 @@ class GsplatRenderer:
                     view = paste(view, here, Rendering(*kept) if kept else None)
                 results.append(view.to(parts[0].means.device if len(parts) else torch.device("cpu")))
         return results
-
-    def touched_tiles(self, gaussians: Gaussians, camera: Camera, eps2d: float = 0.0) -> Tensor:
-        """[rows, columns] bool on the GPU, see `spackle.render.touched_tiles`; tiles that boxes touch, more or less."""
-        rows, columns = tile_grid(camera.height, camera.width)
-        corners = torch.zeros((rows + 1) * (columns + 1), dtype=torch.int32, device=self.device)
-        if len(gaussians):
-            (numbers,) = self._numbers([camera])
-            _, seen = self._seen(gaussians, camera, *numbers, eps2d)
-            there = (seen.radii > 0).all(-1).int()
-            left, top, right, bottom = _boxes(seen.means2d.detach(), seen.radii, rows, columns)
-            for y, x, sign in ((top, left, 1), (bottom, right, 1), (top, right, -1), (bottom, left, -1)):
-                corners.index_add_(0, y * (columns + 1) + x, sign * there)
-        return corners.view(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns] > 0
 
     def _draw(
         self,
@@ -200,27 +164,26 @@ class GsplatRenderer:
         rows, columns = tile_grid(height, width)
         materials: list[Material] = []
         seen: list[Projection] = []
-        boxes: list[Tensor] = []
         images: list[Tensor] = []
-        for k, (parts, numbers) in enumerate(zip(scenes, self._numbers(cameras), strict=True)):
+        for k, (parts, (view, lens)) in enumerate(zip(scenes, self._matrices(cameras), strict=True)):
             for part in parts:
                 if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
                     continue
-                material, projection = self._seen(part, cameras[k], *numbers, eps2d)
-                here, radii = wanted[k], projection.radii
-                if here is not None:
-                    radii = radii * _touching(projection.means2d.detach(), radii, here)[:, None]
+                material = self._store.material(part)
+                found = self._gsplat.fully_fused_projection(
+                    material.means, material.covariances, None, None, view, lens, width, height,
+                    eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=FINITE, opacities=material.opacities,
+                )  # fmt: skip
                 materials.append(material)
-                seen.append(projection)
-                boxes.append(radii)
+                seen.append(Projection(*(field[0] for field in found[:4])))
                 images.append(torch.full((len(part),), k, device=self.device))
         if not seen:
             black = torch.zeros(len(cameras), height, width, 5, device=self.device)
             return [Rendering(image[..., :3], image[..., 3], image[..., 4]) for image in black]
-        means2d, depths, conics = (torch.cat(field) for field in list(zip(*seen, strict=True))[1:])
+        radii, means2d, depths, conics = (torch.cat(field) for field in zip(*seen, strict=True))
         of = torch.cat(images)
         _, keys, ids = self._gsplat.isect_tiles(
-            means2d.detach(), torch.cat(boxes), depths.detach(), TILE, columns, rows,
+            means2d.detach(), radii, depths.detach(), TILE, columns, rows,
             packed=True, n_images=len(cameras), image_ids=of, gaussian_ids=of,
         )  # fmt: skip
         if len(ids) > MOST_ENTRIES:
@@ -239,40 +202,12 @@ class GsplatRenderer:
             for image, alpha in zip(drawn, alphas[..., 0], strict=True)
         ]
 
-    def _numbers(self, cameras: Sequence[Camera]) -> list[tuple[Hashable, Tensor, Tensor]]:
-        """Of each camera its numbers as a key, extrinsics [1, 4, 4] and intrinsics [1, 3, 3]: one upload for all."""
-        keys = [(*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras]
-        there = torch.tensor(keys, dtype=torch.float32).to(self.device, non_blocking=True)
+    def _matrices(self, cameras: Sequence[Camera]) -> list[tuple[Tensor, Tensor]]:
+        """Of each camera extrinsics [1, 4, 4] and intrinsics [1, 3, 3]: one upload for all."""
+        numbers = [(*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras]
+        there = torch.tensor(numbers, dtype=torch.float32).to(self.device, non_blocking=True)
         views, lenses = there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3)
-        return list(zip(keys, views, lenses, strict=True))
-
-    def _seen(
-        self, part: Gaussians, camera: Camera, numbers: Hashable, view: Tensor, lens: Tensor, eps2d: float
-    ) -> tuple[Material, Projection]:
-        """A set as a camera sees it, which is remembered."""
-
-        def project(material: Material) -> Projection:
-            found = self._gsplat.fully_fused_projection(
-                material.means, material.covariances, None, None, view, lens, camera.width, camera.height,
-                eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=FINITE, opacities=material.opacities,
-            )  # fmt: skip
-            return Projection(*(field[0] for field in found[:4]))
-
-        return self._store.seen(part, (eps2d, camera.width, camera.height, numbers), project)
-
-
-@contextlib.contextmanager
-def _enough_memory(what: str) -> Iterator[None]:
-    """Turn a shortage of memory into one `MemoryShort` line."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not memory_is_short(error):
-            raise
-        raise MemoryShort(
-            f"--device cuda: the GPU's memory is too small to draw {what}: close other programs, make the picture "
-            "smaller, or use --device cpu"
-        ) from error
+        return list(zip(views, lenses, strict=True))
 
 
 def load_gsplat(device: torch.device) -> ModuleType:
@@ -309,25 +244,3 @@ def check_version(found: str) -> None:
             f"--device cuda: gsplat {found} does not build here or draws otherwise: {INSTALL} takes one from "
             f"{VERSIONS[0]} on and before {VERSIONS[1]}; or use --device cpu"
         )
-
-
-def _touching(means2d: Tensor, radii: Tensor, wanted: Tensor) -> Tensor:
-    """[N] int: 1 for a Gaussian whose box meets a wanted tile, by sums over the tiles above and to the left."""
-    rows, columns = wanted.shape
-    before = torch.nn.functional.pad(wanted.int(), (1, 0, 1, 0)).cumsum(0).cumsum(1).flatten()  # [(rows+1)(columns+1)]
-    left, top, right, bottom = _boxes(means2d, radii, rows, columns)
-
-    def at(x: Tensor, y: Tensor) -> Tensor:
-        return before[y * (columns + 1) + x]
-
-    return ((at(right, bottom) - at(left, bottom) - at(right, top) + at(left, top)) > 0).int()
-
-
-def _boxes(means2d: Tensor, radii: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The tiles of each box, [N] long: left and top, right and bottom (exclusive)."""
-
-    def tile(place: Tensor) -> tuple[Tensor, Tensor]:  # of what is out of sight gsplat leaves the place as it was
-        x, y = place.nan_to_num(0, 0, 0).unbind(-1)
-        return x.clamp(0, columns).long(), y.clamp(0, rows).long()
-
-    return *tile(((means2d - radii) / TILE).floor()), *tile(((means2d + radii) / TILE).ceil())

@@ -16,6 +16,9 @@ from spackle.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 
 Numbers = Array | tuple[Any, ...]
+Four = tuple[float, float, float, float]
+Six = tuple[float, float, float, float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 # A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy
 # from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square of this
@@ -23,7 +26,6 @@ Numbers = Array | tuple[Any, ...]
 X, Y, SLOPE, ACROSS, FALL, PEAK, HALF_WIDTH, HALF_HEIGHT, DEPTH, RED, GREEN, BLUE = range(12)
 RECORD = 12  # floats in a record
 
-SPARE = 1 << 16  # Gaussians
 BLUR_CLAMP = 0.3  # how far beyond the border, in half-images, the projection is still linearised in place
 
 # What is measured of a block of Gaussians is one flat buffer of planes, because the compiler then knows that they do
@@ -65,14 +67,6 @@ class KernelCamera:
         lens = np.array([fx, fy, cx, cy, left, right, top, bottom])
         return KernelCamera(lens, pose, camera.width, camera.height, eps2d)
 
-    def same_as(self, other: KernelCamera) -> bool:
-        """Whether both show the same."""
-        return (
-            (self.width, self.height, self.eps2d) == (other.width, other.height, other.eps2d)
-            and np.array_equal(self.lens, other.lens)
-            and np.array_equal(self.pose, other.pose)
-        )
-
     @property
     def tiles(self) -> tuple[int, int]:
         """Rows and columns of tiles."""
@@ -90,14 +84,9 @@ class Splats:
 
     @staticmethod
     def allocate(n: int) -> Splats:
-        """Room for n Gaussians, and for some more that may come later; what is not written to takes no memory."""
-        n += n // 4 + SPARE
-        return Splats(
-            np.empty((n, RECORD), np.float32),
-            np.empty((n, 4), np.uint16),
-            np.empty(n, np.uint32),
-            np.empty(n, np.int32),
-        )
+        """Room for n Gaussians; what is not written to takes no memory."""
+        boxes, keys, ids = np.empty((n, 4), np.uint16), np.empty(n, np.uint32), np.empty(n, np.int32)
+        return Splats(np.empty((n, RECORD), np.float32), boxes, keys, ids)
 
 
 def count_before(wanted: Array) -> Array:
@@ -214,25 +203,49 @@ def measure_block(
 def covariance(
     x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, lens: Array, pose: Array, eps2d: float
 ) -> tuple[float, float, float, float]:
-    """The projected covariance (xx, xy, yy) and its determinant, of a Gaussian at (x, y, 1) / nearness.
+    """The projected covariance (xx, xy, yy) and its determinant, of a Gaussian at (x, y, 1) / nearness."""
+    return spread(factor(jacobian(x, y, nearness, lens), pose, rotation(quat), scale), eps2d)
 
-    With M = J W R S, the covariance is M Mᵀ, and its determinant the squared cross product of M's rows
-    (Cauchy–Binet), which does not cancel where a Gaussian is seen edge-on.
-    """
+
+@inlined_kernel
+def jacobian(x: float, y: float, nearness: float, lens: Array) -> Four:
+    """(a, b, c, d) of the projection's Jacobian J, with rows (a, 0, b) and (0, c, d), at (x, y, 1) / nearness."""
+    a, c = lens[0] * nearness, lens[1] * nearness
+    return a, -a * min(lens[5], max(lens[4], x)), c, -c * min(lens[7], max(lens[6], y))
+
+
+@inlined_kernel
+def rotation(quat: Numbers) -> Nine:
+    """The matrix R of a quaternion (wxyz) of any length, row by row."""
     qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² makes the rotation a unit one
-    # The Jacobian's two rows are (a, 0, b) and (0, c, d).
-    a, c = lens[0] * nearness, lens[1] * nearness
-    b, d = -a * min(lens[5], max(lens[4], x)), -c * min(lens[7], max(lens[6], y))
-    h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
-    v0, v1, v2 = c * pose[1, 0] + d * pose[2, 0], c * pose[1, 1] + d * pose[2, 1], c * pose[1, 2] + d * pose[2, 2]
     r00, r01, r02 = 1 - two * (qy * qy + qz * qz), two * (qx * qy - qw * qz), two * (qx * qz + qw * qy)
     r10, r11, r12 = two * (qx * qy + qw * qz), 1 - two * (qx * qx + qz * qz), two * (qy * qz - qw * qx)
     r20, r21, r22 = two * (qx * qz - qw * qy), two * (qy * qz + qw * qx), 1 - two * (qx * qx + qy * qy)
+    return r00, r01, r02, r10, r11, r12, r20, r21, r22
+
+
+@inlined_kernel
+def factor(j: Four, pose: Array, r: Nine, scale: Numbers) -> Six:
+    """The two rows of M = J W R S, one after the other; the projected covariance is M Mᵀ."""
+    a, b, c, d = j
+    h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
+    v0, v1, v2 = c * pose[1, 0] + d * pose[2, 0], c * pose[1, 1] + d * pose[2, 1], c * pose[1, 2] + d * pose[2, 2]
     s0, s1, s2 = np.float64(scale[0]), np.float64(scale[1]), np.float64(scale[2])
-    m0, n0 = s0 * (h0 * r00 + h1 * r10 + h2 * r20), s0 * (v0 * r00 + v1 * r10 + v2 * r20)
-    m1, n1 = s1 * (h0 * r01 + h1 * r11 + h2 * r21), s1 * (v0 * r01 + v1 * r11 + v2 * r21)
-    m2, n2 = s2 * (h0 * r02 + h1 * r12 + h2 * r22), s2 * (v0 * r02 + v1 * r12 + v2 * r22)
+    m0, n0 = s0 * (h0 * r[0] + h1 * r[3] + h2 * r[6]), s0 * (v0 * r[0] + v1 * r[3] + v2 * r[6])
+    m1, n1 = s1 * (h0 * r[1] + h1 * r[4] + h2 * r[7]), s1 * (v0 * r[1] + v1 * r[4] + v2 * r[7])
+    m2, n2 = s2 * (h0 * r[2] + h1 * r[5] + h2 * r[8]), s2 * (v0 * r[2] + v1 * r[5] + v2 * r[8])
+    return m0, m1, m2, n0, n1, n2
+
+
+@inlined_kernel
+def spread(m: Six, eps2d: float) -> Four:
+    """The covariance M Mᵀ + eps2d (xx, xy, yy) and its determinant.
+
+    The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet), which does not cancel where a
+    Gaussian is seen edge-on.
+    """
+    m0, m1, m2, n0, n1, n2 = m
     cxx = m0 * m0 + m1 * m1 + m2 * m2
     cyy = n0 * n0 + n1 * n1 + n2 * n2
     cxy = m0 * n0 + m1 * n1 + m2 * n2

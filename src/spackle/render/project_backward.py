@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from spackle._numba import Array, kernel
+from spackle.render.project import Four, Nine, Six, factor, jacobian, rotation, spread
 
 
 @kernel
@@ -33,8 +34,7 @@ def project_backward(
         table: [N, SUMS], what the pixels give to each Gaussian of the set (see SUMS). All
             zeros mean that no pixel saw it; the gradients are then left as they are.
     """
-    factor, axes, jacobian, local = np.empty((2, 3)), np.empty((3, 3)), np.zeros((2, 3)), np.empty(3)
-    factor_grad, axes_grad, jacobian_grad = np.empty((2, 3)), np.empty((3, 3)), np.empty((2, 3))
+    local, factor_grad, rotation_grad, jacobian_grad = np.empty(3), np.empty((2, 3)), np.empty((3, 3)), np.empty((2, 3))
     for i in range(start, stop):
         row = table[i]
         if not row.any():
@@ -43,107 +43,68 @@ def project_backward(
         opacities_grad[i] = row[0] / opacities[i]
         for a in range(3):
             local[a] = pose[a, 0] * means[i, 0] + pose[a, 1] * means[i, 1] + pose[a, 2] * means[i, 2] + pose[a, 3]
-        norm = rotate_axes(quats[i], axes)
-        linearise(local, lens, jacobian)
-        project_axes(jacobian, pose, axes, scales[i], factor)
-        u_grad, v_grad = splat_backward(row, factor, eps2d, factor_grad)
-        axes_backward(jacobian, pose, axes, scales[i], factor_grad, jacobian_grad, axes_grad, scales_grad[i])
-        quat_backward(quats[i], norm, axes_grad, quats_grad[i])
+        nearness = 1.0 / local[2]
+        j, r = jacobian(local[0] * nearness, local[1] * nearness, nearness, lens), rotation(quats[i])
+        u_grad, v_grad = splat_backward(row, factor(j, pose, r, scales[i]), eps2d, factor_grad)
+        factor_backward(j, pose, r, scales[i], factor_grad, jacobian_grad, rotation_grad, scales_grad[i])
+        quat_backward(quats[i], rotation_grad, quats_grad[i])
         local_grad = point_backward(local, lens, jacobian_grad, u_grad, v_grad, row[9])
         for b in range(3):
             means_grad[i, b] = pose[0, b] * local_grad[0] + pose[1, b] * local_grad[1] + pose[2, b] * local_grad[2]
 
 
 @kernel
-def rotate_axes(quat: Array, axes: Array) -> float:
-    """The rotation matrix of a quaternion into `axes`; returns one by the quaternion's length."""
-    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    w, x, y, z = w * norm, x * norm, y * norm, z * norm
-    axes[0, 0], axes[0, 1], axes[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    axes[1, 0], axes[1, 1], axes[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    axes[2, 0], axes[2, 1], axes[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return norm
-
-
-@kernel
-def linearise(local: Array, lens: Array, jacobian: Array) -> None:
-    """The Jacobian of the projection at a point of the camera's space, its direction clamped."""
-    z = local[2]
-    jacobian[0, 0], jacobian[0, 2] = lens[0] / z, -lens[0] / z * min(lens[5], max(lens[4], local[0] / z))
-    jacobian[1, 1], jacobian[1, 2] = lens[1] / z, -lens[1] / z * min(lens[7], max(lens[6], local[1] / z))
-
-
-@kernel
-def project_axes(jacobian: Array, pose: Array, axes: Array, scale: Array, factor: Array) -> None:
-    """M = J W R S into `factor`; the projected covariance is M Mᵀ + eps2d."""
-    for a in range(2):
-        for k in range(3):
-            total = 0.0
-            for b in range(3):
-                for c in range(3):
-                    total += jacobian[a, c] * pose[c, b] * axes[b, k]
-            factor[a, k] = total * scale[k]
-
-
-@kernel
-def splat_backward(row: Array, factor: Array, eps2d: float, factor_grad: Array) -> tuple[float, float]:
+def splat_backward(row: Array, factors: Six, eps2d: float, factor_grad: Array) -> tuple[float, float]:
     """From sums over pixels to the gradients of the factor M, and of the centre, which are returned.
 
     For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d.
     In the blender's terms p = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.
     """
-    m, n = factor[0], factor[1]
-    xx, xy, yy = eps2d, 0.0, eps2d
-    det = eps2d * eps2d
-    for k in range(3):
-        xx += m[k] * m[k]
-        xy += m[k] * n[k]
-        yy += n[k] * n[k]
-        cross = m[(k + 1) % 3] * n[(k + 2) % 3] - m[(k + 2) % 3] * n[(k + 1) % 3]
-        det += cross * cross + eps2d * (m[k] * m[k] + n[k] * n[k])
-    across, fall, slope = yy / det, 1.0 / yy, xy / yy
-    skew = slope * across
+    _, xy, yy, det = spread(factors, eps2d)
+    across, fall = yy / det, 1.0 / yy
+    skew = xy / yy * across
     grad_xx = across * across * row[2]
     grad_xy = across * fall * row[5] - across * skew * row[2]
     grad_yy = fall * fall * row[4] - 2.0 * fall * skew * row[5] + skew * skew * row[2]
     for k in range(3):
-        factor_grad[0, k] = grad_xx * m[k] + grad_xy * n[k]
-        factor_grad[1, k] = grad_xy * m[k] + grad_yy * n[k]
+        m, n = factors[k], factors[3 + k]
+        factor_grad[0, k] = grad_xx * m + grad_xy * n
+        factor_grad[1, k] = grad_xy * m + grad_yy * n
     return across * row[1], fall * row[3] - skew * row[1]
 
 
 @kernel
-def axes_backward(
-    jacobian: Array,
+def factor_backward(
+    j: Four,
     pose: Array,
-    axes: Array,
+    r: Nine,
     scale: Array,
     factor_grad: Array,
     jacobian_grad: Array,
-    axes_grad: Array,
+    rotation_grad: Array,
     scale_grad: Array,
 ) -> None:
-    """From the factor's gradient to those of the Jacobian, the rotation and the scales."""
+    """From the gradient of the factor M = J W R S to those of the Jacobian J, the rotation R and the scales S."""
     jacobian_grad[:, :] = 0.0
     for k in range(3):
         scale_grad[k] = 0.0
         for b in range(3):
             # (J W) is two rows; its column b meets the axis' component b.
-            h0 = jacobian[0, 0] * pose[0, b] + jacobian[0, 2] * pose[2, b]
-            h1 = jacobian[1, 1] * pose[1, b] + jacobian[1, 2] * pose[2, b]
-            along = h0 * factor_grad[0, k] + h1 * factor_grad[1, k]
-            scale_grad[k] += along * axes[b, k]
-            axes_grad[b, k] = along * scale[k]
+            h0, h1 = j[0] * pose[0, b] + j[1] * pose[2, b], j[2] * pose[1, b] + j[3] * pose[2, b]
+            along, axis = h0 * factor_grad[0, k] + h1 * factor_grad[1, k], r[3 * b + k]
+            scale_grad[k] += along * axis
+            rotation_grad[b, k] = along * scale[k]
             for a in range(2):
                 for c in range(3):
-                    jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axes[b, k] * pose[c, b]
+                    jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axis * pose[c, b]
 
 
 @kernel
-def quat_backward(quat: Array, norm: float, r: Array, grad: Array) -> None:
+def quat_backward(quat: Array, r: Array, grad: Array) -> None:
     """From the gradient of a rotation matrix to that of the quaternion before normalisation."""
-    w, x, y, z = quat[0] * norm, quat[1] * norm, quat[2] * norm, quat[3] * norm
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w * norm, x * norm, y * norm, z * norm
     gw = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
     gx = 2 * (w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])) - 4 * x * (r[1, 1] + r[2, 2])
     gy = 2 * (w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1])) - 4 * y * (r[0, 0] + r[2, 2])

@@ -83,14 +83,15 @@ def tile_grid(height: int, width: int) -> tuple[int, int]:
     return -(-height // TILE), -(-width // TILE)
 
 
-def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
-    """[H, W] bool: the pixels of the chosen tiles, [rows, columns] bool.
+def check_tiles(tiles: Tensor, height: int, width: int) -> None:
+    """ValueError where the chosen tiles are not those of an image of this size."""
+    if tuple(tiles.shape) != (grid := tile_grid(height, width)):
+        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected {grid}: one for each {TILE}×{TILE} pixels")
 
-    Raises:
-        ValueError: the tiles are not those of an image of this size.
-    """
-    if tuple(tiles.shape) != tile_grid(height, width):
-        raise ValueError(f"tiles has shape {tuple(tiles.shape)}, expected one of each {TILE}×{TILE} pixels")
+
+def tile_mask(tiles: Tensor, height: int, width: int) -> Tensor:
+    """[H, W] bool: the pixels of the chosen tiles, [rows, columns] bool; ValueError for tiles of another size."""
+    check_tiles(tiles, height, width)
     return tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
 
 
