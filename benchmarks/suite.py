@@ -43,7 +43,7 @@ from spackle.image import Photo
 from spackle.machine import commit, hardware, load_average, versions
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.binning import list_tiles, sort_by_depth
-from spackle.render.pipeline import blend, project, wanted_tiles
+from spackle.render.cpu import blend, project, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.network import load_residual
@@ -115,7 +115,7 @@ def renderer_section(runs: int, side: int, peaks: Peaks) -> Section:
 
 
 def render_in_laps(scene: Gaussians, camera: Camera, lap: Lap) -> None:
-    """What `spackle.render.pipeline.draw` does, step by step."""
+    """What `spackle.render.cpu.draw` does, step by step."""
     view = KernelCamera.of(camera, 0.0)
     wanted = wanted_tiles(view, None)
     splats, spans = project([scene], view, wanted)

@@ -8,6 +8,9 @@ import math
 import torch
 from torch import Tensor
 
+SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
+LEAST_TILT = 1e-3  # radians between the view and its up
+
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
@@ -73,22 +76,8 @@ class Camera:
         return self.resized(self.width + self.width % 2, self.height + self.height % 2)
 
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
-        """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down.
-
-        Raises:
-            ValueError: where eye and target coincide, or the view is straight up or down.
-        """
-        eye, target = eye.double(), target.double()
-        forward = target - eye
-        down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-        right = torch.linalg.cross(down, forward)
-        if float(right.norm()) < 1e-9 * max(1.0, float(forward.norm())):
-            raise ValueError("cannot look there: eye and target coincide, or the view is vertical")
-        forward, right = forward / forward.norm(), right / right.norm()
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        matrix = torch.eye(4, dtype=torch.float64)
-        matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
-        return dataclasses.replace(self, world_to_camera=matrix.to(self.world_to_camera))
+        """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down; see `look_at`."""
+        return dataclasses.replace(self, world_to_camera=look_at(eye, target).to(self.world_to_camera))
 
     def to_camera(self, points: Tensor) -> Tensor:
         """World points [..., 3] in this camera's coordinates, [..., 3]."""
@@ -115,6 +104,31 @@ class Camera:
         ys = (torch.arange(self.height // stride) + 0.5) * stride
         xs = (torch.arange(self.width // stride) + 0.5) * stride
         return torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1)
+
+
+def look_at(eye: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
+    """world_to_camera [4, 4], float64, of an eye [3] that looks at a target [3], with `up` [3] (None: -y) upwards.
+
+    Raises:
+        ValueError: eye and target coincide, or up has no length, or lies along the view.
+    """
+    eye, target = eye.double(), target.double()
+    forward, down = target - eye, eye.new_tensor([0.0, 1.0, 0.0])
+    distance = float(forward.norm())
+    if distance <= SHORTEST_LOOK * max(1e-3, float(torch.cat([eye, target]).abs().max())):
+        raise ValueError("eye and target coincide, so there is no direction to look in")
+    if up is not None:
+        if float(up.norm()) < 1e-9:
+            raise ValueError("up has no length")
+        down = -up.double() / up.double().norm()
+    right = torch.linalg.cross(down, forward)
+    if float(right.norm()) < LEAST_TILT * distance:
+        raise ValueError("up lies along the view, so it does not say which way is up")
+    forward, right = forward / forward.norm(), right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    return matrix
 
 
 def beside(numbers: Tensor, other: Tensor) -> Tensor:

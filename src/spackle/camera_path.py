@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.camera import Camera
+from spackle.camera import Camera, look_at
 from spackle.gaussians import Gaussians
 
 TrajectoryKind = Literal["swipe", "shake", "rotate", "rotate-forward"]
@@ -27,10 +28,8 @@ MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
 UP = (0.0, -1.0, 0.0)  # by default the photo's
-SHORTEST_LOOK = 1e-6  # an eye and a target nearer than this, against their distance from the origin, are one
 LEAST_STEP = 1e-6  # seconds between two keys
 STILL = 1e-100  # slopes below it are none; their inverse would overflow
-LEAST_TILT = 1e-3  # radians between the view and its up
 Array = NDArray[np.float64]
 
 
@@ -154,7 +153,7 @@ class Keyframe:
             raise PathError("every number must be finite, not NaN or infinite")
         if self.fov is not None and not MIN_FOV <= self.fov <= MAX_FOV:
             raise PathError(f"fov must be from {MIN_FOV:g} to {MAX_FOV:g} degrees, got {self.fov:g}")
-        view_matrix(*(np.array(part) for part in (self.eye, self.target, self.up)))
+        _look_at(self.eye, self.target, self.up)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,37 +222,20 @@ class KeyframePath:
         views = []
         for time, row in zip(times, values, strict=True):
             try:
-                matrix = view_matrix(row[:3] * length, row[3:6] * length, row[6:9])
+                pose = _look_at(row[:3] * length, row[3:6] * length, row[6:9])
             except PathError as error:
                 raise PathError(f"at {time:.3g} s, between two keyframes, {error}: add a keyframe there") from None
             K = camera.K.clone()
             K[:2, :2] *= math.exp(row[9]) / fx
-            pose = torch.from_numpy(matrix).to(camera.world_to_camera)
-            views.append(dataclasses.replace(camera, K=K, world_to_camera=pose))
+            views.append(dataclasses.replace(camera, K=K, world_to_camera=pose.to(camera.world_to_camera)))
         return views
 
 
-def view_matrix(eye: Array, target: Array, up: Array) -> Array:
-    """world_to_camera [4, 4] of a camera at `eye` [3] that looks at `target` [3], with `up` [3] upwards.
-
-    Raises:
-        PathError: eye and target coincide, or up has no length, or lies along the view.
-    """
-    forward = target - eye
-    distance, height = float(np.linalg.norm(forward)), float(np.linalg.norm(up))
-    if distance <= SHORTEST_LOOK * max(1e-3, float(np.abs([eye, target]).max())):
-        raise PathError("eye and target coincide, so there is no direction to look in")
-    if height < 1e-9:
-        raise PathError("up has no length")
-    forward = forward / distance
-    right = np.cross(forward, up / height)
-    if (sine := float(np.linalg.norm(right))) < LEAST_TILT:
-        raise PathError("up lies along the view, so it does not say which way is up")
-    right = right / sine
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
-    return matrix
+def _look_at(*vectors: Sequence[float] | Array) -> Tensor:
+    try:
+        return look_at(*(torch.tensor(vector, dtype=torch.float64) for vector in vectors))
+    except ValueError as error:
+        raise PathError(str(error)) from None
 
 
 def interpolate(times: Array, values: Array, wanted: Array, period: float | None = None) -> Array:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from spackle.errors import InputError
+from spackle.errors import InputError, reading, reason_in_a_line
 
 LOCK, NEW = ".lock", ".new"
 LEFTOVER = re.compile(r"\.(.+)\.[0-9a-f]{12}(\.\w+)")  # how `atomic_path` calls its temporary files
@@ -24,7 +24,7 @@ BLOCK = 1 << 20  # bytes of a file that are hashed at once
 
 def check_file(path: str | os.PathLike[str], kind: str) -> int:
     """The size in bytes of a plain, non-empty file; InputError otherwise. `kind` names it in messages."""
-    try:
+    with reading(repr(str(path)), "cannot be read: {reason}", OSError, ValueError):
         if not os.path.exists(path):
             raise InputError(f"{path}: no such {kind}: check the name")
         if not os.path.isfile(path):
@@ -32,10 +32,6 @@ def check_file(path: str | os.PathLike[str], kind: str) -> int:
         size = os.path.getsize(path)
         with open(path, "rb"):
             pass
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{str(path)!r}: cannot be read: {error}") from error
     if size == 0:
         raise InputError(f"{path}: the file is empty: give another {kind}")
     return size
@@ -65,7 +61,7 @@ def atomic_path(path: str | os.PathLike[str], *, durable: bool = False) -> Itera
     except OSError as error:
         if error.filename not in (None, str(temporary)):
             raise  # about another file, such as an input that the block reads
-        raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot write: {reason_in_a_line(error)}") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -94,7 +90,8 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
         InputError: where the folder is missing or closed to us, or the name is taken by something
             that is not a plain file (replacing /dev/null would be a surprise).
     """
-    try:
+    # A name too long, a zero byte in it, a loop of links.
+    with reading(repr(str(path)), "cannot write: {reason}", OSError, ValueError):
         target = Path(os.path.realpath(path))
         if target.exists() and not target.is_file():
             kind = "a folder" if target.is_dir() else "not a plain file"
@@ -103,10 +100,6 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
             raise InputError(f"{path}: cannot write: the folder {target.parent} does not exist; create it first")
         if not os.access(target.parent, os.W_OK | os.X_OK):
             raise InputError(f"{path}: cannot write: the folder {target.parent} is not writable")
-    except (OSError, ValueError) as error:  # a name too long, a zero byte in it, a loop of links
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{str(path)!r}: cannot write: {error}") from error
     return target
 
 
@@ -199,7 +192,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
                 f"{folder}: another run is at work in this folder: wait for it, end it, or choose another with -o"
             ) from error
         except OSError as error:
-            raise InputError(f"{folder / LOCK}: cannot write: {error.strerror or error}") from error
+            raise InputError(f"{folder / LOCK}: cannot write: {reason_in_a_line(error)}") from error
         yield
 
 
@@ -229,12 +222,10 @@ def whole_set(folder: Path, last: str) -> Iterator[Path]:
     """
     new = folder / NEW
     try:
-        try:
+        with reading(new, "cannot write: {reason}", OSError):
             if os.path.lexists(new):  # of a killed run
                 shutil.rmtree(new)
             new.mkdir()
-        except OSError as error:
-            raise InputError(f"{new}: cannot write: {error.strerror or error}") from error
         yield new
         (folder / last).unlink(missing_ok=True)
         files = [file.relative_to(new) for file in sorted(new.rglob("*")) if file.is_file()]
@@ -284,13 +275,24 @@ def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> N
 
 def make_folder(path: Path) -> None:
     """Create a folder for results, or check that it can be written to; InputError where it cannot."""
-    try:
+    with reading(path, "cannot create this output folder: {reason}; choose another with -o", OSError, ValueError):
         path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot create this output folder: {reason}; choose another with -o") from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{path}: this output folder is not writable; choose another with -o")
+
+
+def files_in(folder: Path, endings: tuple[str, ...], *, below: bool = False) -> list[Path]:
+    """The files in a folder whose names end so, in any case; with `below` those in folders below it, too.
+
+    Sorted; what is hidden is left out. InputError where the folder cannot be read.
+    """
+    with reading(folder, "cannot read the folder: {reason}", OSError):
+        os.scandir(folder).close()
+    found = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if below and not name.startswith(".")]
+        found += [Path(place) / name for name in names if name.lower().endswith(endings) and not name.startswith(".")]
+    return sorted(file for file in found if file.is_file())
 
 
 def sha256_of(file: BinaryIO) -> str:

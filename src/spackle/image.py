@@ -18,7 +18,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.photo_frame import PhotoFrame, find_frame
 
@@ -223,28 +223,22 @@ def read_image(path: str | os.PathLike[str], read: Callable[[Image.Image], T]) -
             everything is caught.
     """
     check_file(path, "photo")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # broken EXIF, 90 megapixels: not worth a line
-            if "HEIF" not in Image.OPEN:
-                import pillow_heif
+    with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # broken EXIF, 90 megapixels: not worth a line
+        if "HEIF" not in Image.OPEN:
+            import pillow_heif
 
-                pillow_heif.register_heif_opener()
+            pillow_heif.register_heif_opener()
+        try:
             with _BoundedFile(open(path, "rb", buffering=0)) as file, Image.open(file) as image:
                 check_pixels(image.width, image.height, file.size, path)
                 return read(image)
-    except InputError:
-        raise
-    except Image.DecompressionBombError:
-        raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
-    except UnidentifiedImageError:
-        raise InputError(
-            f"{path}: not an image in any format that is known here: give a JPEG, PNG, WebP, HEIC or TIFF"
-        ) from None
-    except Exception as error:
-        raise InputError(
-            f"{path}: cannot be decoded ({reason_in_a_line(error)}): the file is damaged or cut off"
-        ) from error
+        except Image.DecompressionBombError:
+            raise InputError(f"{path}: more than 100 megapixels: shrink it first") from None
+        except UnidentifiedImageError:
+            raise InputError(
+                f"{path}: not an image in any format that is known here: give a JPEG, PNG, WebP, HEIC or TIFF"
+            ) from None
 
 
 def check_pixels(width: int, height: int, size: int, path: str | os.PathLike[str]) -> None:

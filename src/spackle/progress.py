@@ -1,4 +1,4 @@
-"""Progress that suits where it is read: bars on a terminal, lines in a log."""
+"""Progress that suits where it is read: bars on a terminal, lines in a log. And the end of a long job on request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import copy
 import io
 import json
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import timedelta
@@ -170,3 +172,27 @@ class Notes(Reporter):
 
     def log(self, line: str) -> None:
         self.said.append(line)
+
+
+@contextlib.contextmanager
+def asked_to_stop(alone: bool) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM came, which then ends the run between two steps, where nothing is half done.
+
+    A second Ctrl-C ends it at once; not so under torchrun, which passes on what the terminal has sent already.
+    """
+    asked: list[int] = []  # no Event: its lock would hold up a second signal that comes while it is set, for ever
+    if threading.current_thread() is not threading.main_thread():  # signals are not for this one
+        yield lambda: False
+        return
+
+    def note(number: int, frame: object) -> None:
+        asked.append(number)
+        if alone:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(asked)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -15,17 +15,15 @@ import gsplat_stand_in
 import pytest
 import torch
 from scenes import box_before_wall, same_bits, shifted
-from torch import Tensor
 
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import CpuRenderer, cuda, get_renderer, render_batch, touched_tiles
+from spackle.render import CpuRenderer, cuda, get_renderer, render_batch
 from spackle.render.cuda import (
     VERSIONS,
     GsplatRenderer,
     Material,
-    Projection,
     SetStore,
     check_version,
     load_gsplat,
@@ -167,7 +165,7 @@ def test_too_little_memory_is_a_line(gpu: GsplatRenderer, monkeypatch: pytest.Mo
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 66 GiB")
 
     monkeypatch.setattr(gpu._gsplat, "isect_tiles", full)
-    with pytest.raises(MemoryShort, match="memory is too small"):
+    with pytest.raises(MemoryShort, match="not enough memory"):
         gpu.render(BASE, SIDE)
 
 
@@ -202,9 +200,7 @@ def test_a_scene_travels_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Material, "of", staticmethod(counted))
     store = SetStore(torch.device("cpu"))
 
-    def material(part: Gaussians) -> Material:
-        return store.seen(part, None, lambda there: Projection(*(there.means,) * 4))[0]
-
+    material = store.material
     kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
     first = material(kept)
     assert material(kept) is first
@@ -220,34 +216,9 @@ def test_a_scene_travels_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch.inference_mode():
         passing = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
         assert material(passing) is not material(passing)
-    assert len(store._entries) == 1
+    assert len(store._kept) == 1
     del kept
-    assert len(store._entries) == 0
-
-
-def test_a_scene_is_projected_once_for_a_camera(gpu: GsplatRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    counts: list[int] = []
-    package = gpu._gsplat
-
-    class Counting:
-        def __getattr__(self, name: str) -> Any:
-            return getattr(package, name)
-
-        def fully_fused_projection(self, means: Tensor, *arguments: Any, **options: Any) -> Any:
-            counts.append(len(means))
-            return package.fully_fused_projection(means, *arguments, **options)
-
-    monkeypatch.setattr(gpu, "_gsplat", Counting())
-    more = BASE.select(slice(0, 50))
-    tiles = torch.ones(3, 3, dtype=torch.bool)
-    whole = gpu.render(BASE, SIDE)
-    redrawn = gpu.render([BASE, more], SIDE, tiles=tiles, onto=whole)
-    gpu.render([BASE, more], SIDE)
-    assert counts == [len(BASE), 50]
-    assert same_bits(redrawn, gpu.render([BASE, more], SIDE))
-    gpu.render(BASE, SCENE.camera)
-    gpu.render(BASE, SIDE, eps2d=0.3)
-    assert counts == [len(BASE), 50, len(BASE), len(BASE)]
+    assert len(store._kept) == 0
 
 
 def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,10 +287,3 @@ def test_each_step_of_the_gpus_first_minutes_says_why_it_is_skipped_without_one(
     for step in steps.STEPS:
         with pytest.raises(steps.Skip, match=r"GPU|gsplat|path"):
             list(step(argparse.Namespace(checkpoint=None)))
-
-
-def test_touched_tiles_hold_all_that_the_processor_finds(gpu: GsplatRenderer) -> None:
-    for part in (BASE.select(slice(0, 7)), BASE.select(slice(300, 340)), Gaussians.empty()):
-        found, expected = gpu.touched_tiles(part, SIDE).cpu(), touched_tiles(part, SIDE)
-        assert bool((found >= expected).all())
-        assert int((found & ~expected).sum()) <= 2

@@ -1,6 +1,5 @@
 """The CPU renderer against hand-computed cases, and against its plain twin."""
 
-import copy
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +15,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.render import TILE, CpuRenderer, cpu, get_renderer, touched_tiles
+from spackle.render import TILE, CpuRenderer, get_renderer, touched_tiles
 from spackle.render.blend import decode_srgb, encode_srgb, exp2
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
@@ -267,59 +266,16 @@ def test_chosen_tiles_match_the_full_image_and_no_other_is_touched(scene, tile_s
 @settings(max_examples=15, deadline=None)
 @given(scenes(), SEEDS)
 def test_other_tiles_than_those_touched_do_not_change(scene, more_seed):
-    gaussians, camera, eps2d, solidity = scene
+    gaussians, camera, _, solidity = scene
     more = random_scene(more_seed, 5, camera, solidity)
-    before = CPU.render(gaussians, camera, eps2d=eps2d)
-    after = CPU.render([gaussians, more], camera, eps2d=eps2d)
-    tiles = touched_tiles(more, camera, eps2d)
+    before, after = CPU.render(gaussians, camera), CPU.render([gaussians, more], camera)
+    tiles = touched_tiles(more, camera)
     mask = tile_mask(tiles, camera)
-    alone = CPU.render(more, camera, eps2d=eps2d).alpha > 0
+    alone = CPU.render(more, camera).alpha > 0
     for name in FIELDS:
         assert torch.equal(getattr(after, name)[~mask], getattr(before, name)[~mask])
     assert not (alone & ~mask).any()
     assert not touched_tiles(more.select(torch.zeros(len(more), dtype=torch.bool)), camera).any()
-
-
-@settings(max_examples=25, deadline=None)
-@given(scenes(), SEEDS, st.integers(0, 2))
-def test_drawing_onto_what_is_remembered_is_bit_for_bit_drawing_anew(scene, more_seed, sets):
-    gaussians, camera, eps2d, solidity = scene
-    there = [gaussians, *(random_scene(more_seed + k, 30, camera, solidity) for k in range(sets))]
-    doubles = there[0].select(slice(0, 3))  # equally far: those that are there come first
-    more = [random_scene(more_seed, 20, camera, solidity), Gaussians.empty(), doubles]
-    tiles = random_tiles(camera, more_seed, 0.7)
-    renderer = CpuRenderer()
-    before = renderer.render(there, camera, eps2d=eps2d)
-    for added in (more, more[:1], []):
-        found = renderer.render([*there, *added], camera, eps2d=eps2d, tiles=tiles, onto=before)
-        fresh = CpuRenderer().render([*there, *added], camera, eps2d=eps2d, tiles=tiles, onto=before)
-        assert same_bits(found, fresh)
-
-
-def test_what_is_remembered_is_used_only_for_what_it_is(monkeypatch):
-    drawn, whole = [], cpu.draw
-    monkeypatch.setattr(cpu, "draw", lambda *args: (drawn.append(1), whole(*args))[1])
-    renderer, tiles = CpuRenderer(), torch.ones(3, 3, dtype=torch.bool)
-    there, more = random_scene(1, 30, CAMERA), random_scene(2, 5, CAMERA)
-
-    def costs(*gaussians, camera=CAMERA, eps2d=0.0):
-        """Whether all is drawn anew; what comes out is right in either case."""
-        drawn.clear()
-        found = renderer.render(gaussians, camera, eps2d=eps2d, tiles=tiles)
-        count = len(drawn)
-        assert same_bits(found, CpuRenderer().render(gaussians, camera, eps2d=eps2d))
-        return count == 1
-
-    renderer.render(there, CAMERA)
-    assert not costs(there, more)
-    assert costs(more, there)
-    assert costs(there.select(slice(None)), more)  # as good, but not the same tensors
-    assert costs(there, more, eps2d=0.3)
-    assert costs(there, more, camera=turned_camera(CAMERA.width, CAMERA.height, 30.0))
-    assert costs(there, random_scene(3, 80_000, CAMERA))  # no room
-    there.colors.mul_(0.5)
-    assert costs(there, more)
-    assert copy.deepcopy(renderer)._memory is not renderer._memory
 
 
 def test_gradients_pass_through_kept_tiles_only():

@@ -101,7 +101,7 @@ def test_looking_by_hand() -> None:
     expected = torch.tensor([[0.0, 0.0, -1.0, 3.0], [0.0, 1.0, 0.0, -2.0], [1.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 1.0]])
     torch.testing.assert_close(camera.world_to_camera, expected)
     for target in ((0, 0, 0), (0, 1, 0), (0, -3, 0)):  # nowhere, and straight up or down
-        with pytest.raises(ValueError, match="cannot look there"):
+        with pytest.raises(ValueError, match=r"coincide|along the view"):
             PHOTO.looking(torch.zeros(3), torch.tensor(target).float())
 
 

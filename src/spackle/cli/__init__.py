@@ -7,7 +7,9 @@ import contextlib
 import gc
 import json
 import os
+import signal
 import sys
+import threading
 from typing import Annotated, NoReturn
 
 import typer
@@ -17,7 +19,6 @@ from typer.exceptions import TyperException
 from spackle.cli import dataset, evaluate, predict, render, train, weights
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError, one_line
-from spackle.signals import exit_on_sigterm
 
 EXAMPLES = (
     ("spackle predict photo.jpg -o out", "a scene, a video, a report"),
@@ -107,7 +108,8 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Its collector would look again and again at the 200,000 objects of torch and numba, which stay.
     gc.set_threshold(50_000)
-    exit_on_sigterm()
+    if threading.current_thread() is threading.main_thread():  # SIGTERM ends it after every `finally`, too
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()

@@ -26,11 +26,10 @@ from spackle.cli.photo import (
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
-from spackle.files import as_recorded, check_file, check_mark, mark, results_folder
+from spackle.files import as_recorded, check_file, check_mark, files_in, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.pipeline import Pipeline
-from spackle.progress import Notes, Reporter
-from spackle.signals import asked_to_stop
+from spackle.progress import Notes, Reporter, asked_to_stop
 from spackle.weights import weights_digest
 from spackle.workers import Workers, at_work, cluster, threads_of_torch
 
@@ -198,11 +197,7 @@ def find_photos(path: Path) -> list[NamedPhoto]:
     """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
     if not os.path.isdir(path):
         return [NamedPhoto(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
-    try:
-        files = (p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
-        photos = sorted(p for p in files if p.suffix.lower() in PHOTO_SUFFIXES)
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the folder: {error.strerror}") from error
+    photos = files_in(path, PHOTO_SUFFIXES)
     if not photos:
         raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
     # a.jpg and a.png must not write over each other, nor over a.jpg.png.

@@ -23,9 +23,8 @@ from spackle.errors import InputError, check_name
 from spackle.files import check_file
 from spackle.image import Photo, load_photo
 from spackle.pipeline import Options, Pipeline
-from spackle.progress import Reporter, Step
+from spackle.progress import Reporter, Step, asked_to_stop
 from spackle.scene import Scene
-from spackle.signals import asked_to_stop
 from spackle.viewer import PageScene, page_files
 from spackle.viewer.server import HOST, ViewerServer
 from spackle.viewer.work import Tell

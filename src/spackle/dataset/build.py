@@ -28,10 +28,9 @@ from spackle.files import (
 )
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import InpainterOptions
-from spackle.progress import Reporter, counted, timed
+from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
-from spackle.signals import asked_to_stop
 from spackle.workers import at_work, cluster
 
 MAX_PHOTOS = 1_000_000  # six digits name a photo

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from spackle.errors import InputError, reading
-from spackle.files import check_file, sha256_of
+from spackle.files import check_file, files_in, sha256_of
 from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.progress import Step
 
@@ -46,11 +46,7 @@ def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -
         return _named_by_coco(source, folder, log)
     if folder is not None:
         raise InputError(f"{folder}: only a COCO JSON needs a folder beside it, and {source} is a folder itself")
-    names = []
-    for place, folders, files in os.walk(source):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        photos = [name for name in files if name.lower().endswith(SUFFIXES) and not name.startswith(".")]
-        names += [(Path(place) / name).relative_to(source).as_posix() for name in photos]
+    names = [file.relative_to(source).as_posix() for file in files_in(source, SUFFIXES, below=True)]
     if not names:
         raise InputError(f"{source}: no photos in this folder (looked for {', '.join(SUFFIXES)})")
     return source, sorted(names)

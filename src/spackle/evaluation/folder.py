@@ -26,8 +26,7 @@ from spackle.files import (
     remove_half_written,
     write_whole,
 )
-from spackle.progress import Reporter
-from spackle.signals import asked_to_stop
+from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 2

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from spackle.errors import InputError
-from spackle.files import write_whole
+from spackle.files import files_in, write_whole
 from spackle.image import PHOTO_SUFFIXES
 from spackle.progress import Step
 from spackle.render import Renderer
@@ -159,8 +159,7 @@ def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> l
     """All files below a folder whose names end so, in order; InputError for no folder, or no such file in it."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
-    found = sorted(file for file in folder.rglob("*") if file.name.lower().endswith(endings) and file.is_file())
-    found = [file for file in found if not file.name.startswith(".")]
+    found = files_in(folder, endings, below=True)
     if not found:
         raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
     return found

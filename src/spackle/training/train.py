@@ -31,8 +31,7 @@ from spackle.errors import InputError, reading
 from spackle.files import results_folder, write_json
 from spackle.formats import save_png
 from spackle.machine import hardware, versions, without_nan
-from spackle.progress import Reporter
-from spackle.signals import asked_to_stop
+from spackle.progress import Reporter, asked_to_stop
 from spackle.training.checkpoint import (
     BAD,
     BEST,

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from spackle.errors import InputError
+from spackle.files import files_in
 from spackle.image import PHOTO_SUFFIXES
 
 MAX_DEPTH = 4  # of a scene below the root; the deepest official one is root/train/balanced/SCENE
@@ -67,10 +68,7 @@ def by_name(scenes: Sequence[Path], name: Callable[[Path], str] = lambda scene: 
 
 def photo_files(folder: Path) -> list[Path]:
     """The photos right in a folder, by name; none where there is no folder."""
-    if not folder.is_dir():
-        return []
-    files = (entry for entry in folder.iterdir() if entry.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted(entry for entry in files if not entry.name.startswith("."))
+    return files_in(folder, PHOTO_SUFFIXES) if folder.is_dir() else []
 
 
 def _walk(root: Path, layout: Layout, budget: int) -> Iterator[Path]:

@@ -11,7 +11,7 @@ import pytest
 # As `timeout` ends a process and its group: the second signal comes while the first one is noted.
 TWICE = """
 import os, signal, sys, time
-from spackle.signals import asked_to_stop
+from spackle.progress import asked_to_stop
 def again(frame, event, argument):
     name = argument.__name__ if event == "c_call" else frame.f_code.co_name
     if event in ("call", "c_call") and name in ("notify_all", "append"):  # of an Event, of a list
