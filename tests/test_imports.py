@@ -152,3 +152,23 @@ def test_every_module_imports_with_the_core_dependencies_alone() -> None:
         path.name != "__main__.py" and path.parent.joinpath("__init__.py").is_file() and path != SOURCES / "__init__.py"
         for path in FILES
     )
+
+
+# What a reader from photo to scene may leave out: other bases, phones' depth, the page, clips.
+ASIDE = ("bases.lite", "bases.hf", "bases.photo_depth", "viewer", "clips")
+MOST_FILES, MOST_LINES = 75, 13_400  # to be lowered, to 55 and 11,000, and never raised
+
+
+def test_the_way_from_photo_to_scene_stays_short() -> None:
+    ahead, reached = ["spackle.pipeline"], dict[str, Path]()
+    while ahead:
+        module = ahead.pop()
+        path = SOURCES.parent.joinpath(*module.split("."))
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        aside = any(f"{module}.".startswith(f"spackle.{room}.") for room in ASIDE)
+        if module not in reached and path.is_file() and not aside:
+            reached[module] = path
+            ahead += [name for name in imports_of(path) if name.startswith("spackle.")]
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in reached.values())
+    assert 40 < len(reached) <= MOST_FILES, sorted(reached)
+    assert lines <= MOST_LINES

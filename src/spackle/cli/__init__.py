@@ -109,7 +109,7 @@ def main() -> None:
     # Its collector would look again and again at the 200,000 objects of torch and numba, which stay.
     gc.set_threshold(50_000)
     if threading.current_thread() is threading.main_thread():  # SIGTERM ends it after every `finally`, too
-        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+        signal.signal(signal.SIGTERM, _end)
     try:
         code = app(standalone_mode=False)
         sys.stdout.flush()
@@ -143,6 +143,10 @@ def run() -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(code if isinstance(code, int) else 1)
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    sys.exit(128 + number)
 
 
 def _fail(message: str) -> NoReturn:
