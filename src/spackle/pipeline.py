@@ -18,7 +18,7 @@ from typing import Literal
 from torch import Tensor
 
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.open import BaseSettings, Choice, OpenedBase, open_base, open_loaded
+from spackle.bases.open import BaseSettings, OpenedBase, ResolvedBase, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, TrajectoryKind
@@ -92,7 +92,7 @@ class CompletedPhoto:
 
     photo: Photo  # at its full size
     prediction: BasePrediction
-    choice: Choice
+    choice: ResolvedBase
     views: PlannedViews
     scene: Scene  # its disparity is None for given views and keyframes
     pictures: Mapping[int, Tensor]  # [H, W, 3] uint8 of views that completion has drawn as they are, by index
@@ -143,7 +143,7 @@ class Pipeline:
         done = CompletedPhoto(photo, prediction, choice, views, scene, pictures if views.maker.plain else {})
         return done if scene.by_view is None else _with_farthest_view(done)
 
-    def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, Choice]:
+    def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
         """The photo's Gaussians, and the base that made them; says which one, the focal length and the disparity."""
         name = photo.path.name
         if photo.frame is not None:
@@ -182,7 +182,7 @@ class Pipeline:
         )
         return fill_views(context, cameras if fill.texture != "none" else (), fill.mode, exact, progress)
 
-    def disparity_source(self, choice: Choice) -> str:
+    def disparity_source(self, choice: ResolvedBase) -> str:
         """Who says how far the camera goes."""
         return f"default of {choice.base}" if self.options.path.disparity is None else "--disparity"
 

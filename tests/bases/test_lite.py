@@ -57,7 +57,7 @@ def motorcycle() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return rgb, 1 / (known.where(valid, 1.0) + 31.086), valid  # depth but for its unit; the pair's doffs
 
 
-def test_a_real_photo_comes_out_nearer_to_its_measured_depth_than_by_a_guess_without_looking() -> None:
+def test_depth_of_a_real_photo_beats_a_blind_guess() -> None:
     rgb, depth, valid = motorcycle()
     seen = shipped().inverse_depth(rgb)
     seen = interpolate(seen[None, None], size=depth.shape, mode="bilinear", align_corners=False)[0, 0]
@@ -67,7 +67,7 @@ def test_a_real_photo_comes_out_nearer_to_its_measured_depth_than_by_a_guess_wit
     assert found.delta > 0.8
 
 
-def test_a_mirrored_photo_has_nearly_the_mirrored_depth_and_quite_where_all_sizes_are_seen_both_ways() -> None:
+def test_a_mirrored_photo_has_mirrored_depth() -> None:
     rgb, *_ = motorcycle()
     seen, mirrored = (shipped().inverse_depth(picture).log() for picture in (rgb, rgb.flip(1)))
     assert float((mirrored - seen.flip(1)).abs().mean()) < 0.02
@@ -95,7 +95,7 @@ def test_a_photo_of_any_shape_has_finite_depth(shape: tuple[int, int]) -> None:
     assert bool(torch.isfinite(shipped().inverse_depth(small)).all())
 
 
-def test_stored_weights_are_small_and_those_of_the_networks_but_for_rounding(tmp_path: Path) -> None:
+def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
     """Steps of 1/127 of an output's largest weight: half of that is the most that one can be off."""
     assert SHIPPED.stat().st_size <= 12_000_000
     assert [network.encoder.size for network in load_networks(SHIPPED)] == ["lite0", "lite2"]
@@ -116,7 +116,7 @@ def test_stored_weights_are_small_and_those_of_the_networks_but_for_rounding(tmp
         torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=1e-6, atol=1e-9)
 
 
-def test_each_look_is_by_its_own_network_and_one_network_alone_does_without_the_others() -> None:
+def test_each_input_scale_has_its_network() -> None:
     networks, rgb = [some_network("lite0", 1), some_network("lite0", 2)], motorcycle()[0][:96, :128]
     seen = LiteBase(networks, torch.device("cpu")).at_scales(rgb, INPUT_SCALES)
     alone = [LiteBase([network], torch.device("cpu")) for network in networks]

@@ -23,7 +23,7 @@ import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite import LiteBase
-from spackle.bases.open import KINDS, BaseError, BaseSettings, Choice, open_base
+from spackle.bases.open import KINDS, BaseError, BaseSettings, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
@@ -75,7 +75,7 @@ def broken_portrait(path: Path) -> Path:
     return portraits.write(path, portraits.gdepth_jpeg(image[:60] + bytes(30) + image[90:]))
 
 
-def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, Choice]:
+def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
     """A photo's Gaussians by a base that is opened for it alone."""
     return open_base(BaseSettings(**settings), ([] if log is None else log).append).predict(load_photo(path))
 
@@ -165,7 +165,7 @@ def test_other_weights_of_lite_and_one_choice_for_a_whole_clip(tmp_path: Path, p
 # Whose lens counts.
 
 
-def test_a_persons_focal_length_beats_the_map_which_beats_the_photo(tmp_path: Path) -> None:
+def test_focal_length_of_person_then_map_then_photo(tmp_path: Path) -> None:
     photo, disparity = write_photo(tmp_path / "im0.png"), tmp_path / "disp0.npy"
     np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
     calibration(tmp_path / "calib.txt", 80, 200, 1.5)
@@ -186,7 +186,7 @@ def test_a_persons_focal_length_beats_the_map_which_beats_the_photo(tmp_path: Pa
     assert open_base(BaseSettings(depth=loaded)).predict(twice_as_fine)[0].camera.focal[0] == 80
 
 
-def test_a_persons_focal_length_beats_that_of_the_depth_in_the_photo(tmp_path: Path) -> None:
+def test_focal_length_of_person_then_depth_in_the_photo(tmp_path: Path) -> None:
     matrix = (70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0)
     data = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp(matrix=matrix))
     photo = portraits.write(tmp_path / "photo.jpg", data)
@@ -320,7 +320,7 @@ def test_what_a_base_has_no_use_for_is_refused(settings: dict[str, Any], option:
 # What results say of a base.
 
 
-def test_a_models_folder_counts_by_its_files_and_not_by_its_place(tmp_path: Path) -> None:
+def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
     settings = BaseSettings(f"hf:{folder}")
     assert set(settings.files) == {"config.json", "model.safetensors"}
@@ -346,7 +346,7 @@ def test_tables_call_weights_apples_where_name_and_size_are(tmp_path: Path, monk
 # In Python.
 
 
-def test_python_takes_depth_or_a_base_and_photos_that_have_no_file(tmp_path: Path, photo: Path) -> None:
+def test_python_takes_depth_or_a_base_and_photos_without_file(tmp_path: Path, photo: Path) -> None:
     loaded = load_photo(photo)
     drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
     scene = spackle.predict(loaded, network=None)

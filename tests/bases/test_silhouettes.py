@@ -96,7 +96,7 @@ def test_a_mixed_pixel_is_taken_apart_and_put_together_again() -> None:
         assert float(seen.rgb[wall].amin()) > 0.42  # nothing of the box's colour stays on the wall
 
 
-def test_a_fringe_that_a_camera_has_sharpened_goes_with_the_thing() -> None:
+def test_a_sharpened_fringe_goes_with_the_thing() -> None:
     """Brighter than the wall along a dark box; on the wall it would be a thin line as soon as the camera moves."""
     scene = blended()
     scene.rgb[:, 31][scene.depth[:, 32] < 3] = torch.tensor([1.0, 1.0, 0.9])
@@ -137,7 +137,7 @@ def test_a_mixture_is_what_the_renderer_shows() -> None:
 
 
 @pytest.mark.parametrize("cells", [2, 3, 7])
-def test_there_are_never_more_gaussians_than_three_for_two_pixels(cells: int) -> None:
+def test_at_most_three_gaussians_for_two_pixels(cells: int) -> None:
     """Also where every pixel is beside a step."""
     y, x = torch.meshgrid(torch.arange(42) // cells, torch.arange(50) // cells, indexing="ij")
     near = ((x + y) % 2).bool()
@@ -147,7 +147,7 @@ def test_there_are_never_more_gaussians_than_three_for_two_pixels(cells: int) ->
     assert float(CPU.render(base, Camera.from_focal(60, 50, 42)).alpha.min()) > 0.95
 
 
-def test_a_surface_without_steps_has_one_layer_that_gives_the_photo_back() -> None:
+def test_a_surface_without_steps_has_one_layer() -> None:
     scene = slanted_plane(2, 4, 1)
     counts = []
     for levels in (0, LEVELS):

@@ -80,7 +80,7 @@ def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, shipped: Path, hub: li
     assert [asked["model"] for asked in hub] == [str(model)]
 
 
-def test_a_photo_that_a_model_cannot_work_on_is_passed_over_and_too_little_memory_stops(
+def test_a_dataset_skips_bad_photos_and_stops_without_memory(
     tmp_path: Path, hub: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work = StandIn.predict
@@ -119,9 +119,7 @@ def test_an_evaluation_of_lite_and_of_a_model(
     assert hub == [{"model": "me/small", "precision": "fp32", "device": None}]
 
 
-def test_where_results_must_say_what_they_are_of_auto_is_refused_and_sharp_the_default(
-    tmp_path: Path, stereo: Path
-) -> None:
+def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: Path) -> None:
     root = ("--dataset", "middlebury", "--root", stereo, "-o", tmp_path / "out", "--base", "auto")
     for result in (
         build(tmp_path, "--base", "auto"),
@@ -166,7 +164,7 @@ def test_a_folder_is_done_again_when_better_weights_come(
     assert [base(), base()] == ["lite", "done already"]
 
 
-def test_the_base_says_how_far_the_camera_goes_unless_a_person_does(tmp_path: Path) -> None:
+def test_disparity_of_the_person_then_of_the_base(tmp_path: Path) -> None:
     photo = write_photo(tmp_path / "photo.png")
     depth = ("--depth", write_depth(tmp_path / "d.npy"))
     for options, far, who in (
@@ -220,7 +218,7 @@ def test_results_of_sharp_that_give_way_to_lite_are_named(
 
 
 @pytest.mark.parametrize("when", ["load", "predict"])
-def test_results_for_want_of_memory_are_tried_again_the_next_time(
+def test_results_after_short_memory_are_tried_again(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     def hungry(*args: object, **options: object) -> None:

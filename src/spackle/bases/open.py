@@ -202,7 +202,7 @@ class BaseSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
+class ResolvedBase:
     """The base that a photo got, and why."""
 
     base: str
@@ -317,7 +317,7 @@ class OpenedBase:
         self.candidates, self._log, self.fingerprints = candidates, log, fingerprints
         self.notes: set[str] = set()  # on earlier photos' choices
 
-    def predict(self, photo: Photo, depth: Depth = None) -> tuple[BasePrediction, Choice]:
+    def predict(self, photo: Photo, depth: Depth = None) -> tuple[BasePrediction, ResolvedBase]:
         """A photo's Gaussians, and the base that made them.
 
         Args:
@@ -334,7 +334,7 @@ class OpenedBase:
         """The first half of `predict`: loads the base, and the photo's depth if the base takes any."""
         return PhotoBase(self, photo, depth, log or self._log)
 
-    def only(self, choice: Choice) -> OpenedBase:
+    def only(self, choice: ResolvedBase) -> OpenedBase:
         """The chosen base for all further photos, such as the frames of a clip, without a fallback."""
         return OpenedBase([c for c in self.candidates if c.name == choice.base], self._log, self.fingerprints)
 
@@ -365,7 +365,7 @@ class PhotoBase:
                 self._fall_back(error, for_good=True)
         return self._base
 
-    def predict(self, progress: Progress | None = None) -> tuple[BasePrediction, Choice]:
+    def predict(self, progress: Progress | None = None) -> tuple[BasePrediction, ResolvedBase]:
         """The photo's Gaussians by the first candidate that works; raises as `OpenedBase.predict` does."""
         while True:
             base = self.load()
@@ -384,7 +384,7 @@ class PhotoBase:
         if len(self._opened.candidates) == 1 or note in self._opened.notes:
             note = ""
         self._opened.notes.add(note)
-        return prediction, Choice(base.name, why, tuple(self._failures), not self._short, note)
+        return prediction, ResolvedBase(base.name, why, tuple(self._failures), not self._short, note)
 
     def _fall_back(self, error: InputError, *, for_good: bool) -> None:
         """Log the error and go on with the next candidate, for all photos if for good; raise it at the last one."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import spackle
-from spackle.bases.open import Choice, OpenedBase
+from spackle.bases.open import OpenedBase, ResolvedBase
 from spackle.bases.protocol import BasePrediction
 from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
@@ -121,7 +121,7 @@ class _FirstBase:
 
     def __init__(self, base: OpenedBase, clip: Clip, reporter: Reporter) -> None:
         self._base, self._clip, self._reporter = base, clip, reporter
-        self.first: tuple[Photo, BasePrediction, Choice] | None = None
+        self.first: tuple[Photo, BasePrediction, ResolvedBase] | None = None
 
     def predict(self, photo: Photo) -> BasePrediction:
         """A frame's Gaussians."""
