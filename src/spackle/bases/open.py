@@ -36,6 +36,11 @@ ROUGH = (
     "rough geometry; for better: --depth FILE, `spackle weights get depth` (99 MB, Apache-2.0), "
     "or `spackle weights get sharp` (2.8 GB, research only)"
 )
+DOWNLOADS = {  # what to do without the weights of a base
+    "sharp": "no weights on this machine: `spackle weights get sharp` downloads them "
+    "(2.8 GB, for research only), -c FILE takes a local copy",
+    "depth": "not on this machine: `spackle weights get depth` downloads it (99 MB, Apache-2.0)",
+}
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
 Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named as the photos
@@ -74,10 +79,7 @@ KINDS = {
         f"Spackle's own small depth networks, from the photo alone, lifted; {NOT_SHARP}",
         _OWN_DEPTH | {"--precision": "always computes in fp32", "--sharp": "is fast as it is"},
     ),
-    ANY_HF: BaseKind(
-        f"a depth model of transformers, from the photo alone, lifted; {NOT_SHARP}",
-        _MODELS,
-    ),
+    ANY_HF: BaseKind(f"a depth model of transformers, from the photo alone, lifted; {NOT_SHARP}", _MODELS),
 }
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.network)
 NO_DEPTH = (
@@ -190,15 +192,8 @@ class BaseSettings:
         check_windows("--sharp windows", self.windows)
         if self.calib is not None and self.depth is None:
             raise InputError(f"--calib {self.calib}: is for a disparity map: give that with --depth")
-        if self.named == "sharp" and not self.files:
-            raise InputError(
-                "--base sharp: no weights on this machine: `spackle weights get sharp` downloads them "
-                "(2.8 GB, for research only), -c FILE takes a local copy"
-            )
-        if self.named == "depth" and not self.files:
-            raise InputError(
-                "--base depth: not on this machine: `spackle weights get depth` downloads it (99 MB, Apache-2.0)"
-            )
+        if self.named in DOWNLOADS and not self.files:
+            raise InputError(f"--base {self.named}: {DOWNLOADS[self.named]}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -263,28 +258,22 @@ def open_loaded(base: Base) -> OpenedBase:
 
 def _load(name: str, settings: BaseSettings, files: Mapping[str, Path], prints: Mapping[str, str]) -> Base | None:
     """A network, None if it is not installed; BaseError if its files have changed since the base was opened."""
-    downloaded = files.get({"sharp": "checkpoint", "depth": "depth weights"}.get(name, ""))
-    if name in ("sharp", "depth") and downloaded is None:
-        return None
-    if downloaded is not None:
-        check_undamaged(downloaded)
-    device = None if settings.device == "auto" else settings.device
+    device, precision = None if settings.device == "auto" else settings.device, settings.precision
     base: Base
     if name == "lite":
         base = lite.LiteBase.load(settings.checkpoint if settings.named == name else None, device=device)
     elif name.startswith(HF):
-        base = HfBase.load(name.removeprefix(HF), device=device, precision=settings.precision)
-    elif name == "depth":
-        folder = str(files["depth weights"].parent)
-        base = HfBase.load(folder, device=device, precision=settings.precision, name=name)
+        base = HfBase.load(name.removeprefix(HF), device=device, precision=precision)
     else:
-        base = SharpBase.load(
-            files["checkpoint"],
-            precision=settings.precision,
-            windows=settings.windows,
-            compiled=settings.compiled,
-            device=device,
-        )
+        file = files.get("checkpoint" if name == "sharp" else "depth weights")
+        if file is None:
+            return None
+        check_undamaged(file)
+        if name == "depth":
+            base = HfBase.load(str(file.parent), device=device, precision=precision, name=name)
+        else:
+            windows, compiled = settings.windows, settings.compiled
+            base = SharpBase.load(file, precision=precision, windows=windows, compiled=compiled, device=device)
     if {title: fingerprint(file, title) for title, file in settings.files.items()} != prints:
         raise BaseError(f"{', '.join(map(str, files.values()))}: changed while this was running: start again")
     return base
