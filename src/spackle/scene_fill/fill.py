@@ -296,6 +296,6 @@ class _Stage:
     def look_again(self, new: Gaussians) -> Rendering:
         """Add Gaussians, and look from the last camera: only tiles that they touch are drawn."""
         self.add(new)
-        tiles = touched_tiles(self._sets[-1], self._camera)
+        tiles = touched_tiles(new, self._camera)
         self._drawn = self._renderer.render(self._sets, self._camera, tiles=tiles, onto=self._drawn)
         return self._drawn.to(PROCESSOR)
