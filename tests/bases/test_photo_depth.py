@@ -418,7 +418,7 @@ def test_extended_xmp_with_missing_mixed_and_foreign_parts(tmp_path: Path) -> No
     [
         (b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "document type"),
         ('<?xml version="1.0" encoding="utf-16"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'.encode("utf-16"), "XMP"),
-        (b"<a>" + b"<b/>" * 30_000 + b"</a>", "too large"),
+        (b"<a>" + b"<b/>" * 30_000 + b"</a>", "too large or too deep"),
         (b"<a><b></a>", "cannot be read"),
         (b"", "cannot be read"),
     ],
@@ -436,8 +436,7 @@ def test_hostile_xmp(tmp_path: Path, hostile: bytes, why: str) -> None:
         refused(tmp_path, portraits.with_segments(photo, portraits.xmp_segment(main)), why)
         packet = hostile + b"<!-- http://ns.apple.com/pixeldatainfo/1.0/ -->"
         refused(tmp_path, portraits.apple_jpeg(codes(), packet), why)
-        if b"\0" not in hostile:  # a packet in a HEIF is found by its outermost element
-            refused(tmp_path, portraits.heic(codes(), b"<x:xmpmeta>" + packet + b"</x:xmpmeta>"), "XMP")
+        refused(tmp_path, portraits.heic(codes(), packet), why)
 
 
 def test_huge_announced_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -464,7 +463,7 @@ def test_huge_announced_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
-    start = time.process_time()
+    start = time.perf_counter()
     fill = b"\xff\xd8\xff" + b"\xff" * 3_000_000
     tiny = b"\xff\xd8" + b"\xff\xe5\x00\x02" * 700_000
     scans = portraits.dynamic_jpeg(png(codes()))
@@ -478,7 +477,7 @@ def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
             load_photo_depth(path)
         except InputError:
             continue
-    assert time.process_time() - start < 10
+    assert time.perf_counter() - start < 5
 
 
 # Bytes of chance.

@@ -23,41 +23,53 @@ from spackle.image import LENSES, check_pixels
 Array = NDArray[Any]
 
 
+@dataclasses.dataclass(frozen=True)
+class Turn:
+    """Rows and columns swapped first, then mirrored."""
+
+    transpose: bool = False
+    mirror_x: bool = False  # left and right
+    mirror_y: bool = False  # top and bottom
+
+    def grid(self, values: Tensor) -> Tensor:
+        """[H, W] to [H, W] or [W, H]."""
+        values = values.T if self.transpose else values
+        axes = [axis for axis, mirrored in enumerate((self.mirror_y, self.mirror_x)) if mirrored]
+        return values.flip(axes).contiguous()
+
+    def matrix(self, K: Tensor, width: int, height: int) -> Tensor:
+        """Intrinsics [3, 3] of a width×height map, after the turn."""
+        (fx, cx), (fy, cy) = (float(K[0, 0]), float(K[0, 2])), (float(K[1, 1]), float(K[1, 2]))
+        if self.transpose:
+            fx, cx, fy, cy, width, height = fy, cy, fx, cx, height, width
+        cx = width - cx if self.mirror_x else cx
+        cy = height - cy if self.mirror_y else cy
+        return K.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def then(self, after: Turn) -> Turn:
+        """This turn followed by another."""
+        x, y = (self.mirror_y, self.mirror_x) if after.transpose else (self.mirror_x, self.mirror_y)
+        return Turn(self.transpose != after.transpose, x != after.mirror_x, y != after.mirror_y)
+
+
+UPRIGHT = Turn()
+# How a picture with this EXIF orientation is turned upright.
+BY_ORIENTATION = {
+    2: Turn(mirror_x=True),
+    3: Turn(mirror_x=True, mirror_y=True),
+    4: Turn(mirror_y=True),
+    5: Turn(transpose=True),
+    6: Turn(transpose=True, mirror_x=True),
+    7: Turn(transpose=True, mirror_x=True, mirror_y=True),
+    8: Turn(transpose=True, mirror_y=True),
+}
+# HEIF's `irot`: so many quarter turns anticlockwise. Its `imir`: 0 swaps top and bottom, 1 left and right.
+BY_IROT = (UPRIGHT, BY_ORIENTATION[8], BY_ORIENTATION[3], BY_ORIENTATION[6])
+BY_IMIR = (BY_ORIENTATION[4], BY_ORIENTATION[2])
+
+
 class BrokenDepth(Exception):
     """A photo has a depth map that cannot be used; the message completes "the depth map in the photo …"."""
-
-
-@contextmanager
-def decoding() -> Iterator[None]:
-    """BrokenDepth for whatever a decoder raises over a stranger's bytes; its warnings are not worth a line."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except BrokenDepth:
-        raise
-    except Exception as error:
-        raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
-
-
-def to_number(text: str, name: str) -> float:
-    """A finite number; BrokenDepth with the property's name otherwise."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition('}')[2]}, which is no number")
-    return value
-
-
-def read_codes(picture: bytes) -> tuple[Array, int]:
-    """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
-    with decoding(), Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
-        check_pixels(*image.size, len(picture), "it")
-        if image.mode.startswith("I"):
-            return np.asarray(image).astype(np.uint16), 65535
-        return np.asarray(image.convert("L")), 255
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,8 +110,8 @@ class Lens:
     center: tuple[float, float]
     size: tuple[float, float]  # (width, height)
 
-    def matrix(self, width: int, height: int, turn: str) -> Tensor | None:
-        """[3, 3] for a width×height map, after its turn; None where the numbers cannot be this map's."""
+    def matrix(self, width: int, height: int) -> Tensor | None:
+        """[3, 3] for a width×height map; None where the numbers cannot be this map's: the photo's own lens counts."""
         numbers = (*self.focal, *self.center, *self.size)
         if not all(map(math.isfinite, numbers)) or min(self.size) <= 0:
             return None
@@ -111,19 +123,7 @@ class Lens:
             return None
         x, y = width / self.size[0], height / self.size[1]
         fx, fy, cx, cy = self.focal[0] * x, self.focal[1] * y, self.center[0] * x, self.center[1] * y
-        for step in turn:
-            if step == "t":
-                fx, cx, fy, cy, width, height = fy, cy, fx, cx, height, width
-            cx = width - cx if step == "x" else cx
-            cy = height - cy if step == "y" else cy
         return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def turned(values: Tensor, turn: str) -> Tensor:
-    """[H, W] to [H, W] or [W, H] by the steps of a turn, see `containers.BY_ORIENTATION`."""
-    for step in turn:
-        values = values.T if step == "t" else values.flip(1 if step == "x" else 0)
-    return values.contiguous()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +135,29 @@ class CodedDepth:
     scale: Scale
     source: str  # whose layout, of what quantity, how far to be trusted: for the report
     lens: Lens | None = None
-    decoded_turn: str = ""  # what the decoder has done to the codes, but not to the lens
-    turn: str = ""  # what is still to do to get to the photo as Pillow opens it
+    turned: Turn = UPRIGHT  # what the decoder has done to the codes, but not to the lens
+    turn: Turn = UPRIGHT  # what is still to do to get to the photo as Pillow opens it
     along_ray: bool = False  # distances from the eye instead of z
     unit_known: bool = True
+
+
+def read_codes(picture: bytes) -> tuple[Array, int]:
+    """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
+    with decoding(), Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+        check_pixels(*image.size, len(picture), "it")
+        if image.mode.startswith("I"):
+            return np.asarray(image).astype(np.uint16), 65535
+        return np.asarray(image.convert("L")), 255
+
+
+@contextmanager
+def decoding() -> Iterator[None]:
+    """BrokenDepth for whatever a decoder raises over a stranger's bytes; its warnings are not worth a line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except BrokenDepth:
+        raise
+    except Exception as error:
+        raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-import io
+import mmap
+import os
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -15,35 +16,31 @@ from PIL import Image
 
 from spackle.bases.depth_map import ASPECT_TOLERANCE, DepthMap, Quantity, StrPath, is_depth
 from spackle.bases.photo_depth.coded import (
+    BY_ORIENTATION,
+    UPRIGHT,
     Array,
     BrokenDepth,
     CodedDepth,
     Lens,
     Scale,
+    Turn,
     decoding,
     read_codes,
-    to_number,
-    turned,
 )
 from spackle.bases.photo_depth.containers import (
-    BY_ORIENTATION,
-    DEPTH_TYPES,
+    Bytes,
+    MalformedBoxes,
     Node,
-    Segments,
     end_of_picture,
-    extended_xmp,
-    find,
-    find_number,
+    extended_xmp_of,
+    find_depth_item,
     further_pictures,
-    get,
-    heif_turns,
-    main_xmp,
     parse_xmp,
-    segments_of,
-    xmp_packets,
+    to_number,
+    xmp_of,
 )
 from spackle.camera import Camera
-from spackle.errors import reading
+from spackle.errors import InputError
 from spackle.files import check_file
 from spackle.image import DEFAULT_FOCAL_MM, check_pixels, film_to_pixels, focal_from_exif, read_image
 
@@ -62,30 +59,34 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     Raises:
         InputError: a missing file, or a photo whose depth map is broken or of another crop.
     """
-    check_file(path, "photo")
-    problem = "the depth map in the photo {reason}: give another one with --depth FILE, or use --base lite"
-    with reading(path, problem, BrokenDepth), reading(path, "cannot be read: {reason}", OSError):
-        data = Path(path).read_bytes()
-        if data[4:8] == b"ftyp" and any(kind in data for kind in DEPTH_TYPES):
-            coded = find_in_heif(data)
-        elif data.startswith(b"\xff\xd8\xff"):
-            segments = segments_of(data)
-            coded = find_apple(data, segments) or find_android(data, segments)
-        else:
-            return None
+    if check_file(path, "photo") < 12:
+        return None
+    try:
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if data[:3] == b"\xff\xd8\xff":
+                coded = find_apple(data) or find_android(data)
+            else:
+                coded = find_in_heif(data, path) if data[4:8] == b"ftyp" else None
         return None if coded is None else _depth_map(coded, path)
+    except BrokenDepth as error:
+        raise InputError(
+            f"{path}: the depth map in the photo {error}: give another one with --depth FILE, or use --base lite"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
 
 
 def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
     photo_width, photo_height, photo_turn, focal = read_image(path, _photo_header)
+    turn = coded.turn.then(photo_turn)
     stored, quantum = coded.scale.decode(coded.codes, coded.full)
-    depth = turned(torch.from_numpy(stored), coded.turn + photo_turn)
+    depth = turn.grid(torch.from_numpy(stored))
     height, width = depth.shape
     if abs(width * photo_height / (height * photo_width) - 1) > ASPECT_TOLERANCE:
         raise BrokenDepth(f"has {width}×{height} pixels but the photo {photo_width}×{photo_height}, another crop")
-    before = coded.codes.shape[:: 1 if "t" in coded.decoded_turn else -1]
-    turn = coded.decoded_turn + coded.turn + photo_turn
-    K = None if coded.lens is None else coded.lens.matrix(before[0], before[1], turn)
+    before = coded.codes.shape[:: 1 if coded.turned.transpose else -1]
+    K = None if coded.lens is None else coded.lens.matrix(*before)
+    K = None if K is None else coded.turned.then(turn).matrix(K, *before)
     if coded.along_ray:
         own = Camera.from_focal(focal, photo_width, photo_height).resized(width, height)
         camera = own if K is None else Camera(K, torch.eye(4), width, height)
@@ -105,20 +106,20 @@ def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
     return DepthMap(metres.where(valid, 0.0), valid, K, quantum, coded.scale.quantity, Path(path), f"{note})")
 
 
-def _photo_header(image: Image.Image) -> tuple[int, int, str, float]:
+def _photo_header(image: Image.Image) -> tuple[int, int, Turn, float]:
     """Upright width and height of the photo, the turn of its stored pixels, and its focal length in pixels."""
     try:
         exif = image.getexif()
-        turn, tags = BY_ORIENTATION.get(exif.get(_ORIENTATION, 1), ""), {**exif, **exif.get_ifd(_EXIF_IFD)}
+        orientation, tags = exif.get(_ORIENTATION, 1), {**exif, **exif.get_ifd(_EXIF_IFD)}
+        turn = BY_ORIENTATION.get(orientation, UPRIGHT)
     except Exception:  # unreadable EXIF says nothing about the orientation
-        turn, tags = "", {}
-    width, height = image.size[::-1] if "t" in turn else image.size
+        turn, tags = UPRIGHT, {}
+    width, height = image.size[::-1] if turn.transpose else image.size
     focal = focal_from_exif(tags, width, height) or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
     return width, height, turn, focal
 
 
-PIXELS, DEPTH = "{http://ns.apple.com/pixeldatainfo/1.0/}", "{http://ns.apple.com/depthData/1.0/}"
-RDF_ITEM = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"
+PIXELS, DEPTH = "http://ns.apple.com/pixeldatainfo/1.0/ ", "http://ns.apple.com/depthData/1.0/ "
 
 # Core Video's formats of depth maps, half and full floats; any other is a matte, a gain map or a mask.
 _FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep": "depth", "fdep": "depth"}
@@ -127,10 +128,10 @@ _FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep
 Description = tuple[Scale | None, Lens | None, str]  # the scale if XMP gives the range, the lens, the source
 
 
-def find_apple(data: bytes, segments: Segments) -> CodedDepth | None:
+def find_apple(data: Bytes) -> CodedDepth | None:
     """The depth map among the further pictures of a JPEG, told from the others by its XMP."""
-    for begin, end in further_pictures(data, segments):
-        if (described := describe(main_xmp(segments_of(data[begin:end])))) is None:
+    for begin, end in further_pictures(data):
+        if (described := describe(xmp_of(data, begin))) is None:
             continue
         scale, lens, source = described
         if scale is None:
@@ -144,82 +145,82 @@ def find_apple(data: bytes, segments: Segments) -> CodedDepth | None:
 
 def describe(packet: bytes) -> Description | None:
     """What an XMP packet says of a depth map; None where it is about something else."""
-    if PIXELS.strip("{}").encode() not in packet:
+    if PIXELS.encode().strip() not in packet:
         return None
     tree = parse_xmp(packet)
     if (quantity := _quantity(tree)) is None:
         return None
-    first, last = (find_number(tree, f"{PIXELS}Float{end}Value") for end in ("Min", "Max"))
-    lowest, highest = (find_number(tree, f"{PIXELS}Int{end}Value") for end in ("Min", "Max"))
+    first, last = (tree.number(f"{PIXELS}Float{end}Value") for end in ("Min", "Max"))
+    lowest, highest = (tree.number(f"{PIXELS}Int{end}Value") for end in ("Min", "Max"))
     scale = None if first is None or last is None else Scale(quantity, first, last, lowest or 0.0, highest)
-    accuracy = find(tree, f"{DEPTH}Accuracy")
+    accuracy = tree.find(f"{DEPTH}Accuracy")
     source = f"Apple {quantity}, {accuracy if accuracy in ('absolute', 'relative') else 'of unknown accuracy'}"
     return scale, _apple_lens(tree), source
 
 
 def _quantity(tree: Node) -> Quantity | None:
-    native, kind = find(tree, f"{PIXELS}NativeFormat"), find(tree, f"{PIXELS}AuxiliaryImageType")
+    native, kind = tree.find(f"{PIXELS}NativeFormat"), tree.find(f"{PIXELS}AuxiliaryImageType")
     if native is not None:
         if native.isascii() and native.isdigit() and len(native) <= 10:  # four characters, written as the number
             native = int(native).to_bytes(5, "big")[1:].decode("latin-1")
         return _FORMATS.get(native)
-    if find(tree, f"{PIXELS}AuxiliaryImageSubType") is not None:  # the mattes: they too are of type "depth"
+    if tree.find(f"{PIXELS}AuxiliaryImageSubType") is not None:  # the mattes: they too are of type "depth"
         return None
     return "disparity" if kind == "disparity" else "depth" if kind == "depth" else None
 
 
 def _apple_lens(tree: Node) -> Lens | None:
     """The intrinsics, which are listed column by column."""
-    matrix = next((each for each in tree.iter(f"{DEPTH}IntrinsicMatrix")), None)
+    matrix = tree.numbers(f"{DEPTH}IntrinsicMatrix")
     try:
-        entries = [] if matrix is None else [to_number(item.text or "", "matrix") for item in matrix.iter(RDF_ITEM)]
-        width, height = (find_number(tree, f"{DEPTH}IntrinsicMatrixReference{side}") for side in ("Width", "Height"))
+        size = [tree.number(f"{DEPTH}IntrinsicMatrixReference{side}") for side in ("Width", "Height")]
     except BrokenDepth:  # the map can do without
         return None
-    if len(entries) != 9 or width is None or height is None:
+    if len(matrix) != 9 or size[0] is None or size[1] is None:
         return None
-    fx, _, _, _, fy, _, cx, cy, _ = entries
-    return Lens((fx, fy), (cx, cy), (width, height))
+    fx, _, _, _, fy, _, cx, cy, _ = matrix
+    return Lens((fx, fy), (cx, cy), (size[0], size[1]))
 
 
-GDEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
-MAP, MODEL, ITEM = (f"{{http://ns.google.com/photos/dd/1.0/{name}/}}" for name in ("depthmap", "imagingmodel", "item"))
+GDEPTH = "http://ns.google.com/photos/1.0/depthmap/ "
+DYNAMIC = "http://ns.google.com/photos/dd/1.0/{}/ "
+MAP, MODEL, ITEM = (DYNAMIC.format(name) for name in ("depthmap", "imagingmodel", "item"))
 
 _UNITS_M = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
 _PICTURE_STARTS = (b"\xff\xd8\xff", b"\x89PNG")
 
 
-def find_android(data: bytes, segments: Segments) -> CodedDepth | None:
+def find_android(data: Bytes) -> CodedDepth | None:
     """The depth map that a JPEG's XMP holds or points to."""
-    main = main_xmp(segments)
-    extended, complete = extended_xmp(segments)
-    if not any(name.strip("{}").encode() in packet for name in (GDEPTH, MAP) for packet in (main, extended)):
+    main = xmp_of(data)
+    extended, complete = extended_xmp_of(data, main)
+    if not any(name.encode().strip() in packet for name in (GDEPTH, MAP) for packet in (main, extended)):
         return None
     if not complete:
         raise BrokenDepth("is cut off: a part of the photo's extended XMP is missing")
     tree = parse_xmp(main)
     if extended:
-        tree.append(parse_xmp(extended))
-    for node in tree.iter():
-        uri = get(node, f"{MAP}DepthURI")
-        if uri is not None and (get(node, f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
+        tree.children.append(parse_xmp(extended))
+    for node in tree.walk():
+        uri = node.get(f"{MAP}DepthURI")
+        if uri is not None and (node.get(f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
             return _coded(node, MAP, _item(data, tree, uri), "Dynamic Depth", _android_lens(tree))
-    text = find(tree, f"{GDEPTH}Data")
+    text = tree.find(f"{GDEPTH}Data")
     # Editors that drop the extended XMP leave the rest behind: a photo whose depth is gone has none.
     return None if text is None else _coded(tree, GDEPTH, _decoded(text), "GDepth", None)
 
 
 def _coded(node: Node, space: str, picture: bytes, layout: str, lens: Lens | None) -> CodedDepth:
-    near, far = find_number(node, f"{space}Near"), find_number(node, f"{space}Far")
+    near, far = node.number(f"{space}Near"), node.number(f"{space}Far")
     if near is None or far is None:
         raise BrokenDepth("does not say its range: Near or Far is missing")
-    unit = (find(node, f"{space}Units") or "").lower()
+    unit = (node.find(f"{space}Units") or "").lower()
     # A Pixel says diopters of what grows from near to far, and so is none: the order counts, not the unit.
     known = unit in _UNITS_M or (unit == "diopters" and near > far)
     metre = _UNITS_M.get(unit, 1.0) if known else 1.0
-    style = (find(node, f"{space}Format") or "").lower()
+    style = (node.find(f"{space}Format") or "").lower()
     scale = _scale(style, near * metre, far * metre, diopters=known and unit == "diopters")
-    along_ray = (find(node, f"{space}MeasureType") or "").lower() == "opticray"
+    along_ray = (node.find(f"{space}MeasureType") or "").lower() == "opticray"
     source = f"{layout}, in {unit}" if known else f"{layout}, unit unknown"
     codes, full = read_codes(picture)
     return CodedDepth(codes, full, scale, source, lens, along_ray=along_ray, unit_known=known)
@@ -245,14 +246,14 @@ def _decoded(text: str) -> bytes:
         raise BrokenDepth(f"is not readable as base64 ({error})") from error
 
 
-def _item(data: bytes, tree: Node, uri: str) -> bytes:
+def _item(data: Bytes, tree: Node, uri: str) -> bytes:
     """The bytes of a directory entry; they are appended to the primary picture in the directory's order."""
-    entries = [node for node in tree.iter() if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None]
-    index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
+    entries = [node for node in tree.walk() if (node.get(f"{ITEM}Mime") or node.get(f"{ITEM}Length")) is not None]
+    index = next((i for i, node in enumerate(entries) if node.get(f"{ITEM}DataURI") == uri), None)
     if index is None:
         raise BrokenDepth("is named by its XMP, but missing from the photo's directory of items")
     lengths, paddings = (
-        [int(to_number(get(node, f"{ITEM}{name}") or "0", f"{ITEM}{name}")) for node in entries]
+        [int(to_number(node.get(f"{ITEM}{name}") or "0", f"{ITEM}{name}")) for node in entries]
         for name in ("Length", "Padding")
     )
     if min(lengths) < 0 or min(paddings) < 0:
@@ -265,7 +266,7 @@ def _item(data: bytes, tree: Node, uri: str) -> bytes:
     raise BrokenDepth("is cut off, or not where the photo's directory of items has it")
 
 
-def _places(data: bytes, lengths: list[int], paddings: list[int], index: int) -> list[int]:
+def _places(data: Bytes, lengths: list[int], paddings: list[int], index: int) -> list[int]:
     """Where the item may begin: writers disagree on whether lengths include paddings, and on the primary's."""
     places = [len(data) - sum(lengths[index:])]  # counted from the end
     if (end := end_of_picture(data)) is not None:
@@ -277,12 +278,12 @@ def _places(data: bytes, lengths: list[int], paddings: list[int], index: int) ->
 
 def _android_lens(tree: Node) -> Lens | None:
     """The one imaging model, in pixels; its centre may be in shares of the picture, as the specification has it."""
-    models = [node for node in tree.iter() if get(node, f"{MODEL}FocalLengthX") is not None]
+    models = [node for node in tree.walk() if node.get(f"{MODEL}FocalLengthX") is not None]
     if len(models) != 1:
         return None
     names = ("FocalLengthX", "FocalLengthY", "PrincipalPointX", "PrincipalPointY", "ImageWidth", "ImageHeight")
     try:
-        found = [find_number(models[0], f"{MODEL}{name}") for name in names]
+        found = [models[0].number(f"{MODEL}{name}") for name in names]
     except BrokenDepth:  # the map can do without
         return None
     fx, fy, cx, cy, width, height = found
@@ -297,25 +298,34 @@ FULL_CODES = {"L": 255, "I;10": 1023, "I;12": 4095}
 ASSUMED = Scale("disparity", 0.1, 1.0)  # 10 m to 1 m: a portrait's usual range, where a file says none
 
 
-def find_in_heif(data: bytes) -> CodedDepth | None:
+def find_in_heif(data: Bytes, path: str | os.PathLike[str]) -> CodedDepth | None:
     """The auxiliary depth image of the primary picture, in any of the representations of HEVC's depth information."""
+    try:
+        item = find_depth_item(data)
+    except MalformedBoxes:  # whoever decodes the photo will say what is wrong
+        return None
+    if item is None:
+        return None
+    xmp, own_turn, turn = item
+    codes, full, stated = _decode(path)
+    scale, lens, source = describe(xmp) or (None, None, "")
+    if scale is None:  # Apple's words count more than HEVC's
+        scale, source = _meaning(stated)
+    return CodedDepth(codes, full, scale, source, lens, own_turn, turn)
+
+
+def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
+    """Codes [H, W] with the item's own rotation applied, the highest code, and HEVC's depth information."""
     import pillow_heif
 
     with decoding():
-        images = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"]
+        images = pillow_heif.open_heif(os.fspath(path), hdr_to_16bit=False).info["depth_images"]
         if not images:
-            return None
+            raise BrokenDepth("is announced, but missing")
         width, height = images[0].size
-        check_pixels(width, height, len(data), "it")
-        codes: Array = np.array(images[0])
-        full, stated = FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
-    described = [found for packet in xmp_packets(data) if (found := describe(packet)) is not None]
-    scale, lens, source = described[0] if len(described) == 1 else (None, None, "")
-    if scale is None:  # Apple's words count more than HEVC's
-        scale, source = _meaning(stated)
-    own, of_primary = heif_turns(data)
-    # Apple rotates the picture and leaves the map as the sensor saw it.
-    return CodedDepth(codes, full, scale, source, lens, own or "", "" if own is not None else of_primary or "")
+        check_pixels(width, height, os.path.getsize(path), "it")
+        codes = np.array(images[0])
+        return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
 
 
 def _meaning(stated: dict[str, Any]) -> tuple[Scale, str]:
