@@ -218,7 +218,7 @@ def speed(options: argparse.Namespace) -> Iterator[str]:
     tiles = torch.zeros(SIDE // TILE, SIDE // TILE, dtype=torch.bool, device=CUDA)
     tiles[:24, :24] = True
 
-    def again(_: object) -> None:  # what completion does: the scene's projection is remembered
+    def again(_: object) -> None:  # what completion does
         view: Rendering = gpu.render(there, cameras[0])
         gpu.render([there, few], cameras[0], tiles=tiles, onto=view)
 

@@ -16,7 +16,9 @@ from scenes import psnr, same_bits
 
 import spackle
 from spackle.bases.lift import RgbdBase
+from spackle.bases.open import BaseSettings
 from spackle.formats import load_ply_camera
+from spackle.pipeline import Options, complete_photo
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,8 @@ def test_files_names_and_values_are_the_same_input_and_the_base_comes_first(
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)
     assert same_bits(spackle.predict(str(photo), str(depth)).gaussians, scene.gaussians)
+    whole = complete_photo(loaded[0], Options(BaseSettings(depth=depth)))
+    assert same_bits(whole.scene.gaussians, scene.gaussians)
     alone = RgbdBase(loaded[1]).predict(loaded[0])
     assert same_bits(scene.base, alone.gaussians)
     assert len(scene.gaussians) == len(scene.base) + len(scene.aux) > len(scene.base)

@@ -1,7 +1,6 @@
 """The way from a photo to a completed scene: base, camera path, fill. Read `complete_photo` and `Pipeline.complete`.
 
-The command line, Python, the page, datasets and ComfyUI go this way or take its stages: `Pipeline.predict`,
-`spackle.views.plan_views`, `complete`.
+The command line, Python, the page and the demo go this way; ComfyUI takes its last stage, `complete`.
 """
 
 from __future__ import annotations

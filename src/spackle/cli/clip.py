@@ -69,21 +69,20 @@ def predict_clip(
     InputError for a clip, a frame, a depth map or a folder that cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
-    completer = ClipCompleter(
-        options.path.trajectory,
-        options.path.disparity,
-        0,  # frames: known once the clip is read
-        pipeline.renderer,
-        OpenCV("a clip").flow,
-        align=options.base.depth is None,  # measured depth stays as it is
-        fill=options.fill.texture != "none",
-        network=pipeline.network,
-        precision=options.base.precision,
-    )
     with results_folder(folder, FILES, alone=True), whole_set(folder, FILES[-1]) as new:
         with reporter.stage("read") as step:
             clip = read_clip(path, options.path.frames, step)
-        completer.frames = len(clip)
+        completer = ClipCompleter(
+            options.path.trajectory,
+            options.path.disparity,
+            len(clip),
+            pipeline.renderer,
+            OpenCV("a clip").flow,
+            align=options.base.depth is None,  # measured depth stays as it is
+            fill=options.fill.texture != "none",
+            network=pipeline.network,
+            precision=options.base.precision,
+        )
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:
             reporter.log(f"{path.name}: its {clip.hdr} colours are taken as they are, so they may look pale")

@@ -24,6 +24,7 @@ from spackle.files import (
     fingerprint,
     make_folder,
     remove_half_written,
+    write_json,
     write_whole,
 )
 from spackle.progress import Reporter, asked_to_stop
@@ -73,8 +74,7 @@ def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any
     remove_half_written(output, output / IMAGES)
     path, kind = output / CONFIG, config["kind"]
     if not path.exists():
-        content = {"format": FORMAT, **config, "about": about}
-        write_whole(path, (json.dumps(content, indent=1) + "\n").encode())
+        write_json({"format": FORMAT, **config, "about": about}, path)
         return
     with reading(path, "damaged, or not JSON ({reason}): choose another -o"):
         old = json.loads(path.read_text("utf-8"))
