@@ -36,7 +36,8 @@ from spackle.camera_path import DepthRange, trajectory
 from spackle.errors import InputError, check_name
 from spackle.evaluation.motorcycle import load_motorcycle
 from spackle.evaluation.timing import CPU, EXTRA, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
-from spackle.files import make_folder, write_json, write_whole
+from spackle.files import write_json, write_whole
+from spackle.folders import make_folder
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo

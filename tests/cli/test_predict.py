@@ -29,7 +29,7 @@ from safetensors.torch import save_file
 
 import spackle
 from spackle.bases.open import BaseSettings, open_base
-from spackle.files import results_folder
+from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo
 from spackle.pipeline import FillOptions

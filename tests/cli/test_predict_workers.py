@@ -20,7 +20,7 @@ from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 
 from spackle.cli.photos import Predictor
 from spackle.errors import InputError
-from spackle.files import check_mark, mark, results_folder
+from spackle.folders import check_mark, mark, results_folder
 
 FILES = {"base.ply", "scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 

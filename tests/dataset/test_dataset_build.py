@@ -29,7 +29,7 @@ from spackle.dataset.build import Made, Maker
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
-from spackle.files import hold
+from spackle.folders import hold
 from spackle.render import get_renderer
 from spackle.training.data import Supply
 from spackle.training.recipe import DataRecipe

@@ -34,7 +34,7 @@ from spackle.dataset.sample import (
 )
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
-from spackle.files import digest_of
+from spackle.folders import digest_of
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual import hole_mask

@@ -32,7 +32,7 @@ from spackle.dataset.photos import find_photos
 from spackle.dataset.shards import load_manifest, problems
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import get_dataset
-from spackle.files import digest_of
+from spackle.folders import digest_of
 from spackle.formats import load_cameras, load_path, save_ply
 from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
 from spackle.gaussians import Gaussians

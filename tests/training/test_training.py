@@ -20,7 +20,7 @@ from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state
 
-from spackle.files import hold
+from spackle.folders import hold
 from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual.network import ResidualNet, load_residual

@@ -14,7 +14,8 @@ from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
 from spackle.clips.files import Clip, ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
-from spackle.files import file_records, results_folder, whole_set, write_json
+from spackle.files import write_json
+from spackle.folders import file_records, results_folder, whole_set
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.opencv import OpenCV
 from spackle.pipeline import Options, Pipeline

@@ -20,7 +20,8 @@ from spackle.cli.first_use import compiled_ahead
 from spackle.cli.photo import save_views
 from spackle.evaluation.metrics import sharpness
 from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
-from spackle.files import results_folder, write_json
+from spackle.files import write_json
+from spackle.folders import results_folder
 from spackle.formats import save_ply, save_png
 from spackle.image import Photo
 from spackle.pipeline import Options, Pipeline, complete

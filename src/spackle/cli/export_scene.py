@@ -11,7 +11,8 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from spackle.errors import InputError
-from spackle.files import check_writable, results_folder, write_whole
+from spackle.files import check_writable, write_whole
+from spackle.folders import results_folder
 from spackle.formats.ply import PlyFile
 from spackle.formats.scene_files import SceneFile, Writer, writer_of
 from spackle.formats.spz import LARGEST, spz_grid

@@ -16,7 +16,8 @@ import spackle
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
 from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.errors import InputError
-from spackle.files import digest_of, file_records, fingerprint, results_folder, whole_set, write_json
+from spackle.files import fingerprint, write_json
+from spackle.folders import digest_of, file_records, results_folder, whole_set
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
 from spackle.image import load_photo
 from spackle.pipeline import CompletedPhoto, Options, Pipeline

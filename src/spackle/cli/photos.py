@@ -26,7 +26,8 @@ from spackle.cli.photo import (
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
-from spackle.files import as_recorded, check_file, check_mark, files_in, mark, results_folder
+from spackle.files import check_file, files_in
+from spackle.folders import as_recorded, check_mark, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.pipeline import Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop

@@ -15,7 +15,7 @@ from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
-from spackle.files import results_folder
+from spackle.folders import results_folder
 from spackle.formats import load_ply, load_ply_camera, save_png, save_video
 from spackle.formats.ply import load_ply_disparity
 from spackle.formats.video import FORMATS

@@ -18,7 +18,8 @@ from spackle.dataset.sample import pack_sample
 from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
 from spackle.dataset.views import draw_path, open_completion, path_cameras, render_views
 from spackle.errors import InputError, reading
-from spackle.files import differences, fingerprint, make_folder, remove_half_written, results_folder, write_whole
+from spackle.files import fingerprint, write_whole
+from spackle.folders import differences, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import InpainterOptions
 from spackle.progress import Reporter, asked_to_stop, counted, timed

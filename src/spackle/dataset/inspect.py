@@ -17,7 +17,7 @@ from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import load_manifest, problems
 from spackle.errors import InputError, one_line
-from spackle.files import results_folder
+from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
 from spackle.formats.png import thumbnail
 from spackle.progress import Reporter, counted

@@ -14,7 +14,8 @@ from spackle.camera_path import MAX_DISPARITY, TrajectoryKind
 from spackle.dataset.photos import PhotoFile
 from spackle.dataset.views import COMPLETIONS, Completion
 from spackle.errors import InputError, check_name
-from spackle.files import digest_of, fingerprint
+from spackle.files import fingerprint
+from spackle.folders import digest_of
 from spackle.inpaint import INPAINTERS
 from spackle.residual import MASK_THRESHOLD
 from spackle.weights import weights_digest

@@ -14,7 +14,8 @@ from pydantic import BaseModel, Field, model_validator
 
 from spackle.dataset.sample import END, PhotoGroup
 from spackle.errors import InputError, reading
-from spackle.files import atomic_path, digest_of
+from spackle.files import atomic_path
+from spackle.folders import digest_of
 from spackle.progress import Step
 
 NAME = "manifest.json"

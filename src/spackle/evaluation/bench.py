@@ -25,7 +25,7 @@ from spackle.evaluation.rows import NOTE, Row, Run
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.tables import write_tables
 from spackle.evaluation.timing import BASE_PATH, EXTRA, MS, STAGES, TOTAL, Lap, complete_in_laps, measure
-from spackle.files import results_folder
+from spackle.folders import results_folder
 from spackle.machine import hardware, load_average, versions
 from spackle.progress import Reporter
 from spackle.residual import ResidualNet

@@ -24,7 +24,8 @@ from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluatio
 from spackle.evaluation.sheets import BEST, WORST, strip, write_sheets
 from spackle.evaluation.table import NOT_RUN
 from spackle.evaluation.tables import FILES, make_tables, write_tables
-from spackle.files import results_folder, write_whole
+from spackle.files import write_whole
+from spackle.folders import results_folder
 from spackle.formats import save_png
 from spackle.machine import hardware, versions
 from spackle.progress import Reporter

@@ -16,17 +16,8 @@ from spackle.bases.open import BaseError
 from spackle.errors import InputError, reading
 from spackle.evaluation.case import Case
 from spackle.evaluation.rows import PROBLEM, Row, Run
-from spackle.files import (
-    as_recorded,
-    differences,
-    digest_of,
-    file_records,
-    fingerprint,
-    make_folder,
-    remove_half_written,
-    write_json,
-    write_whole,
-)
+from spackle.files import fingerprint, write_json, write_whole
+from spackle.folders import as_recorded, differences, digest_of, file_records, make_folder, remove_half_written
 from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"

@@ -23,7 +23,7 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
 from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
-from spackle.files import digest_of
+from spackle.folders import digest_of
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer

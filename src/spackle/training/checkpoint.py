@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from spackle.errors import InputError, reading, reason_in_a_line
-from spackle.files import NEW, atomic_path
+from spackle.files import atomic_path
+from spackle.folders import NEW
 from spackle.training.recipe import AnyRecipe, differences
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"

@@ -11,7 +11,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from spackle.files import make_folder, write_whole
+from spackle.files import write_whole
+from spackle.folders import make_folder
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of, render_batch
 from spackle.residual.compose import compose

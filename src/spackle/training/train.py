@@ -28,7 +28,8 @@ from torch.optim import AdamW
 
 from spackle.device import pick_device
 from spackle.errors import InputError, reading
-from spackle.files import results_folder, write_json
+from spackle.files import write_json
+from spackle.folders import results_folder
 from spackle.formats import save_png
 from spackle.machine import hardware, versions, without_nan
 from spackle.progress import Reporter, asked_to_stop

@@ -18,7 +18,8 @@ from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.files import check_writable, hold, sha256_of
+from spackle.files import check_writable, sha256_of
+from spackle.folders import hold
 
 TIMEOUT = 30.0  # seconds without a byte
 PAUSES = (1.0, 2.0, 4.0, 8.0)  # seconds before each further try of a connection that broke

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.files import differences
+from spackle.folders import differences
 from spackle.workers.local import QUEUED, J, PhotoWorker, R, Workers, at_work_here
 
 ANSWER_S = 30.0  # for a cluster to answer
