@@ -130,14 +130,14 @@ def compare(ply: Path, reference: Path) -> str:
     import torch
 
     import spackle
-    from spackle.formats import load_ply_camera
+    from spackle.formats import PlyFile
 
     ours, theirs = spackle.load_ply(ply), spackle.load_ply(reference)
     rows = []
     for name in ("means", "covariances", "opacities", "colors"):
         a, b = (g.covariances() if name == "covariances" else getattr(g, name) for g in (ours, theirs))
         rows.append(f"{name} {float((a - b).norm() / b.norm()):.1e}")
-    camera = load_ply_camera(ply)
+    camera = PlyFile(ply).camera()
     assert camera is not None
     eye = torch.tensor([0.05 * float(theirs.means[:, 2].median()), 0.0, 0.0])
     views = {"at the photo": camera, "from the side": camera.looking(eye, torch.tensor([0.0, 0.0, 5.0]))}

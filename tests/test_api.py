@@ -17,7 +17,7 @@ from scenes import psnr, same_bits
 import spackle
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import BaseSettings
-from spackle.formats import load_ply_camera
+from spackle.formats import PlyFile
 from spackle.pipeline import Options, complete_photo
 
 
@@ -74,7 +74,7 @@ def test_files_names_and_values_are_the_same_input_and_the_base_comes_first(
 def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     scene.save(tmp_path / "scene.ply")
     assert read_ply(tmp_path / "scene.ply").count == len(scene.gaussians)
-    loaded, camera = spackle.load_ply(tmp_path / "scene.ply"), load_ply_camera(tmp_path / "scene.ply")
+    loaded, camera = spackle.load_ply(tmp_path / "scene.ply"), PlyFile(tmp_path / "scene.ply").camera()
     assert camera is not None
     assert torch.equal(camera.K, scene.camera.K)
     renderer = spackle.get_renderer()

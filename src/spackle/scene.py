@@ -14,8 +14,8 @@ from spackle.bases.protocol import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind
 from spackle.files import write_whole
-from spackle.formats.ply import save_ply
-from spackle.formats.scene_files import SceneFile, Writer, at_origin, writer_of
+from spackle.formats.ply import PlyFile, save_ply
+from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of
 from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import focal_length
@@ -50,7 +50,7 @@ class Scene:
             focal_px: focal length in pixels; by default what is stored, else that of 30 mm.
             fov: horizontal field of view in degrees, in its place.
         """
-        return Scene.of_file(SceneFile.load(Path(path)), focal_px, fov)
+        return Scene.of_file(PlyFile(path).scene(), focal_px, fov)
 
     @staticmethod
     def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:
@@ -129,9 +129,9 @@ class Scene:
         InputError for another name, and for a scene too large for a format.
         """
         target = Path(path)
-        page: Writer = lambda file, place: write_whole(place, single_html(self.page(place.stem)))  # noqa: E731
+        page: Encoder = lambda file: single_html(self.page(file.path.stem))  # noqa: E731
         file = SceneFile(target, self.gaussians, self.camera, len(self.base), self.disparity)
-        writer_of(target, {".html": page})(file, target)
+        write_whole(target, encoder_of(target, {".html": page})(file))
 
     def show(self, height: int = 480) -> InlinePage:
         """The page with the scene in it, `height` pixels high: the last value of a notebook's cell is shown."""

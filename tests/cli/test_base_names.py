@@ -22,7 +22,7 @@ from spackle.bases.sharp import SharpBase
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort
 from spackle.errors import InputError
-from spackle.formats import load_ply_disparity
+from spackle.formats import PlyFile
 from spackle.image import Photo
 
 NO_DEPTH, NO_MODEL = "no depth in the photo", "no Depth Anything here"
@@ -176,7 +176,7 @@ def test_disparity_of_the_person_then_of_the_base(tmp_path: Path) -> None:
         report = report_of(tmp_path / "out" / "photo")
         assert (report["disparity"], report["disparity_source"]) == (far, who)
         assert f"disparity {far:g} ({who})" in result.err
-        assert load_ply_disparity(tmp_path / "out" / "photo" / "scene.ply") == far
+        assert PlyFile(tmp_path / "out" / "photo" / "scene.ply").disparity() == far
         assert [row["view"] for row in report["hole_area_ratio"]] == [f"-{far:g}", f"+{far:g}"]
     scene = spackle.predict(photo, network=None, fill="none")
     assert (scene.disparity, scene.path()[20].position.tolist()) == (

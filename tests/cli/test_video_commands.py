@@ -114,7 +114,7 @@ def test_predict_completes_what_both_eyes_see(tmp_path: Path) -> None:
     assert len(frames) == 3
     assert frames[0].shape == (24, 64, 3)
     base, merged = (spackle.load_ply(tmp_path / "two" / "photo" / name) for name in ("base.ply", "scene.ply"))
-    camera = spackle.formats.load_ply_camera(tmp_path / "two" / "photo" / "scene.ply")
+    camera = spackle.formats.PlyFile(tmp_path / "two" / "photo" / "scene.ply").camera()
     assert camera is not None
     for eye, picture in zip(Stereo("sbs", 0.8, 2.01).eyes(camera), frames[0].split(32, dim=1), strict=True):
         holes, rest = (float((CPU.render(part, eye).alpha < 0.95).float().mean()) for part in (base, merged))

@@ -32,24 +32,23 @@ from spackle.camera import Camera
 from spackle.cli.export_scene import PAGE, export_scene
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
-from spackle.formats import load_ply, load_ply_camera, save_ply
-from spackle.formats.compressed_ply import encode_compressed_ply, morton_order
-from spackle.formats.gltf import encode_glb
-from spackle.formats.scene_files import SCENE_WRITERS, SceneFile, encode_splat
-from spackle.formats.sog import codebook, encode_sog
-from spackle.formats.spz import LIMIT, encode_spz, spz_grid
+from spackle.formats import PlyFile, load_ply, save_ply
+from spackle.formats.compressed_ply import morton_order
+from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_of
+from spackle.formats.sog import codebook
+from spackle.formats.spz import LIMIT, spz_grid
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.progress import Reporter
 from spackle.render import CpuRenderer
 
 CPU = CpuRenderer()
 BOX = box_before_wall(width=64, height=48, focal=54)
-FORMATS: dict[str, tuple[Callable[[Gaussians], bytes], Callable[[bytes], Iterator[Row]]]] = {
-    "compressed.ply": (encode_compressed_ply, compressed_ply_rows),
-    "spz": (encode_spz, spz_rows),
-    "splat": (encode_splat, splat_rows),
-    "sog": (encode_sog, sog_rows),
-    "glb": (encode_glb, glb_rows),
+FORMATS: dict[str, Callable[[bytes], Iterator[Row]]] = {
+    "compressed.ply": compressed_ply_rows,
+    "spz": spz_rows,
+    "splat": splat_rows,
+    "sog": sog_rows,
+    "glb": glb_rows,
 }
 # What a format's rounding leaves of a small scene: dB between renders, and the greatest error of a position in
 # standard deviations, of a scale's logarithm, of an axis' direction, of sRGB and of opacity.
@@ -62,13 +61,14 @@ BOUNDS = {
 }
 
 
-def encode(kind: str, gaussians: Gaussians) -> bytes:
-    return FORMATS[kind][0](gaussians)
+def encode(kind: str, gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
+    path = Path(f"a.{kind}")
+    return encoder_of(path)(SceneFile(path, gaussians, camera, base_count))
 
 
 def read(kind: str, data: bytes) -> Gaussians:
     """By the plainest reader of the format."""
-    return gaussians_of(FORMATS[kind][1](data), flipped=kind in ("spz", "glb"))
+    return gaussians_of(FORMATS[kind](data), flipped=kind in ("spz", "glb"))
 
 
 def in_file_order(kind: str, gaussians: Gaussians, base_count: int = 0) -> Gaussians:
@@ -156,7 +156,7 @@ def moved() -> Camera:
 
 def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     camera = moved()
-    gltf, _ = glb_parts(encode_glb(random_gaussians(1), camera, 1))
+    gltf, _ = glb_parts(encode("glb", random_gaussians(1), camera, 1))
     (scene, photo), (lens,) = gltf["nodes"], gltf["cameras"]
     assert scene["extras"] == {"spackle_base": 1}
     assert gltf["scenes"][0]["nodes"] == [0, 1]
@@ -169,14 +169,14 @@ def test_glb_keeps_the_photos_camera_and_the_border() -> None:
     flipped = there[:3] * torch.tensor([1.0, -1.0, -1.0])
     expected = torch.linalg.inv(camera.world_to_camera) @ torch.tensor([0.1, 0.2, 1.0, 1.0])
     torch.testing.assert_close(flipped, expected[:3])
-    still, _ = glb_parts(encode_glb(random_gaussians(1), Camera.from_focal(50, 64, 48)))
+    still, _ = glb_parts(encode("glb", random_gaussians(1), Camera.from_focal(50, 64, 48)))
     assert "matrix" not in still["nodes"][1]
     assert "extras" not in still["nodes"][0]
 
 
 def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
     gaussians = random_gaussians(700)
-    data = encode_compressed_ply(gaussians, Camera.from_focal(50, 64, 48), 300)
+    data = encode("compressed.ply", gaussians, Camera.from_focal(50, 64, 48), 300)
     found = read("compressed.ply", data)
     expected = in_file_order("compressed.ply", gaussians, 300)
     assert float((found.means - expected.means).abs().max()) < 0.005
@@ -217,7 +217,7 @@ def test_spz_shows_what_is_near_and_a_far_sky(far: float) -> None:
     bits, beyond = spz_grid(gaussians)
     assert (beyond > 0) == (far > 1000)
     assert 2.0**-bits <= 0.3 / 2000
-    found = read("spz", encode_spz(gaussians))
+    found = read("spz", encode("spz", gaussians))
     assert looks(found, gaussians, camera) >= 43
     assert looks(found, gaussians, shifted(camera, 0.02, 0.3)) >= 41
     directions = torch.nn.functional.normalize(gaussians.means, dim=1)
@@ -229,17 +229,17 @@ def test_spz_takes_scenes_of_any_unit(size: float) -> None:
     gaussians = random_gaussians()
     scaled = dataclasses.replace(gaussians, means=gaussians.means * size, scales=gaussians.scales * size)
     assert spz_grid(scaled)[1] == 0
-    error = (read("spz", encode_spz(scaled)).means / size - gaussians.means).abs()
+    error = (read("spz", encode("spz", scaled)).means / size - gaussians.means).abs()
     assert float((error / gaussians.scales.median(1).values[:, None]).max()) < 0.4
 
 
 def test_spz_is_an_eighth_of_the_ply() -> None:
     base = slanted_plane(1.5, 6, 0).base()
-    data = encode_spz(base)
+    data = encode("spz", base)
     assert len(data) <= LIMIT * len(base) == 68 * len(base) / 8
     # What can be had finer within that size is had: a scene of one colour and one size.
     plain = Gaussians(base.means, base.quats, torch.full_like(base.scales, 0.01), base.opacities, base.colors * 0 + 0.5)
-    error = (read("spz", encode_spz(plain)).means - base.means).abs().max()
+    error = (read("spz", encode("spz", plain)).means - base.means).abs().max()
     assert float(error) < 0.01 / 16
 
 
@@ -270,7 +270,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
-    outputs = [tmp_path / f"out{suffix}" for suffix in (*SCENE_WRITERS, *PAGE)] + [tmp_path / "A.SPLAT"]
+    outputs = [tmp_path / f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE)] + [tmp_path / "A.SPLAT"]
     export_scene(scene, outputs, told()[0])
     base, copy = load_ply(scene), tmp_path / "out.ply"
     for a, b in zip(load_ply(copy).tensors, base.tensors, strict=True):
@@ -283,8 +283,8 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     assert gltf["nodes"][0]["extras"] == {"spackle_base": 1000}
     assert (tmp_path / "A.SPLAT").stat().st_size == 32 * len(base)
     assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *(output.name for output in outputs)}
-    SCENE_WRITERS[".ply"](SceneFile(scene, base, moved(), None), copy)  # a camera elsewhere is no comment
-    assert load_ply_camera(copy) is None
+    copy.write_bytes(encode("ply", base, moved()))  # a camera elsewhere is no comment
+    assert PlyFile(copy).camera() is None
 
 
 def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
 def test_rotations_too_long_to_square_keep_their_direction(tmp_path: Path) -> None:
     one = random_gaussians(4)
     huge = dataclasses.replace(one, quats=one.quats / one.quats.norm(dim=-1, keepdim=True) * 3e38)
-    assert encode_splat(huge) == encode_splat(one)
+    assert encode("splat", huge) == encode("splat", one)
     save_ply(huge, tmp_path / "huge.ply")
     torch.testing.assert_close(load_ply(tmp_path / "huge.ply").quats, huge.quats / 3e38, atol=1e-6, rtol=0)
 

@@ -21,7 +21,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.files import atomic_path
-from spackle.formats import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
+from spackle.formats import PlyFile, load_ply, save_ply
 from spackle.formats.ply import BLOCK
 from spackle.gaussians import Gaussians
 
@@ -137,7 +137,7 @@ def test_orders_and_types(tmp_path: Path, order: str, kind: str) -> None:
     first = b"50 1\n60 0\n" if order == "ascii" else b"\0" * 18
     (tmp_path / "a.ply").write_bytes(before + b"end_header\n" + first + body)
     close(load_ply(tmp_path / "a.ply"), gaussians)
-    assert load_ply_camera(tmp_path / "a.ply") is None
+    assert PlyFile(tmp_path / "a.ply").camera() is None
     header, body = ply(rows, shuffled, kind, order, after=LISTED, tail=b"3 0 0 0\n").split(b"end_header\n", 1)
     (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)  # and a mesh after it
     close(load_ply(tmp_path / "a.ply"), gaussians)
@@ -149,7 +149,7 @@ def test_sharp_file(tmp_path: Path, color_space: int, linear: bool) -> None:
     content = ply(raw(gaussians, linear), GIVEN, after=SHARP_AFTER, tail=sharp_tail(color_space))
     (tmp_path / "a.ply").write_bytes(content)
     close(load_ply(tmp_path / "a.ply"), gaussians)
-    camera = load_ply_camera(tmp_path / "a.ply")
+    camera = PlyFile(tmp_path / "a.ply").camera()
     assert camera is not None
     assert (camera.width, camera.height, camera.focal) == (640, 480, (500, 500))
     assert torch.equal(camera.world_to_camera, torch.eye(4))
@@ -161,7 +161,7 @@ def test_older_sharp_file(tmp_path: Path) -> None:
     tail = struct.pack("<4f12f", 700, 710, 320, 200, *np.ravel(turn))
     (tmp_path / "a.ply").write_bytes(ply(raw(random_gaussians(3), linear=True), GIVEN, after=after, tail=tail))
     close(load_ply(tmp_path / "a.ply"), random_gaussians(3))
-    camera = load_ply_camera(tmp_path / "a.ply")
+    camera = PlyFile(tmp_path / "a.ply").camera()
     assert camera is not None
     assert camera.K.tolist() == [[700, 0, 160], [0, 710, 100], [0, 0, 1]]
     assert camera.world_to_camera[:3].tolist() == [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
@@ -169,28 +169,29 @@ def test_older_sharp_file(tmp_path: Path) -> None:
         tail = struct.pack("<4f12f", bad, 710, 320, 200, *np.ravel(turn))
         (tmp_path / "a.ply").write_bytes(ply(raw(random_gaussians(3)), GIVEN, after=after, tail=tail))
         with pytest.raises(InputError, match="stored camera"):
-            load_ply_camera(tmp_path / "a.ply")
+            PlyFile(tmp_path / "a.ply").camera()
 
 
 def test_what_a_comment_keeps(tmp_path: Path) -> None:
     path, camera = tmp_path / "a.ply", Camera.from_focal(50.25, 64, 48)
     save_ply(random_gaussians(9), path, camera=camera, base_count=7, disparity=0.3)
-    found = load_ply_camera(path)
+    found = PlyFile(path).camera()
     assert found is not None
     assert torch.equal(found.K, camera.K)
-    assert (found.width, found.height, load_ply_base_count(path), load_ply_disparity(path)) == (64, 48, 7, 0.3)
+    assert (found.width, found.height, PlyFile(path).base_count(), PlyFile(path).disparity()) == (64, 48, 7, 0.3)
     content = path.read_bytes()
     for load, kept, wrong in (
-        (load_ply_base_count, b"spackle_base 7", (b"10", b"-3", b"x", b"1 2", b"")),
-        (load_ply_disparity, b"spackle_disparity 0.3", (b"nan", b"inf", b"-1", b"x", b"1 2", b"")),
-        (load_ply_camera, b"spackle_camera 50.25", (b"x", b"nan", b"0", b"1 2", b"")),
+        (PlyFile.base_count, b"spackle_base 7", (b"10", b"-3", b"x", b"1 2", b"")),
+        (PlyFile.disparity, b"spackle_disparity 0.3", (b"nan", b"inf", b"-1", b"x", b"1 2", b"")),
+        (PlyFile.camera, b"spackle_camera 50.25", (b"x", b"nan", b"0", b"1 2", b"")),
     ):
         for value in wrong:
             path.write_bytes(content.replace(kept, kept.split()[0] + b" " + value))
             with pytest.raises(InputError, match=r"a\.ply: the stored"):
-                load(path)
+                load(PlyFile(path))
     save_ply(random_gaussians(9), path)
-    assert load_ply_camera(path) is load_ply_base_count(path) is load_ply_disparity(path) is None
+    plain = PlyFile(path)
+    assert plain.camera() is plain.base_count() is plain.disparity() is None
 
 
 GOOD = ply(raw(random_gaussians(3)), GIVEN)
@@ -252,7 +253,7 @@ def test_random_damage_is_an_input_error_or_a_scene(tmp_path_factory: Any, whole
     with contextlib.suppress(InputError):
         assert all(torch.isfinite(t).all() for t in load_ply(path).tensors)
     with contextlib.suppress(InputError):
-        load_ply_camera(path)
+        PlyFile(path).camera()
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

@@ -33,8 +33,7 @@ from spackle.dataset.shards import load_manifest, problems
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import get_dataset
 from spackle.folders import digest_of
-from spackle.formats import load_cameras, load_path, save_ply
-from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity
+from spackle.formats import PlyFile, load_cameras, load_path, save_ply
 from spackle.gaussians import Gaussians
 from spackle.image import load_photo, resize_photo
 from spackle.network_file import read_tensors
@@ -135,8 +134,8 @@ def _sharp_ply(folder: Path) -> None:
 
 
 def _read_ply(folder: Path) -> None:
-    for read in (load_ply_camera, load_ply_base_count, load_ply_disparity, load_ply):
-        read(_only(folder))
+    for read in (PlyFile.camera, PlyFile.base_count, PlyFile.disparity, PlyFile.gaussians):
+        read(PlyFile(_only(folder)))
 
 
 def _keyframes(folder: Path) -> None:

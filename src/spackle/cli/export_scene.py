@@ -14,15 +14,13 @@ from spackle.errors import InputError
 from spackle.files import check_writable, write_whole
 from spackle.folders import results_folder
 from spackle.formats.ply import PlyFile
-from spackle.formats.scene_files import SceneFile, Writer, writer_of
+from spackle.formats.scene_files import Encoder, SceneFile, encoder_of
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.progress import Reporter
 from spackle.scene import Scene
 from spackle.viewer import PageScene, single_html
 
-PAGE: dict[str, Writer] = {
-    ".html": lambda scene, path: write_whole(path, single_html(page_of(Scene.of_file(scene), scene.path)))
-}
+PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
@@ -30,31 +28,30 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
-    writers = [writer_of(output, PAGE) for output in outputs]
+    encoders = [encoder_of(output, PAGE) for output in outputs]
     with contextlib.ExitStack() as folders:
         for output in outputs:
             folders.enter_context(results_folder(output.parent, [output.name]))
-        _export(scene, outputs, writers, reporter)
+        _export(scene, outputs, encoders, reporter)
 
 
-def _export(scene: Path, outputs: Sequence[Path], writers: Sequence[Writer], reporter: Reporter) -> None:
+def _export(scene: Path, outputs: Sequence[Path], encoders: Sequence[Encoder], reporter: Reporter) -> None:
     targets = [check_writable(output) for output in outputs]
     twice = [output for output, target in zip(outputs, targets, strict=True) if targets.count(target) > 1]
     if twice:
         raise InputError(f"{twice[0]}: named twice: give each output once")
     if os.path.realpath(scene) in map(str, targets):
         raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
-    loaded = SceneFile.load(scene)
-    size = os.path.getsize(scene)
-    elements = PlyFile(scene).elements
-    if rest := sum(name.startswith("f_rest_") for element in elements for name, _ in element.fields):
+    file, size = PlyFile(scene), os.path.getsize(scene)
+    loaded = file.scene()
+    if rest := sum(name.startswith("f_rest_") for element in file.elements for name, _ in element.fields):
         reporter.log(
             f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
         )
-    for output, writer in zip(outputs, writers, strict=True):
+    for output, encoder in zip(outputs, encoders, strict=True):
         start = time.perf_counter()
         try:
-            writer(loaded, output)
+            write_whole(output, encoder(loaded))
         except InputError as error:
             raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
         _say(reporter, loaded, output, size, time.perf_counter() - start)

@@ -16,8 +16,7 @@ from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, PathError
 from spackle.errors import InputError
 from spackle.folders import results_folder
-from spackle.formats import load_ply, load_ply_camera, save_png, save_video
-from spackle.formats.ply import load_ply_disparity
+from spackle.formats import PlyFile, load_ply, save_png, save_video
 from spackle.formats.video import FORMATS
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
@@ -101,7 +100,7 @@ def render_scene(
 
 def _reach(scene: Path) -> str:
     """How far a scene was completed, where its file says it."""
-    disparity = load_ply_disparity(scene)
+    disparity = PlyFile(scene).disparity()
     return "" if disparity is None else f": the scene was completed for --disparity {disparity:g}"
 
 
@@ -114,10 +113,10 @@ def _fly(
     reporter: Reporter,
 ) -> list[Camera]:
     """The cameras of the path around the photo's place; InputError where the scene cannot be looked at from there."""
-    stored = load_ply_camera(scene)
+    stored = PlyFile(scene).camera()
     try:
         camera = _photo_camera(stored, path.video.size, focal_px)
-        completed = load_ply_disparity(scene)
+        completed = PlyFile(scene).disparity()
         cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if completed is None else completed)
     except InputError:
         raise

@@ -1,18 +1,16 @@
 """Files in and out: scenes, videos, pictures and cameras."""
 
 from spackle.formats.camera_files import load_cameras, load_path
-from spackle.formats.ply import load_ply, load_ply_base_count, load_ply_camera, load_ply_disparity, save_ply
+from spackle.formats.ply import PlyFile, load_ply, save_ply
 from spackle.formats.png import save_gray_png, save_png
 from spackle.formats.video import VideoWriter, save_video
 
 __all__ = [
+    "PlyFile",
     "VideoWriter",
     "load_cameras",
     "load_path",
     "load_ply",
-    "load_ply_base_count",
-    "load_ply_camera",
-    "load_ply_disparity",
     "save_gray_png",
     "save_ply",
     "save_png",

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from spackle.camera import Camera
-from spackle.formats.columns import Columns, Floats, as_shares, smallest_three
 from spackle.formats.ply import ply_header
-from spackle.gaussians import Gaussians
+from spackle.formats.scene_files import Columns, Floats, SceneFile, as_shares, smallest_three
 
 CHUNK = 256  # Gaussians that share bounds
 LARGEST_LOG_SCALE = 20  # what readers expect at most, in either direction
@@ -21,16 +19,15 @@ _CHUNK_NAMES = [
 _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
-def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
+def encode_compressed_ply(scene: SceneFile) -> bytes:
     """Gaussians, in their axes, as a compressed PLY; the camera and the base's number are comments, as `save_ply`'s.
 
-    The first `base_count` stay before the others; within both, neighbours in space become neighbours in the file.
+    The base's stay before the others; within both, neighbours in space become neighbours in the file.
 
     Raises:
         ValueError: where a Gaussian is not finite.
     """
-    columns, count = Columns.of(gaussians), len(gaussians)
-    border = base_count or 0
+    columns, count, border = Columns.of(scene.gaussians), len(scene.gaussians), scene.base_count or 0
     order = np.concatenate([morton_order(columns.means[:border]), border + morton_order(columns.means[border:])])
     columns = columns.select(order)
     scales = np.clip(columns.log_scales, -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
@@ -47,7 +44,8 @@ def encode_compressed_ply(gaussians: Gaussians, camera: Camera | None = None, ba
         rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), (10, 10, 10))
         rows[:, 2] = _packed(sizes, (11, 10, 11))
         rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), (8, 8, 8, 8))
-    return ply_header(*tables, camera=camera, base_count=base_count) + chunks.tobytes() + rows.tobytes()
+    header = ply_header(*tables, camera=scene.untilted_camera, base_count=scene.base_count)
+    return header + chunks.tobytes() + rows.tobytes()
 
 
 def morton_order(means: Floats) -> NDArray[np.int64]:

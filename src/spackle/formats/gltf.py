@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
-from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, Columns
-from spackle.gaussians import Gaussians
+from spackle.formats.scene_files import FLIPPED_MEANS, FLIPPED_QUATS, Columns, SceneFile
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
@@ -25,24 +24,26 @@ UNMOVED = np.eye(4).ravel().tolist()
 NEAR_PLANE = 0.01  # of the photo's camera; required, though nothing of ours depends on it
 
 
-def encode_glb(gaussians: Gaussians, camera: Camera | None = None, base_count: int | None = None) -> bytes:
+def encode_glb(scene: SceneFile) -> bytes:
     """Gaussians, in their order, as binary glTF: y up, z backward, scales linear, colours sRGB as harmonics.
 
     COLOR_0, linear as glTF's always is, lets viewers without the extension show points. The photo's camera becomes
-    a glTF camera; what that cannot say of it, and `base_count`, go into `extras`.
+    a glTF camera; what that cannot say of it, and the base's number, go into `extras`.
 
     Raises:
         InputError: no Gaussians, or more than 4 GiB of them.
         ValueError: where a Gaussian is not finite.
     """
-    count = len(gaussians)
+    count = len(scene.gaussians)
     if count == 0:
         raise InputError("glTF cannot hold a scene without Gaussians: use another format")
     if count * ROW + (1 << 16) > LARGEST_FILE:
         raise InputError(f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format")
-    arrays = _attributes(Columns.of(gaussians))
+    arrays = _attributes(Columns.of(scene.gaussians))
     parts = [array.tobytes() for array in arrays.values()]
-    text = json.dumps(_description(arrays, camera, base_count), separators=(",", ":"), allow_nan=False).encode()
+    text = json.dumps(
+        _description(arrays, scene.camera, scene.base_count), separators=(",", ":"), allow_nan=False
+    ).encode()
     text += b" " * (-len(text) % 4)
     size = sum(len(part) for part in parts)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + size)

@@ -8,27 +8,26 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError, reading
 from spackle.files import atomic_path, check_file
 from spackle.formats.camera_files import checked_camera
-from spackle.formats.columns import SH_C0, Columns
+from spackle.formats.scene_files import SH_C0, Columns, SceneFile
 from spackle.gaussians import Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
 MAX_EXTRA_ROWS = 64  # SHARP's elements after the vertices hold at most 16 numbers
 
-_NAMES = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
-_SIZED = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
-_CODES = dict(zip([*_NAMES, *_SIZED], ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
+_TYPES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
+_CODES = dict(zip(_TYPES.split(), ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"] * 2, strict=True))
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # keep the logit finite
@@ -40,6 +39,7 @@ BLOCK = 8192
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
 _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
+_SLICES = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10), slice(10, 14)  # means, f_dc, opacity, scales, rot
 
 # Comments of the header, which other readers ignore.
 CAMERA_COMMENT = "spackle_camera"  # fx fy cx cy width height of the photo's camera
@@ -49,7 +49,6 @@ DISPARITY_COMMENT = "spackle_disparity"  # how far to the side the scene was com
 StrPath = str | os.PathLike[str]
 
 
-@torch.no_grad()
 def save_ply(
     gaussians: Gaussians,
     path: StrPath,
@@ -66,29 +65,40 @@ def save_ply(
     Args:
         gaussians: the scene.
         path: the file.
-        camera: the photo's camera, at the world's origin; kept in a comment for `load_ply_camera`.
-        base_count: how many of the first Gaussians are the base's; kept in a comment likewise.
-        disparity: how far the scene was completed, see `spackle.camera_path.max_offset`; likewise.
+        camera: the photo's camera, at the world's origin; like what follows kept in a comment for `PlyFile`.
+        base_count: how many of the first Gaussians are the base's.
+        disparity: how far the scene was completed, see `spackle.camera_path.max_offset`.
 
     Raises:
         InputError: nothing can be written at `path`.
         ValueError: a Gaussian is not finite.
     """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(_written(gaussians, camera, base_count, disparity))
+
+
+def encode_ply(scene: SceneFile) -> bytes:
+    """A scene as `save_ply` writes it; ValueError where a Gaussian is not finite."""
+    return b"".join(_written(scene.gaussians, scene.untilted_camera, scene.base_count, scene.disparity))
+
+
+def _written(
+    gaussians: Gaussians, camera: Camera | None, base_count: int | None, disparity: float | None
+) -> Iterator[bytes]:
+    """The header and the rows, BLOCK at a time."""
+    vertex = ("vertex", len(gaussians), "float", _WRITTEN)
+    yield ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity)
     gaussians = gaussians.detach().to("cpu", torch.float32)
     surplus = Gaussians(*(torch.zeros(BLOCK, *t.shape[1:]) for t in gaussians.tensors))
     table = np.zeros((BLOCK, len(_WRITTEN)), "<f4")
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        vertex = ("vertex", len(gaussians), "float", _WRITTEN)
-        file.write(ply_header(vertex, camera=camera, base_count=base_count, disparity=disparity))
-        for start in range(0, len(gaussians), BLOCK):
-            block = gaussians.select(slice(start, start + BLOCK))
-            rows = len(block)
-            columns = Columns.of(Gaussians.cat([block, surplus.select(slice(rows, BLOCK))]))
-            opacities = np.clip(columns.opacities, SMALLEST_OPACITY, LARGEST_OPACITY)
-            table[:, 0:3], table[:, 6:9], table[:, 13:17] = columns.means, columns.harmonics, columns.quats
-            table[:, 9] = np.log(opacities / (1 - opacities))  # 1 - o is exact above one half
-            table[:, 10:13] = columns.log_scales
-            file.write(table[:rows].data)
+    for start in range(0, len(gaussians), BLOCK):
+        block = gaussians.select(slice(start, start + BLOCK))
+        columns = Columns.of(Gaussians.cat([block, surplus.select(slice(len(block), BLOCK))]))
+        opacities = np.clip(columns.opacities, SMALLEST_OPACITY, LARGEST_OPACITY)
+        table[:, 0:3], table[:, 6:9], table[:, 13:17] = columns.means, columns.harmonics, columns.quats
+        table[:, 9] = np.log(opacities / (1 - opacities))  # 1 - o is exact above one half
+        table[:, 10:13] = columns.log_scales
+        yield table[: len(block)].tobytes()
 
 
 def ply_header(
@@ -110,95 +120,8 @@ def ply_header(
 
 
 def load_ply(path: StrPath) -> Gaussians:
-    """Read Gaussians from an INRIA or SHARP file, binary or ASCII; colours become linear RGB.
-
-    Properties may come in any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
-    SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with
-    SHARP's camera is linear, as SHARP reads it, and any other sRGB.
-
-    Raises:
-        InputError: a missing, broken or cut file, one without Gaussians, or one with NaN or inf. An
-            infinite opacity logit is allowed: SHARP writes one for an opacity of 1.
-    """
-    file = PlyFile(path)
-    vertex, extras = file.vertex(), file.extras()
-    linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
-    parts = [torch.empty(vertex.count, width) for width in (3, 4, 3, 1, 3)]
-    table, broken = np.zeros((len(_READ), BLOCK), np.float32), 0
-    for index, rows in enumerate(file.blocks(vertex)):
-        with np.errstate(over="ignore", invalid="ignore"):  # too large for float32 becomes inf, which is counted
-            for k, name in enumerate(_READ):
-                table[k, : len(rows)] = rows[name]
-            broken += _decode(table, [part[index * BLOCK :][:BLOCK] for part in parts], linear)
-    if broken:
-        raise InputError(f"{path}: {broken} of {vertex.count} Gaussians are not finite: export the scene again")
-    return Gaussians(parts[0], parts[1], parts[2], parts[3][:, 0], parts[4])
-
-
-def _decode(table: NDArray[np.float32], parts: list[Tensor], linear: bool) -> int:
-    """Fill means, quats, scales, opacities, colours [rows, …] from [14, BLOCK]; return the number of broken rows."""
-    means, quats, scales, opacities, colors = parts
-    rows = len(means)
-    rgb = torch.from_numpy(table[3:6] * np.float32(SH_C0) + np.float32(0.5))
-    colors.copy_((rgb.clamp_min(0) if linear else srgb_to_linear(rgb))[:, :rows].T)
-    opacities.copy_(torch.from_numpy(table[6:7]).sigmoid()[:, :rows].T)
-    table[7:10] = np.exp(table[7:10])
-    for part, first in ((means, 0), (scales, 7), (quats, 10)):
-        part.copy_(torch.from_numpy(table[first : first + part.shape[1], :rows]).T)
-    table[6][np.isinf(table[6])] = 0  # a sigmoid of 0 or 1
-    return int((~np.isfinite(table[:, :rows]).all(axis=0)).sum())
-
-
-def load_ply_camera(path: StrPath) -> Camera | None:
-    """The photo's camera that SHARP stores after the Gaussians, or `save_ply` in a comment; None in other files.
-
-    Raises:
-        InputError: a broken file, or a camera that makes no sense.
-    """
-    file = PlyFile(path)
-    K, matrix = np.eye(3), np.eye(4)
-    if (numbers := file.numbers(CAMERA_COMMENT, 6, lowest=-math.inf)) is not None:
-        K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
-    elif "intrinsic" in (extras := file.extras()):
-        intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", matrix.ravel())
-        if len(intrinsic) == 9 and len(extras.get("image_size", ())) == 2:
-            K, (width, height) = intrinsic.reshape(3, 3), extras["image_size"]
-        elif len(intrinsic) == 4:  # older: fx, fy, width, height
-            K[0, 0], K[1, 1], width, height = intrinsic
-            K[:2, 2] = width / 2, height / 2
-        else:
-            raise InputError(f"{path}: a camera of {len(intrinsic)} numbers is none of SHARP's: give the focal length")
-        if len(extrinsic) == 12:  # older: 3×4 with the rotation transposed
-            matrix[:3] = extrinsic.reshape(3, 4)
-            matrix[:3, :3] = matrix[:3, :3].T.copy()
-        elif len(extrinsic) == 16:
-            matrix = extrinsic.reshape(4, 4)
-    else:
-        return None
-    width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
-    where = f"{path}: the stored camera"
-    return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
-
-
-def load_ply_base_count(path: StrPath) -> int | None:
-    """How many of the first Gaussians are the base's, as `save_ply` was told; None in other files.
-
-    Raises:
-        InputError: a broken file, or a number that makes no sense.
-    """
-    file = PlyFile(path)
-    numbers = file.numbers(BASE_COMMENT, highest=file.vertex().count)
-    return int(numbers[0]) if numbers else None
-
-
-def load_ply_disparity(path: StrPath) -> float | None:
-    """How far the scene was completed, as `save_ply` was told; None in other files.
-
-    Raises:
-        InputError: a broken file, or a number that makes no sense.
-    """
-    numbers = PlyFile(path).numbers(DISPARITY_COMMENT)
-    return numbers[0] if numbers else None
+    """Read Gaussians from an INRIA or SHARP file, binary or ASCII; see `PlyFile.gaussians`."""
+    return PlyFile(path).gaussians()
 
 
 @dataclasses.dataclass
@@ -233,6 +156,82 @@ class PlyFile:
             self._parse(head[: end.start()].decode("latin-1").split("\n")[1:])
             self._place_tables()
 
+    def gaussians(self) -> Gaussians:
+        """The scene; colours become linear RGB.
+
+        Properties may come in any order and type; spherical harmonics above degree 0 (f_rest) are ignored.
+        SHARP's `color_space` says whether colours are sRGB (0) or linear (1). Without it, a file with
+        SHARP's camera is linear, as SHARP reads it, and any other sRGB.
+
+        Raises:
+            InputError: no Gaussians, or some with NaN or inf. An infinite opacity logit is allowed: SHARP writes one
+                for an opacity of 1.
+        """
+        vertex, extras = self._vertex(), self._extras()
+        linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
+        parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
+        table, broken = np.zeros((len(_READ), BLOCK), np.float32), 0
+        for index, rows in enumerate(self._blocks(vertex)):
+            with np.errstate(over="ignore", invalid="ignore"):  # too large for float32 becomes inf, which is counted
+                for k, name in enumerate(_READ):
+                    table[k, : len(rows)] = rows[name]
+                table[7:10] = np.exp(table[7:10])
+                rgb = torch.from_numpy(table[3:6] * np.float32(SH_C0) + np.float32(0.5))
+            table[6:7] = torch.from_numpy(table[6:7]).sigmoid()
+            broken += int(np.count_nonzero(~np.isfinite(table[:, : len(rows)]).all(axis=0)))
+            table[3:6] = rgb.clamp_min(0) if linear else srgb_to_linear(rgb)
+            for part, columns in zip(parts, _SLICES, strict=True):
+                part[index * BLOCK :][: len(rows)] = torch.from_numpy(table[columns, : len(rows)].T)
+        if broken:
+            raise InputError(
+                f"{self.path}: {broken} of {vertex.count} Gaussians are not finite: export the scene again"
+            )
+        means, colors, opacities, scales, quats = parts
+        return Gaussians(means, quats, scales, opacities[:, 0], colors)
+
+    def camera(self) -> Camera | None:
+        """The photo's camera, which SHARP stores after the Gaussians and `save_ply` in a comment; None in other files.
+
+        InputError for a camera that makes no sense.
+        """
+        K, matrix = np.eye(3), np.eye(4)
+        if numbers := self._numbers(CAMERA_COMMENT, 6, lowest=-math.inf):
+            K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
+        elif "intrinsic" in (extras := self._extras()):
+            intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", matrix.ravel())
+            if len(intrinsic) == 9 and len(extras.get("image_size", ())) == 2:
+                K, (width, height) = intrinsic.reshape(3, 3), extras["image_size"]
+            elif len(intrinsic) == 4:  # older: fx, fy, width, height
+                K[0, 0], K[1, 1], width, height = intrinsic
+                K[:2, 2] = width / 2, height / 2
+            else:
+                problem = f"a camera of {len(intrinsic)} numbers is none of SHARP's: give the focal length"
+                raise InputError(f"{self.path}: {problem}")
+            if len(extrinsic) == 12:  # older: 3×4 with the rotation transposed
+                matrix[:3] = extrinsic.reshape(3, 4)
+                matrix[:3, :3] = matrix[:3, :3].T.copy()
+            elif len(extrinsic) == 16:
+                matrix = extrinsic.reshape(4, 4)
+        else:
+            return None
+        width, height = (int(side) if float(side).is_integer() else 0 for side in (width, height))
+        where = f"{self.path}: the stored camera"
+        return checked_camera(torch.from_numpy(K), torch.from_numpy(matrix), width, height, where)
+
+    def base_count(self) -> int | None:
+        """How many of the first Gaussians are the base's; None in other files, InputError for more than there are."""
+        numbers = self._numbers(BASE_COMMENT, 1, highest=self._vertex().count)
+        return int(numbers[0]) if numbers else None
+
+    def disparity(self) -> float | None:
+        """How far the scene was completed; None in other files, InputError for no such number."""
+        numbers = self._numbers(DISPARITY_COMMENT, 1)
+        return numbers[0] if numbers else None
+
+    def scene(self) -> SceneFile:
+        """All of it; InputError as above."""
+        return SceneFile(Path(self.path), self.gaussians(), self.camera(), self.base_count(), self.disparity())
+
     def _parse(self, lines: list[str]) -> None:
         order = ""
         for words in map(str.split, lines):
@@ -253,25 +252,23 @@ class PlyFile:
                     raise ValueError(f"cannot understand the line {' '.join(words)[:80]!r}")
         if not order:
             raise ValueError("there is no format line")
-        self.ascii = order == "="
+        self._ascii = order == "="
 
     def _place_tables(self) -> None:
         """Find where each table starts, and refuse a file that is too short; nothing has been allocated yet."""
-        start, end = 0, self._data - self.ascii  # the last line needs no line break
+        start, end = 0, self._data - self._ascii  # the last line needs no line break
         for element in self.elements:
             if "list" in dict(element.fields).values():
                 return
             row = np.dtype(element.fields).itemsize  # ValueError for a name given twice
             element.start = start
-            start += element.count * (1 if self.ascii else row)
-            end += element.count * (2 * len(element.fields) if self.ascii else row)  # a number and a separator
+            start += element.count * (1 if self._ascii else row)
+            end += element.count * (2 * len(element.fields) if self._ascii else row)  # a number and a separator
             if end > self._size:
-                raise InputError(
-                    f"{self.path}: cut off: {element.count} rows of {element.name!r} are announced, "
-                    f"but the file ends after {self._size} bytes"
-                )
+                announced = f"{element.count} rows of {element.name!r} are announced"
+                raise InputError(f"{self.path}: cut off: {announced}, but the file ends after {self._size} bytes")
 
-    def numbers(self, comment: str, count: int = 1, lowest: float = 0, highest: float = math.inf) -> list[float] | None:
+    def _numbers(self, comment: str, count: int, lowest: float = 0, highest: float = math.inf) -> list[float] | None:
         """The finite numbers of a comment of ours; None without it."""
         if (words := self.comments.get(comment)) is None:
             return None
@@ -282,7 +279,7 @@ class PlyFile:
                 raise ValueError(" ".join(words))
         return numbers
 
-    def vertex(self) -> Element:
+    def _vertex(self) -> Element:
         """The vertices; InputError where they are not Gaussians of a fixed size."""
         named = [element for element in self.elements if element.name == "vertex"]
         if len(named) != 1:
@@ -295,21 +292,21 @@ class PlyFile:
             raise InputError(f"{self.path}: holds {problem}: export it as a plain Gaussian scene")
         return named[0]
 
-    def extras(self) -> dict[str, NDArray[np.float64]]:
+    def _extras(self) -> dict[str, NDArray[np.float64]]:
         """The numbers of the small tables by their properties' names, such as SHARP's camera."""
         tables = [e for e in self.elements if e.name != "vertex" and e.start >= 0 and e.fields]
-        small = [(e, rows) for e in tables if e.count <= MAX_EXTRA_ROWS for rows in self.blocks(e)]
+        small = [(e, rows) for e in tables if e.count <= MAX_EXTRA_ROWS for rows in self._blocks(e)]
         return {name: rows[name].astype(np.float64) for element, rows in small for name, _ in element.fields}
 
-    def blocks(self, element: Element) -> Iterator[NDArray[Any]]:
+    def _blocks(self, element: Element) -> Iterator[NDArray[Any]]:
         """The rows of a table, BLOCK at a time, as structured arrays; InputError where they are no numbers."""
         broken = reading(self.path, f"{element.name!r} is broken: {{reason}}", ValueError)
         with open(self.path, "rb") as file, broken:
-            file.seek(self._data + (0 if self.ascii else element.start))
+            file.seek(self._data + (0 if self._ascii else element.start))
             lines = islice(file, element.start, None)
             for first in range(0, element.count, BLOCK):
                 count = min(BLOCK, element.count - first)
-                if self.ascii:
+                if self._ascii:
                     texts = [line for line in islice(lines, count) if line.strip()]
                     dtype = [(name, "f8") for name, _ in element.fields]
                     rows = np.loadtxt(texts, dtype, comments=None, ndmin=1) if len(texts) == count else np.empty(0)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spackle.errors import InputError
-from spackle.formats.columns import Columns, Floats, as_shares, smallest_three
-from spackle.gaussians import Gaussians
+from spackle.formats.scene_files import Columns, Floats, SceneFile, as_shares, smallest_three
 
 LARGEST_SIDE = 16_380  # of a WebP picture, in fours
 CODES = 256  # entries of a codebook
@@ -23,7 +22,7 @@ EFFORT = {"lossless": True, "exact": True, "quality": 25, "method": 1}  # exact:
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the archive's bytes do not depend on when it was made
 
 
-def encode_sog(gaussians: Gaussians) -> bytes:
+def encode_sog(scene: SceneFile) -> bytes:
     """Gaussians, in their order and axes, as a bundled SOG file.
 
     Positions have 16 bits on an axis, logarithmically spaced from 0; scales and colours are looked up in codebooks.
@@ -32,13 +31,13 @@ def encode_sog(gaussians: Gaussians) -> bytes:
         InputError: no Gaussians, or more than pictures can hold.
         ValueError: where a Gaussian is not finite.
     """
-    count = len(gaussians)
+    count = len(scene.gaussians)
     if count == 0:
         raise InputError("SOG cannot hold a scene without Gaussians: use another format")
     width = math.ceil(math.sqrt(count) / 4) * 4
     if width > LARGEST_SIDE:
         raise InputError(f"{count:,} Gaussians are too many for SOG: use another format")
-    columns = Columns.of(gaussians)
+    columns = Columns.of(scene.gaussians)
     means, low, high = _means(columns.means)
     scale_book, scales = codebook(columns.log_scales)
     color_book, colors = codebook(columns.harmonics)

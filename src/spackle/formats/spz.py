@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.errors import InputError
-from spackle.formats.columns import FLIPPED_MEANS, FLIPPED_QUATS, SH_C0, Columns, Floats, smallest_three
+from spackle.formats.scene_files import (
+    FLIPPED_MEANS,
+    FLIPPED_QUATS,
+    SH_C0,
+    Columns,
+    Floats,
+    SceneFile,
+    smallest_three,
+)
 from spackle.gaussians import Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
@@ -53,7 +61,7 @@ _DETAILS = (
 )
 
 
-def encode_spz(gaussians: Gaussians) -> bytes:
+def encode_spz(scene: SceneFile) -> bytes:
     """Gaussians, in their order, as an SPZ file of version 3: y up, z backward, as the format wants it.
 
     Positions lie on a grid fine enough for what is near. What is then too far for it is drawn nearer and smaller
@@ -63,11 +71,11 @@ def encode_spz(gaussians: Gaussians) -> bytes:
         InputError: more Gaussians than readers take.
         ValueError: where a Gaussian is not finite.
     """
-    count = len(gaussians)
+    count = len(scene.gaussians)
     if count > MAX_COUNT:
         raise InputError(f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format")
-    columns = Columns.of(gaussians)
-    bits, _ = spz_grid(gaussians)
+    columns = Columns.of(scene.gaussians)
+    bits, _ = spz_grid(scene.gaussians)
     columns = _within(columns, bits)
     header = HEADER.pack(MAGIC, VERSION, count, 0, bits, 0, 0)
     data = b""

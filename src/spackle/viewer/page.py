@@ -20,7 +20,7 @@ from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
-from spackle.formats.columns import smallest_three
+from spackle.formats.scene_files import smallest_three
 from spackle.gaussians import Gaussians
 
 SAMPLES = 121  # of a path, between which the page goes straight
