@@ -16,8 +16,7 @@ from command import Run, names_in
 from dataset_builds import build, content, refused
 
 from spackle.bases.open import BaseSettings
-from spackle.dataset.build import Made, Maker
-from spackle.dataset.options import DatasetOptions
+from spackle.dataset.build import DatasetOptions, Made, Maker
 from spackle.dataset.photos import PhotoFile
 from spackle.workers import ray as on_ray
 from spackle.workers.ray import RemoteWorker

@@ -38,7 +38,7 @@ def completed(name: str, stack: ViewStack) -> Tensor:
 def stack_of(*rights: float) -> ViewStack:
     scene = box_before_wall()
     views = [scene.camera, *(shifted(scene.camera, right) for right in rights)]
-    return render_views(scene.base(), scene.camera, views, get_renderer())
+    return render_views(scene.lift(), views, get_renderer())
 
 
 @pytest.mark.parametrize("name", ["geometry", "opencv", "none"])
@@ -109,8 +109,8 @@ def test_geometry_is_calmer_than_views_completed_one_by_one() -> None:
     front = torch.tensor([0.75, 0.3, 0.2]) + 0.1 * torch.sin(20 * points[..., :1])
     scene = Scene(torch.where(box[..., None], front, pattern(points)), torch.where(box, 2.0, FAR), camera)
     cameras = path_cameras(PathChoice("swipe", 0.4), camera, DepthRange.of(scene.base()), 8)
-    stack = render_views(scene.base(), camera, cameras, get_renderer())
-    context = FillContext(stack.base, camera, get_renderer())
+    stack = render_views(scene.lift(), cameras, get_renderer())
+    context = FillContext(stack.prediction.gaussians, camera, get_renderer())
     guards = [context.photo_guard()]
     with torch.no_grad():
         alone = torch.stack([fill_view(context, view, guards).rendering.rgb for view in cameras])

@@ -28,8 +28,9 @@ from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
 from spackle.camera import Camera
 from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.dataset import DatasetFiles
+from spackle.dataset.inspect import problems
 from spackle.dataset.photos import find_photos
-from spackle.dataset.shards import load_manifest, problems
+from spackle.dataset.shards import load_manifest
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import get_dataset
 from spackle.folders import digest_of

@@ -74,8 +74,7 @@ def dataset_build(
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
     from spackle.bases.open import BaseSettings
-    from spackle.dataset.build import build_dataset
-    from spackle.dataset.options import DatasetOptions
+    from spackle.dataset.build import DatasetOptions, build_dataset
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, checkpoint=checkpoint, precision=precision, device=device)

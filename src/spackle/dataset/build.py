@@ -10,66 +10,154 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from spackle.bases.open import BaseError, open_base
-from spackle.camera_path import DepthRange
-from spackle.dataset.options import DatasetOptions, configuration
+import spackle
+from spackle.bases.depth_map import find_depth
+from spackle.bases.open import NETWORKS, BaseError, BaseSettings, kind_of, open_base
+from spackle.camera_path import MAX_DISPARITY, DepthRange, TrajectoryKind
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.sample import pack_sample
 from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
-from spackle.dataset.views import draw_path, open_completion, path_cameras, render_views
-from spackle.errors import InputError, reading
+from spackle.dataset.views import COMPLETIONS, Completion, draw_path, open_completion, path_cameras, render_views
+from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
-from spackle.folders import differences, make_folder, remove_half_written, results_folder
+from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import InpainterOptions
+from spackle.inpaint import INPAINTERS, InpainterOptions
 from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
-from spackle.workers import at_work, cluster
+from spackle.weights import weights_digest, weights_digests
+from spackle.workers import Workers, at_work, cluster
 
 MAX_PHOTOS = 1_000_000  # six digits name a photo
 PARTS = "parts"  # in the output: samples that are in no shard yet
 STAGES = ("load", "base", "render", "inpaint", "encode", "write")
 
 
-def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
-    """Build a dataset of a folder of photos or COCO annotations, or resume that: "complete", or "stopped" by Ctrl-C.
+@dataclasses.dataclass(frozen=True)
+class DatasetOptions:
+    """The options of `spackle dataset build`; the command line keeps its numbers within their bounds."""
 
-    InputError for options, photos or folders that cannot be used, and for another dataset in `output`.
+    base: BaseSettings
+    images: Path | None = None  # folder of the photos of a COCO JSON
+    sample: int | None = None  # number of photos; all where None
+    seed: int = 0  # of the choice of photos, and of the paths
+    views: int = 20  # of a photo, its own among them, as in the paper
+    trajectory: TrajectoryKind | None = None  # drawn for each photo where None
+    disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
+    inpainter: str = "geometry"  # of `COMPLETIONS`
+    inpainter_weights: Path | None = None  # a file or a folder, for one with a network
+    inpainter_side: int | None = None  # long side in pixels at which its network works
+    workers: int = 1  # processes
+    ray: str | None = None  # address of their cluster; this machine where None
+    threads: int = 2  # of each
+    shard_size: int = 50  # photos
+
+    @property
+    def inpaints_by_network(self) -> bool:
+        return self.inpainter in INPAINTERS and INPAINTERS[self.inpainter].network
+
+    @property
+    def processes(self) -> Workers:
+        network = self.base.kind.network or self.inpaints_by_network
+        return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
+
+    def check(self) -> None:
+        """InputError for options that contradict each other; inpainters check theirs themselves."""
+        kind_of(self.base.name)  # refuses `auto`: a dataset names its base
+        self.base.check()
+        depth = self.base.depth
+        if depth is None and not self.base.kind.network:
+            raise InputError(
+                f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
+            )
+        if isinstance(depth, Path) and not depth.is_dir():  # one map for all photos would be wrong for all but one
+            raise InputError(f"--depth {depth}: no such folder: a dataset takes one with a depth map for each photo")
+        check_name("--inpainter", self.inpainter, COMPLETIONS)
+        for option, value in (("weights", self.inpainter_weights), ("side", self.inpainter_side)):
+            if value is not None and not self.inpaints_by_network:
+                line = f"--inpainter-{option} {value}: the {self.inpainter} inpainter has no network"
+                raise InputError(f"{line}: leave the option out")
+        low, high = self.disparity
+        if not 0 < low <= high <= MAX_DISPARITY:
+            raise InputError(
+                f"--disparity {low:g} {high:g}: give the smaller and the greater, above 0 and up to {MAX_DISPARITY:g}"
+            )
+        self.processes.check()
+
+    def depth_of(self, photo: PhotoFile) -> Path | None:
+        """A photo's depth map in --depth, below the photo's subfolder; None without --depth; InputError if missing."""
+        folder = self.base.depth
+        if not isinstance(folder, Path):
+            return None
+        beside = folder / Path(photo.name).parent
+        return find_depth(beside if beside.is_dir() else folder, photo.path)
+
+    def inputs_of(self, photo: PhotoFile) -> list[str]:
+        """Name and digest of a photo, and the digest of its depth map."""
+        try:
+            depth = self.depth_of(photo)
+            return [photo.name, photo.sha256, *([fingerprint(depth, "depth map")] if depth else [])]
+        except InputError:  # the build names it later
+            return [photo.name, photo.sha256, "none"]
+
+
+def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completion: Completion) -> dict[str, Any]:
+    """Everything that decides the shards' bytes, ready for JSON, without folders of this machine.
+
+    The number of threads is part of it, because SHARP's last bits depend on it; the number of workers is not.
+    """
+    base = options.base
+    inputs = digest_of([options.inputs_of(photo) for photo in photos])
+    weights = {name: weights_digest(file) for name, file in completion.files.items()}
+    return {
+        "spackle": spackle.__version__,
+        "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
+        "base": {
+            "name": base.public_name,
+            "weights": weights_digests(base.files),
+            "precision": base.precision,
+            "device": base.device,
+        },
+        "views": {
+            "seed": options.seed,
+            "views": options.views,
+            "trajectory": options.trajectory,
+            "disparity": list(options.disparity),
+            "threshold": MASK_THRESHOLD,
+        },
+        "inpainter": {"name": completion.name, "version": completion.version}
+        | ({"weights": weights} if weights else {}),
+        "shard_size": options.shard_size,
+        "threads": options.threads,
+    }
+
+
+def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
+    """Build a dataset of a folder of photos or of COCO annotations, or go on with one.
+
+    Returns:
+        "complete", or "stopped" by Ctrl-C.
+
+    Raises:
+        InputError: options, photos or folders that cannot be used; another dataset in `output`.
     """
     options.check()
     maker = Maker(options)  # fails before long work
     if maker.completion.notice:
         reporter.log(maker.completion.notice)
     with cluster(options.processes) as ray:
-        photos = _photos(source, options, reporter)
-        new = Manifest(config=configuration(options, photos, maker.completion), shards=(), complete=False)
+        root, names = find_photos(source, options.images, reporter.log)
+        if options.sample is None and len(names) > MAX_PHOTOS:
+            raise InputError(
+                f"{source}: {len(names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
+                "give --sample, or build several"
+            )
+        with reporter.stage("photos") as step:
+            photos = choose(root, names, options.sample, options.seed, reporter.log, step)
+        config = configuration(options, photos, maker.completion)
         with results_folder(output, (NAME,), alone=True):
-            manifest = _begin(output, new)
-            return _Build(photos, output, options, reporter, manifest).run(ray)
-
-
-def _photos(source: Path, options: DatasetOptions, reporter: Reporter) -> list[PhotoFile]:
-    root, names = find_photos(source, options.images, reporter.log)
-    if options.sample is None and len(names) > MAX_PHOTOS:
-        raise InputError(
-            f"{source}: {len(names):,} photos are too many for a dataset (at most {MAX_PHOTOS:,}): "
-            "give --sample, or build several"
-        )
-    with reporter.stage("photos") as step:
-        return choose(root, names, options.sample, options.seed, reporter.log, step)
-
-
-def _begin(output: Path, new: Manifest) -> Manifest:
-    """The manifest of an earlier run, or the new one; InputError for that of another dataset."""
-    if not (output / NAME).exists():
-        new.save(output)
-    manifest = load_manifest(output)
-    if lines := differences(manifest.config, new.config):
-        raise InputError(f"{output}: holds a dataset of another configuration ({'; '.join(lines)}): choose another -o")
-    make_folder(output / PARTS)
-    remove_half_written(output, output / PARTS)
-    return manifest
+            return _Build(photos, output, options, reporter, config).run(ray)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +171,10 @@ class Made:
 
 
 class Maker:
-    """Makes the sample of one photo after the other: its base, views and targets."""
+    """A `PhotoWorker` that makes the sample of one photo after the other: its base, views and targets."""
 
     def __init__(self, options: DatasetOptions) -> None:
-        """Set up; a network is loaded with the first photo. InputError where that cannot be."""
+        """Open base and inpainter, whose networks are loaded with the first photo; InputError where that fails."""
         self.options, self.base = options, open_base(options.base)
         self.renderer = get_renderer(options.base.device)
         device = None if options.base.device == "auto" else options.base.device
@@ -95,11 +183,11 @@ class Maker:
 
     @property
     def setup(self) -> dict[str, Any]:
-        """The manifest's configuration, but for the photos."""
+        """The manifest's configuration without the photos."""
         return configuration(self.options, (), self.completion)
 
     def inputs(self, photo: PhotoFile) -> list[str]:
-        """Digests of a photo and of its depth map, as they lie on this machine."""
+        """Digests of a photo and of its depth map on this machine."""
         try:
             content = fingerprint(photo.path, "photo")
         except InputError:
@@ -122,12 +210,12 @@ class Maker:
             photo = load_photo(file.path)
         with timed("base", seconds):
             prediction, _ = self.base.predict(photo, options.depth_of(file))
-        base, camera = prediction.gaussians, prediction.camera
         with timed("render", seconds):
             path = draw_path(options.trajectory, options.disparity, options.seed, file.sha256)
             with reading(file.path, "no camera path: {reason}", ValueError):
-                cameras = path_cameras(path, camera.even(), DepthRange.of(base), options.views)
-            stack = render_views(base, camera, cameras, self.renderer)
+                depth_range = DepthRange.of(prediction.gaussians)
+                cameras = path_cameras(path, prediction.camera.even(), depth_range, options.views)
+            stack = render_views(prediction, cameras, self.renderer)
         with timed("inpaint", seconds):
             targets = self.completion.complete(stack)
         with timed("encode", seconds):
@@ -139,7 +227,7 @@ class Maker:
                     "height": photo.height,
                     "focal_source": prediction.lens_source or photo.focal_source,
                 },
-                "base": {"gaussians": len(base), **prediction.notes},
+                "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
                 "inpainter": {"name": self.completion.name, "version": self.completion.version},
                 "threshold": MASK_THRESHOLD,
             }
@@ -152,13 +240,27 @@ def key_of(index: int) -> str:
 
 
 class _Build:
-    """The photos of a dataset and how far it has come."""
+    """A dataset's photos, and which of them are done."""
 
     def __init__(
-        self, photos: Sequence[PhotoFile], output: Path, options: DatasetOptions, reporter: Reporter, manifest: Manifest
+        self,
+        photos: Sequence[PhotoFile],
+        output: Path,
+        options: DatasetOptions,
+        reporter: Reporter,
+        config: dict[str, Any],
     ) -> None:
+        """Begin in a folder, or take up an earlier run there; InputError where that is another dataset."""
         self.photos, self.output, self.options, self.reporter = photos, output, options, reporter
-        self.config, self.size = manifest.config, options.shard_size
+        self.config, self.size = config, options.shard_size
+        if not (output / NAME).exists():
+            Manifest(config=config, shards=(), complete=False).save(output)
+        manifest = load_manifest(output)
+        if lines := differences(manifest.config, config):
+            what = f"holds a dataset of another configuration ({'; '.join(lines)})"
+            raise InputError(f"{output}: {what}: choose another -o")
+        make_folder(output / PARTS)
+        remove_half_written(output, output / PARTS)
         sizes = {path.name: path.stat().st_size for path in output.iterdir() if path.is_file()}
         self.shards = {int(s.file[6:-4]): s for s in manifest.shards if sizes.get(s.file) == s.size}
         self.missing = {  # photos by their index

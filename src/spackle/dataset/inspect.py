@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +15,13 @@ from rich.filesize import decimal
 from torch import Tensor
 from torch.nn.functional import pad
 
-from spackle.dataset.reader import DatasetFiles
-from spackle.dataset.sample import PhotoGroup
-from spackle.dataset.shards import load_manifest, problems
-from spackle.errors import InputError, one_line
+from spackle.dataset.sample import END
+from spackle.dataset.shards import DatasetFiles, Manifest, ShardEntry, load_manifest, open_in
+from spackle.errors import InputError, one_line, reading
 from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
 from spackle.formats.png import thumbnail
-from spackle.progress import Reporter, counted
+from spackle.progress import Reporter, Step, counted
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"
 THUMBNAIL = 192  # pixels along its longer side
@@ -59,6 +60,36 @@ def verify_dataset(location: str, reporter: Reporter) -> int:
     return count
 
 
+def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Step) -> Iterator[str]:
+    """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
+    done = 0
+    if not manifest.complete:
+        yield "the dataset is not finished: the command that builds it goes on"
+    for shard in manifest.shards:
+        try:
+            yield from (f"{shard.file}: {line}" for line in _shard_problems(location, shard))
+        except InputError as error:
+            yield str(error)
+        done += shard.size
+        progress(done, manifest.size)
+
+
+def _shard_problems(location: str | os.PathLike[str], shard: ShardEntry) -> Iterator[str]:
+    """Compare each sample with its digest, and the rest with the end of an archive; InputError for no such file."""
+    with open_in(location, shard.file) as file, reading(shard.file, "cannot be read: {reason}", OSError):
+        size = file.seek(0, os.SEEK_END)
+        if size != shard.size:
+            yield f"{size:,} bytes instead of {shard.size:,}"
+        file.seek(0)
+        damaged = False
+        for sample in shard.samples:
+            if hashlib.sha256(file.read(sample.size)).hexdigest() != sample.sha256:
+                damaged = True
+                yield f"sample {sample.key} ({sample.photo}) is damaged"
+        if not damaged and file.read(len(END)) != END:
+            yield "damaged after its last sample"
+
+
 def preview_dataset(location: str, output: Path, photos: int, views: int, reporter: Reporter) -> None:
     """Write a sheet (base, mask and target of some views of some photos) and a video of one path, base beside target.
 
@@ -68,27 +99,22 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
     if not len(files):
         raise InputError(f"{location}: holds no photos")
     with results_folder(output, (SHEET, VIDEO), alone=True):
-        chosen = [files.group(index) for index in _spread(len(files), photos)]
-        save_png(_stack([_block(group, views) for group in chosen], 0), output / SHEET)
+        groups = [files.group(index) for index in _spread(len(files), photos)]
+        blocks = []
+        for group in groups:  # rows of base, mask and target, with a column for each view
+            chosen = [group.view(index) for index in _spread(group.views, views)]
+            rows = [(v.rendering.rgb, v.mask[..., None].expand(-1, -1, 3).float(), v.target) for v in chosen]
+            blocks.append(_stack([_stack([thumbnail(picture, THUMBNAIL) for picture in row], 0) for row in rows], 1))
+        save_png(_stack(blocks, 0), output / SHEET)
         # The path without the photo's own view, which comes before it.
-        path = (chosen[0].view(index) for index in range(1, chosen[0].views))
-        frames = (torch.cat([view.rendering.rgb, view.target], dim=1) for view in path)
-        save_video(frames, output / VIDEO, fps=FPS)
+        path = (groups[0].view(index) for index in range(1, groups[0].views))
+        save_video((torch.cat([view.rendering.rgb, view.target], dim=1) for view in path), output / VIDEO, fps=FPS)
     reporter.log(f"{SHEET} and {VIDEO} -> {output}")
 
 
 def _spread(total: int, count: int) -> list[int]:
     """Up to `count` places in 0..total, evenly."""
     return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})
-
-
-def _block(group: PhotoGroup, views: int) -> Tensor:
-    """Rows of base, mask and target, with a column for each view."""
-    columns = []
-    for view in map(group.view, _spread(group.views, views)):
-        pictures = view.rendering.rgb, view.mask[..., None].expand(-1, -1, 3).float(), view.target
-        columns.append(_stack([thumbnail(picture, THUMBNAIL) for picture in pictures], 0))
-    return _stack(columns, 1)
 
 
 def _stack(pictures: Sequence[Tensor], axis: int) -> Tensor:

@@ -81,9 +81,9 @@ def choose(
 ) -> list[PhotoFile]:
     """The photos of a dataset, sorted by name: all, or a random subset of `count`.
 
-    The subset depends on the names, the contents and the seed alone. `warn` names each photo that is skipped, because
-    it cannot be read, is too small or is a copy of another one; the next one takes its place. InputError where fewer
-    than `count` are left.
+    The subset depends on names, contents and seed alone. `warn` names each photo that is skipped, because it cannot be
+    read, is too small or is a copy of another one; the next one takes its place. InputError where fewer than `count`
+    are left.
     """
     wanted = len(names) if count is None else count
     order = names if count is None else sorted(names, key=lambda n: hashlib.sha256(f"{seed}:{n}".encode()).digest())

@@ -77,13 +77,13 @@ def pack_sample(
     common = {
         "key": key,
         "trajectory": {"kind": path.kind, "disparity": path.disparity},
-        "photo_camera": _camera_facts(stack.photo_camera),
+        "photo_camera": _camera_facts(stack.prediction.camera),
         "views": views,
     }
     text = json.dumps(facts | common, indent=1, sort_keys=True, allow_nan=False) + "\n"
     first = [(f"{key}.json", text.encode()), (f"{key}.photo.png", encode_rgb(photo))]
     parts: list[bytes] = []
-    for name, data in [*first, (f"{key}.base.safetensors", encode_gaussians(stack.base)), *files]:
+    for name, data in [*first, (f"{key}.base.safetensors", encode_gaussians(stack.prediction.gaussians)), *files]:
         header = tarfile.TarInfo(name)  # mtime 0, uid 0, gid 0, mode 644
         header.size = len(data)
         parts += [header.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)]

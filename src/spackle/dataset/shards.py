@@ -1,44 +1,34 @@
-"""The manifest and the shards of a dataset, in a folder or at an address (optional: pip install fsspec)."""
+"""A dataset's shards and manifest in a folder or at an address (optional: pip install fsspec), written and read.
+
+`ViewDataset` streams the views from the tar files in a random order, each view once between all readers.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import itertools
 import json
+import logging
 import os
-from collections.abc import Iterator, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import IO, Annotated, Any, Literal
 
+import numpy as np
+import torch.distributed
 from pydantic import BaseModel, Field, model_validator
+from torch.utils.data import IterableDataset, get_worker_info
 
-from spackle.dataset.sample import END, PhotoGroup
-from spackle.errors import InputError, reading
+from spackle.dataset.sample import END, DatasetView, PhotoGroup
+from spackle.errors import InputError, one_line, reading
 from spackle.files import atomic_path
 from spackle.folders import digest_of
-from spackle.progress import Step
 
 NAME = "manifest.json"
 FORMAT = 1  # of shards and manifest; a reader of another one refuses
 Bytes = Annotated[int, Field(ge=0, le=1 << 40)]
 Share = Annotated[float, Field(ge=0, le=1)]
-
-
-def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
-    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if it cannot."""
-    place = f"{str(location).rstrip('/')}/{name}"
-    package = "an address needs a package (pip install fsspec), and its protocol perhaps another"
-    with (
-        reading(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
-        reading(place, "cannot be read: {reason}", OSError),
-        reading(place, f"not there: is {location} a dataset of `spackle dataset build`?", FileNotFoundError),
-    ):
-        if "://" not in place:
-            return open(os.path.join(location, name), "rb")
-        import fsspec
-
-        file: IO[bytes] = fsspec.open(place, "rb").open()
-        return file
 
 
 class SampleEntry(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -63,7 +53,7 @@ class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
 
     @model_validator(mode="after")
     def _filled(self) -> ShardEntry:
-        *offsets, end = accumulate((sample.size for sample in self.samples), initial=0)
+        *offsets, end = itertools.accumulate((sample.size for sample in self.samples), initial=0)
         if [sample.offset for sample in self.samples] != offsets or self.size != end + len(END):
             raise ValueError("samples that do not fill their shard")
         return self
@@ -116,6 +106,23 @@ class Manifest(BaseModel, frozen=True, extra="ignore", strict=True):
         return self.model_dump(mode="json") | {"format": FORMAT, "counts": counts}
 
 
+def open_in(location: str | os.PathLike[str], name: str) -> IO[bytes]:
+    """Open a seekable file in a folder or at an fsspec address (s3://bucket/dataset); InputError if it cannot."""
+    place = f"{str(location).rstrip('/')}/{name}"
+    package = "an address needs a package (pip install fsspec), and its protocol perhaps another"
+    with (
+        reading(place, f"cannot be opened ({{reason}}): {package}", ImportError, ValueError),
+        reading(place, "cannot be read: {reason}", OSError),
+        reading(place, f"not there: is {location} a dataset of `spackle dataset build`?", FileNotFoundError),
+    ):
+        if "://" not in place:
+            return open(os.path.join(location, name), "rb")
+        import fsspec
+
+        file: IO[bytes] = fsspec.open(place, "rb").open()
+        return file
+
+
 def load_manifest(location: str | os.PathLike[str]) -> Manifest:
     """Read the manifest of a dataset; InputError where it is missing, damaged, or of another format."""
     where = f"{str(location).rstrip('/')}/{NAME}"
@@ -157,16 +164,50 @@ def write_shard(parts: Sequence[tuple[str, Path]], target: Path, passed_over: Se
             offset += len(data)
         file.write(END)
         whole.update(END)
+    size, sha256 = offset + len(END), whole.hexdigest()
     return ShardEntry(
-        file=target.name,
-        size=offset + len(END),
-        sha256=whole.hexdigest(),
-        samples=tuple(samples),
-        passed_over=tuple(passed_over),
+        file=target.name, size=size, sha256=sha256, samples=tuple(samples), passed_over=tuple(passed_over)
     )
 
 
-def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
+class DatasetFiles:
+    """The photos of a dataset in any order, for readers that choose themselves."""
+
+    def __init__(self, location: str | os.PathLike[str]) -> None:
+        """Read the manifest in a folder or at an fsspec address; InputError without a finished dataset."""
+        self.location = location
+        self.manifest = load_manifest(location)
+        if not self.manifest.complete:
+            raise InputError(f"{location}: not finished: the command that builds it goes on")
+        self.samples = self.manifest.samples
+
+    def __len__(self) -> int:
+        """The number of photos."""
+        return len(self.samples)
+
+    def group(self, index: int) -> PhotoGroup:
+        """The files of a photo, checked by their digest; InputError where they are damaged."""
+        (group,) = self.groups([self.samples[index]])
+        return group
+
+    def groups(self, places: Sequence[Place], skip: Callable[[InputError], None] | None = None) -> Iterator[PhotoGroup]:
+        """Likewise of several photos, with one shard open at a time; `skip` gets what is damaged, if given."""
+        for shard, pairs in itertools.groupby(places, key=lambda place: place[0]):
+            with contextlib.ExitStack() as stack:
+                file: IO[bytes] | None = None
+                for _, sample in pairs:
+                    try:
+                        file = file or stack.enter_context(open_in(self.location, shard.file))
+                        group = _read_sample(file, sample, f"{self.location}/{shard.file}")
+                    except InputError as error:
+                        if skip is None:
+                            raise
+                        skip(error)
+                    else:
+                        yield group
+
+
+def _read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
     """One photo's files out of an open shard; InputError where they differ from their digest."""
     with reading(where, "cannot be read: {reason}", OSError):
         file.seek(sample.offset)
@@ -178,31 +219,87 @@ def read_sample(file: IO[bytes], sample: SampleEntry, where: str) -> PhotoGroup:
     return PhotoGroup.of(sample.key, data, f"{where}: sample {sample.key}")
 
 
-def problems(location: str | os.PathLike[str], manifest: Manifest, progress: Step) -> Iterator[str]:
-    """Read every byte of a dataset: a line for each thing that is wrong. `progress` counts bytes."""
-    done = 0
-    if not manifest.complete:
-        yield "the dataset is not finished: the command that builds it goes on"
-    for shard in manifest.shards:
-        try:
-            with open_in(location, shard.file) as file, reading(shard.file, "cannot be read: {reason}", OSError):
-                yield from (f"{shard.file}: {line}" for line in _shard_problems(file, shard))
-        except InputError as error:
-            yield str(error)
-        done += shard.size
-        progress(done, manifest.size)
+class ViewDataset(IterableDataset[DatasetView]):
+    """The views of a dataset, decoded one after the other; nothing is unpacked on the disk.
 
+    Photos are divided between ranks and, in a DataLoader, between its workers: each view comes once in all, and no two
+    readers differ by more than a photo. Samples differ in size, so a DataLoader takes `batch_size=None`.
+    """
 
-def _shard_problems(file: IO[bytes], shard: ShardEntry) -> Iterator[str]:
-    """Compare each sample with its digest, and the rest with the end of an archive."""
-    size = file.seek(0, os.SEEK_END)
-    if size != shard.size:
-        yield f"{size:,} bytes instead of {shard.size:,}"
-    file.seek(0)
-    damaged = False
-    for sample in shard.samples:
-        if hashlib.sha256(file.read(sample.size)).hexdigest() != sample.sha256:
-            damaged = True
-            yield f"sample {sample.key} ({sample.photo}) is damaged"
-    if not damaged and file.read(len(END)) != END:
-        yield "damaged after its last sample"
+    def __init__(
+        self,
+        location: str | os.PathLike[str],
+        *,
+        shuffle: int = 0,
+        seed: int = 0,
+        with_base: bool = False,
+        rank: int | None = None,
+        ranks: int | None = None,
+        on_error: Literal["raise", "skip"] = "raise",
+    ) -> None:
+        """Read the manifest.
+
+        Args:
+            location: see `DatasetFiles`.
+            shuffle: views held back to choose from at random, as they are stored (1 to 2 MB each at 640×480, and the
+                Gaussians once for each photo); the order of the shards is random too. 0: as they lie.
+            seed: of that order, together with the epoch.
+            with_base: decode the photo's Gaussians with each view.
+            rank: of this process, from 0; torch.distributed's where None.
+            ranks: how many there are; likewise.
+            on_error: "skip" leaves out what is damaged, logs a warning for it and counts it in `skipped`.
+
+        Raises InputError without a finished dataset, and ValueError for a rank outside 0..ranks - 1.
+        """
+        super().__init__()
+        self.files = DatasetFiles(location)
+        self.shuffle, self.seed, self.with_base, self.epoch = shuffle, seed, with_base, 0
+        self.on_error, self.skipped = on_error, 0  # photos and views, in this process
+        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+        self.rank = rank if rank is not None else torch.distributed.get_rank() if distributed else 0
+        self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if distributed else 1
+        if not 0 <= self.rank < self.ranks:
+            raise ValueError(f"rank {self.rank} of {self.ranks}: ranks are counted from 0")
+
+    def set_epoch(self, epoch: int) -> None:
+        """Another order, the same for all ranks; to be called before a DataLoader's workers start."""
+        self.epoch = epoch
+
+    def __iter__(self) -> Iterator[DatasetView]:
+        """Views of this rank and worker; InputError for a shard that is missing or damaged, unless `on_error` skips."""
+        worker = get_worker_info()
+        part, parts = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        shards = list(self.files.manifest.shards)  # the same order for everybody
+        if self.shuffle:
+            np.random.default_rng([self.seed, self.epoch]).shuffle(shards)
+        order = [(shard, sample) for shard in shards for sample in shard.samples]
+        reader = self.rank * parts + part
+        skip = self._skip if self.on_error == "skip" else None
+        views = (
+            (group.only(index, with_base=self.with_base), index)
+            for group in self.files.groups(order[reader :: self.ranks * parts], skip)
+            for index in range(group.views)
+        )
+        for group, index in self._shuffled(views, reader) if self.shuffle else views:
+            try:
+                view = group.view(index, with_base=self.with_base)
+            except InputError as error:
+                if skip is None:
+                    raise
+                skip(error)
+            else:
+                yield view
+
+    def _skip(self, error: InputError) -> None:
+        self.skipped += 1
+        logging.getLogger(__name__).warning("left out: %s", one_line(str(error)))
+
+    def _shuffled(self, views: Iterator[tuple[PhotoGroup, int]], reader: int) -> Iterator[tuple[PhotoGroup, int]]:
+        """A random one of the views held back makes room for the next."""
+        rng = np.random.default_rng([self.seed, self.epoch, reader])
+        held = list(itertools.islice(views, self.shuffle))
+        for view in views:
+            place = int(rng.integers(len(held)))
+            yield held[place]
+            held[place] = view
+        yield from (held[place] for place in rng.permutation(len(held)))

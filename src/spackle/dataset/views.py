@@ -10,28 +10,28 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.fill import far_fill
-from spackle.gaussians import Gaussians
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, known_inverse_depth
+from spackle.pipeline import complete
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import hole_mask
-from spackle.scene_fill import FillContext, fill_scene
 
 APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
 SPARE = 6  # frames of a path that may coincide with others
 COMPLETIONS = ("geometry", *INPAINTERS, "none")  # values of --inpainter
 
 
-@dataclasses.dataclass(frozen=True)
-class PathChoice:
+class PathChoice(NamedTuple):
     """A camera path around the photo's eye."""
 
     kind: TrajectoryKind
@@ -75,8 +75,7 @@ def _distance(one: Camera, other: Camera) -> float:
 class ViewStack:
     """A photo's Gaussians, rendered from V cameras."""
 
-    base: Gaussians
-    photo_camera: Camera
+    prediction: BasePrediction
     cameras: Sequence[Camera]  # the first one is the photo's
     rgb: Tensor  # [V, H, W, 3] sRGB in 0..1, over black
     depth: Tensor  # [V, H, W] expected z; 0 where alpha is 0
@@ -85,22 +84,21 @@ class ViewStack:
 
 
 @torch.no_grad()
-def render_views(base: Gaussians, photo_camera: Camera, cameras: Sequence[Camera], renderer: Renderer) -> ViewStack:
+def render_views(prediction: BasePrediction, cameras: Sequence[Camera], renderer: Renderer) -> ViewStack:
     """Render the base from each camera."""
-    drawn = [renderer.render(base, camera) for camera in cameras]
-    rgb, depth, alpha = (torch.stack([getattr(view, name) for view in drawn]) for name in ("rgb", "depth", "alpha"))
-    return ViewStack(base, photo_camera, tuple(cameras), rgb, depth, alpha, hole_mask(alpha))
+    drawn = [renderer.render(prediction.gaussians, camera).tensors for camera in cameras]
+    rgb, depth, alpha = (torch.stack(images) for images in zip(*drawn, strict=True))
+    return ViewStack(prediction, cameras, rgb, depth, alpha, hole_mask(alpha))
 
 
-@dataclasses.dataclass(frozen=True)
-class Completion:
+class Completion(NamedTuple):
     """A way to targets [V, H, W, 3] sRGB: new colours where a stack's mask is, elsewhere its rgb, bit for bit."""
 
     name: str
     version: str  # another version may give other pixels
     complete: Callable[[ViewStack], Tensor]
     notice: str = ""  # as of `Inpainter`
-    files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
+    files: Mapping[str, Path] = {}
 
 
 def open_completion(name: str, options: InpainterOptions, renderer: Renderer) -> Completion:
@@ -116,12 +114,13 @@ def open_completion(name: str, options: InpainterOptions, renderer: Renderer) ->
 @torch.no_grad()
 def render_completed(views: ViewStack, renderer: Renderer) -> Tensor:
     """Each hole as one completed scene shows it, filled by seeds alone in the widest view: the same in all views."""
-    context = FillContext(views.base, views.photo_camera, renderer, texture=None)
-    aux = fill_scene(context, views.cameras, exact=True).aux
+    prediction = views.prediction
+    aux = complete(prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer).aux
     targets = []
     for camera, target, hole in zip(views.cameras, views.rgb, views.mask, strict=True):
         if bool(hole.any()):
-            target = torch.where(hole[..., None], _covered(renderer.render([views.base, aux], camera)), target)
+            colors = _covered(renderer.render([prediction.gaussians, aux], camera))
+            target = torch.where(hole[..., None], colors, target)
         targets.append(target)
     return torch.stack(targets)
 
@@ -137,17 +136,15 @@ def _covered(drawn: Rendering) -> Tensor:
 
 
 def paint(inpainter: Inpainter, views: ViewStack) -> Tensor:
-    """The views with their holes painted, given in the order of the path."""
-    order = path_order(views.cameras)
+    """The views with their holes painted, given as a flight along the path meets them.
+
+    The first view, the photo's, stands where the detour is least.
+    """
+    eyes = torch.stack([camera.position.double() for camera in views.cameras])
+    others = list(range(1, len(eyes)))
+    orders = [[*others[:place], 0, *others[place:]] for place in range(len(eyes))]
+    order = min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))
     inverse_depth = known_inverse_depth(views.depth, views.mask)
     targets = torch.empty_like(views.rgb)
     targets[order] = inpainter.paint(views.rgb[order], views.mask[order], inverse_depth[order])
     return targets
-
-
-def path_order(cameras: Sequence[Camera]) -> list[int]:
-    """Views as a flight along the path meets them: the first one, the photo's, stands where the detour is least."""
-    eyes = torch.stack([camera.position.double() for camera in cameras])
-    others = list(range(1, len(cameras)))
-    orders = [[*others[:place], 0, *others[place:]] for place in range(len(cameras))]
-    return min(orders, key=lambda order: float(eyes[order].diff(dim=0).norm(dim=-1).sum()))

@@ -14,7 +14,6 @@ import spackle
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open_base, open_loaded
 from spackle.camera_path import MAX_DISPARITY
-from spackle.dataset.options import base_digest
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
@@ -29,7 +28,7 @@ from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
 from spackle.training.features import load_features
-from spackle.weights import weights_digest
+from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
 MAX_LIMIT = 1_000_000
@@ -212,7 +211,7 @@ def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequen
             "name": base.public_name,
             "title": base.title,
             "says": base.description,
-            "weights": base_digest(base.files),
+            "weights": weights_digests(base.files),
             "precision": base.precision,
             "device": options.device.type,
         },

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from spackle.bases.sharp.base import TunableSharp, normalised_camera
 from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
-from spackle.dataset.reader import DatasetFiles
 from spackle.dataset.sample import DatasetView
+from spackle.dataset.shards import DatasetFiles
 from spackle.device import enough_memory
 from spackle.errors import InputError
 from spackle.files import write_whole

@@ -21,7 +21,7 @@ from spackle.bases.lift import lift
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
-from spackle.dataset.reader import DatasetFiles
+from spackle.dataset.shards import DatasetFiles
 from spackle.errors import InputError, reading
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo

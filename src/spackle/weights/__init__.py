@@ -94,6 +94,12 @@ def weights_digest(path: Path) -> str:
     return file_digest(path) if entry is None else entry.sha256
 
 
+def weights_digests(files: Mapping[str, Path]) -> str | dict[str, str] | None:
+    """`weights_digest` of a network's files: of each by its name where there are several, None where there are none."""
+    digests = {name: weights_digest(file) for name, file in files.items()}
+    return digests if len(digests) > 1 else next(iter(digests.values()), None)
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file of weights, as 64 hexadecimal digits; InputError where it cannot be read."""
     check_file(path, "file of weights")
