@@ -27,7 +27,7 @@ from spackle.camera import Camera
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import flicker, pixel_grid, sample
 from spackle.color import srgb_to_linear
-from spackle.evaluation.motorcycle import load_motorcycle
+from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.gaussians import Gaussians
 from spackle.inpaint.opencv import OpenCV
 from spackle.render import get_renderer

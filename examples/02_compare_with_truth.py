@@ -13,7 +13,7 @@ from torch import Tensor
 
 import spackle
 from spackle.bases.lift import lift
-from spackle.evaluation.motorcycle import load_motorcycle
+from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.formats import save_gray_png, save_png
 
 

@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool2d
 import spackle
 from spackle.bases.lift import lift
 from spackle.color import linear_to_srgb, srgb_to_linear
-from spackle.evaluation.motorcycle import load_motorcycle
+from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.formats import save_png
 from spackle.render import TILE
 

@@ -24,9 +24,8 @@ from spackle.evaluation import bench
 from spackle.evaluation.case import Points
 from spackle.evaluation.efficiency import efficiency_tables
 from spackle.evaluation.folder import KINDS, load_run, open_folder
-from spackle.evaluation.paper import PAPER
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import Row
+from spackle.evaluation.rows import PAPER, Row
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.timing import BASE_PATH, EXTRA, STAGES

@@ -20,11 +20,11 @@ from PIL import Image
 from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.evaluation import paper
 from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, Points, known_depth, load_case
-from spackle.evaluation.datasets import DATASETS, get_dataset
+from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.datasets.multiview import spread
+from spackle.evaluation.rows import IMAGES
 from spackle.image import working_size
 
 Array = NDArray[Any]
@@ -197,7 +197,7 @@ EXPECTED = {"middlebury": 1, "booster": 2, "wildrgbd": 5, "eth3d": 5, "llff": 5,
 
 
 def cases(name: str, root: Path) -> list[Case]:
-    return list(get_dataset(name).cases(root))
+    return read_cases(name, root)
 
 
 def error_of(name: str, root: Path) -> str:
@@ -248,9 +248,7 @@ def test_each_tree_is_read_by_its_dataset_and_recognised_by_the_others(asked: st
 
 
 def test_names_and_roots_without_anything(tmp_path: Path) -> None:
-    assert {dataset.title for dataset in DATASETS.values()} == set(paper.IMAGES)
-    with pytest.raises(InputError, match="did you mean middlebury"):
-        get_dataset("midlebury")
+    assert {dataset.title for dataset in DATASETS.values()} == set(IMAGES)
     assert "no such folder" in error_of("llff", tmp_path / "nowhere")
     assert "looks like" not in error_of("llff", tmp_path)
 
@@ -542,7 +540,8 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
     assert (loaded.full.width, loaded.photo.width, loaded.photo.height) == (96, 64, 48)
     assert loaded.photo.focal_px == pytest.approx(FOCAL * 64 / 48)
     (second,) = loaded.seconds
-    assert second.rgb.shape == (26, 36, 3)
+    assert second.truth is not None
+    assert second.truth.shape == (26, 36, 3)
     for eye, camera, width in ((EYES[0], loaded.camera, 64), (EYES[1], second.camera, 36)):
         uv, _ = camera.project(torch.tensor(POINTS).float())
         expected = torch.tensor([eye.pixel(point)[:2] for point in POINTS]).float() * width / WIDTH

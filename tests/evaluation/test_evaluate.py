@@ -464,6 +464,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
     ("words", "message"),
     [
         (("--methods", "spakle"), "did you mean spackle?"),
+        (("--dataset", "midlebury"), "did you mean middlebury"),
         (("--base", "auto"), "--base auto"),
         (("--metrics", "psnr"), "add --protocol near-view"),
         (("--disparity", "0.3,x"), "not numbers"),

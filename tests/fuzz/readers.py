@@ -32,7 +32,7 @@ from spackle.dataset.inspect import problems
 from spackle.dataset.photos import find_photos
 from spackle.dataset.shards import load_manifest
 from spackle.evaluation.case import load_case
-from spackle.evaluation.datasets import get_dataset
+from spackle.evaluation.datasets import read_cases
 from spackle.folders import digest_of
 from spackle.formats import PlyFile, load_cameras, load_path, save_ply
 from spackle.gaussians import Gaussians
@@ -157,7 +157,7 @@ def _described(folder: Path) -> None:
 
 def _tree(name: str, *makers: Callable[[Path], object]) -> Reader:
     def read(folder: Path) -> None:
-        case = get_dataset(name).cases(folder)[0]
+        case = read_cases(name, folder)[0]
         load_case(case)
         for facts in (case.depth, case.points):
             if facts is not None:

@@ -18,8 +18,8 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.cli.first_use import compiled_ahead
 from spackle.cli.photo import save_views
+from spackle.evaluation.datasets.stereo import StereoPair, load_motorcycle
 from spackle.evaluation.metrics import sharpness
-from spackle.evaluation.motorcycle import StereoPair, load_motorcycle
 from spackle.files import write_json
 from spackle.folders import results_folder
 from spackle.formats import save_ply, save_png

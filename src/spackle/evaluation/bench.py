@@ -17,10 +17,10 @@ from spackle.bases.sharp.checkpoint import unused_shapes
 from spackle.bases.sharp.layers import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.errors import InputError
-from spackle.evaluation.case import Case, load_case
+from spackle.evaluation.case import Case, Viewpoint, load_case
 from spackle.evaluation.efficiency import SIDE, efficiency_tables
 from spackle.evaluation.folder import ROWS, measure_images, open_folder, write_rows
-from spackle.evaluation.protocols import Viewpoint, large_views
+from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import NOTE, Row, Run
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.tables import write_tables

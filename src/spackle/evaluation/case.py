@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
+from operator import attrgetter
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +14,9 @@ from torch import Tensor
 from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.image import MAX_SIDE, Photo, load_photo, resize_photo
+from spackle.evaluation.rows import NEAR
+from spackle.files import files_in
+from spackle.image import MAX_SIDE, PHOTO_SUFFIXES, Photo, load_photo, resize_photo
 
 SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
 
@@ -50,29 +53,37 @@ class Case:
     problem: str | None = None  # why it cannot be used, where that is seen before its turn: of itself, not of the rest
 
 
-class EvalDataset(Protocol):
+@dataclasses.dataclass(frozen=True)
+class EvalDataset:
     """A dataset in its official folders."""
 
     name: str  # as it is typed
     title: str  # as the paper's tables have it
     terms: str  # of use, in a few words
-
-    def cases(self, root: Path) -> Sequence[Case]:
-        """All inputs, in an order that depends on names alone.
-
-        Raises:
-            InputError: folders that are not this dataset's; the message tells what was expected where.
-        """
-        ...
+    expected: str  # which files are looked for, for messages
+    is_scene: Callable[[Path], bool]
+    cases: Callable[[Mapping[str, Path]], list[Case]]  # of all scenes by name; InputError for a missing or damaged file
+    skip: frozenset[str] = frozenset()  # folders that are skipped: no truth, or the same photos again
+    scene_name: Callable[[Path], str] = attrgetter("name")
 
 
-@dataclasses.dataclass(frozen=True)
-class LoadedView:
-    """A true second photo."""
+def has_any(folder: Path, *names: str) -> bool:
+    """Whether a folder has one of these files or folders."""
+    return any((folder / name).exists() for name in names)
 
+
+def photo_files(folder: Path) -> list[Path]:
+    """The photos right in a folder, by name; none where there is no folder."""
+    return files_in(folder, PHOTO_SUFFIXES) if folder.is_dir() else []
+
+
+class Viewpoint(NamedTuple):
+    """A view to look at."""
+
+    setting: str
     name: str
-    rgb: Tensor  # [H, W, 3] sRGB in 0..1, both sides even
-    camera: Camera  # of these pixels, in the input photo's frame and the dataset's lengths
+    camera: Camera
+    truth: Tensor | None = None  # [H, W, 3] sRGB 0..1, of the camera's size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +94,7 @@ class LoadedCase:
     full: Photo  # the input as it is stored, with the dataset's focal length: for bases that look at all its pixels
     photo: Photo  # the input at the working size
     camera: Camera  # of `photo`, at the world's origin: the dataset's, or the photo's own where that has none
-    seconds: tuple[LoadedView, ...]
+    seconds: tuple[Viewpoint, ...]  # with cameras in the input photo's frame and the dataset's lengths
     lacks: tuple[str, ...] = ()  # why second photos of the case are not among them
 
 
@@ -116,14 +127,14 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
     return LoadedCase(case, full, photo, camera, tuple(seconds), tuple(lacks))
 
 
-def _load_view(view: SecondView, max_side: int) -> LoadedView:
+def _load_view(view: SecondView, max_side: int) -> Viewpoint:
     stored = load_photo(view.photo)
     _check_shape(view.photo, stored, view.camera)
     photo = resize_photo(stored, max_side)
     camera = view.camera.resized(photo.width, photo.height)
     width, height = (max(1, side - side % 2) for side in (photo.width, photo.height))
     rgb = photo.rgb[:height, :width].contiguous()
-    return LoadedView(view.name, rgb, dataclasses.replace(camera, width=width, height=height))
+    return Viewpoint(NEAR, view.name, dataclasses.replace(camera, width=width, height=height), rgb)
 
 
 def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:

@@ -7,8 +7,20 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from spackle.evaluation.paper import IMAGES, PAPER, datasets, images_text, paper_rows, setting_title
-from spackle.evaluation.rows import NOTE, Row, Run, mean, median, pivot
+from spackle.evaluation.rows import (
+    IMAGES,
+    NOTE,
+    PAPER,
+    Row,
+    Run,
+    datasets,
+    images_text,
+    mean,
+    median,
+    paper_rows,
+    pivot,
+    setting_title,
+)
 from spackle.evaluation.table import EMPTY, Cells, Table, Text, count_text, percent_text
 from spackle.evaluation.timing import BASE_PATH, EXTRA, STAGES
 

@@ -17,9 +17,9 @@ from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, mea
 from spackle.evaluation.methods import Comparison
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
-from spackle.evaluation.protocols import Viewpoint, large_views, measure_views
+from spackle.evaluation.protocols import large_views, measure_views
 from spackle.evaluation.report import REPORT, make_report, save_picture
-from spackle.evaluation.rows import NEAR, NOTE, REMARK, Row, Run
+from spackle.evaluation.rows import NOTE, REMARK, Row, Run
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.sheets import BEST, WORST, strip, write_sheets
 from spackle.evaluation.table import NOT_RUN
@@ -101,8 +101,8 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, not options.base.kind.network) if options.near else None
     if alignment:
-        cameras = [to_base(v.camera, loaded.camera, prediction.camera, alignment.scale) for v in loaded.seconds]
-        views = [Viewpoint(NEAR, v.name, camera, v.rgb) for v, camera in zip(loaded.seconds, cameras, strict=True)]
+        lenses = loaded.camera, prediction.camera, alignment.scale
+        views = [view._replace(camera=to_base(view.camera, *lenses)) for view in loaded.seconds]
     else:
         views = large_views(prediction, options.disparities)
 

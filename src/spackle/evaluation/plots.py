@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spackle.errors import InputError
 from spackle.evaluation.methods import METHODS
-from spackle.evaluation.paper import paper_rows
-from spackle.evaluation.rows import Row, Run, mean, pivot
+from spackle.evaluation.rows import Row, Run, mean, paper_rows, pivot
 from spackle.evaluation.sheets import ranked
 from spackle.evaluation.tables import method_name
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
-from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError, reason_in_a_line
+from spackle.evaluation.case import Viewpoint
 from spackle.evaluation.methods import Method
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.rows import REMARK, Row
@@ -21,15 +20,6 @@ from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.training.features import FeatureNet
 from spackle.training.losses import hole_distance
-
-
-class Viewpoint(NamedTuple):
-    """A view to look at."""
-
-    setting: str
-    name: str
-    camera: Camera
-    truth: Tensor | None = None  # [H, W, 3] sRGB 0..1, of the camera's size
 
 
 @dataclasses.dataclass(frozen=True)

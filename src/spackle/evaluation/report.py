@@ -18,10 +18,9 @@ from spackle.color import to_bytes
 from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
-from spackle.evaluation.paper import IMAGES
 from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import TRUTH
-from spackle.evaluation.rows import NEAR, REMARK, Run, mean
+from spackle.evaluation.rows import IMAGES, NEAR, REMARK, Run, mean
 from spackle.evaluation.sheets import Ranking, column_title, columns, rank
 from spackle.evaluation.table import EMPTY, Table, count_text, write_table
 from spackle.evaluation.tables import make_tables, method_name, ratio_text

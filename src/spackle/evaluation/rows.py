@@ -1,16 +1,23 @@
-"""What is measured: one row a figure; tables are pivots of rows."""
+"""What is measured, and the paper's own figures (paper.json): one row a figure; tables are pivots of rows."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 from typing import Any, NamedTuple
 
 NEAR = "near"  # the setting of views from where a second photo was taken
 PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics whose values are text; a note's name follows
 Value = float | str | None
+PAPER: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath("paper.json").read_text("utf-8"))
+IMAGES: dict[str, int] = PAPER["images"]  # of each dataset, in the order of the tables
+SETTINGS: list[str] = PAPER["settings"]  # S1, S2, S3
+DISPARITIES = tuple(map(float, SETTINGS))
 
 
 class Row(NamedTuple):
@@ -119,3 +126,34 @@ class Run:
         own = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
         shown = max(own, key=lambda row: float(row.value or 0))
         return shown.setting, shown.view
+
+
+@functools.cache
+def paper_rows(label: str) -> tuple[Row, ...]:
+    """A table's figures in our units: shares where the paper has percent. Near views where it has one setting."""
+    rows = []
+    for table in (table for table in PAPER["tables"] if table["label"] == label):
+        metrics = table["metrics"]
+        for dataset, method, *values in table["values"]:
+            settings = SETTINGS if len(values) > len(metrics) else [NEAR]
+            keys = [(setting, metric) for setting in settings for metric in metrics]
+            for (setting, metric), value in zip(keys, values, strict=True):
+                name = metric.removesuffix("_percent")
+                rows.append(Row(dataset, "", setting, "", method, name, value if name == metric else value / 100))
+    return tuple(rows)
+
+
+def setting_title(setting: str, pattern: str = "{}") -> str:
+    """ "S1" for "0.3", or by the pattern "{}: disparity {}"; other disparities than the paper's have no such name."""
+    return pattern.format(f"S{SETTINGS.index(setting) + 1}", setting) if setting in SETTINGS else f"disparity {setting}"
+
+
+def datasets(runs: Sequence[Run]) -> list[str]:
+    """Titles: the paper's in its order, whether they were run or not, then others."""
+    return list(dict.fromkeys([*IMAGES, *(run.title for run in runs)]))
+
+
+def images_text(run: Run) -> str:
+    """How many of the paper's images were measured."""
+    wanted = IMAGES.get(run.title)
+    return f"{len(run.measured)}" if wanted is None else f"{len(run.measured)}/{wanted}"

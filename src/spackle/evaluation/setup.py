@@ -17,11 +17,11 @@ from spackle.camera_path import MAX_DISPARITY
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
-from spackle.evaluation.datasets import DATASETS, get_dataset
+from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
-from spackle.evaluation.paper import DISPARITIES
 from spackle.evaluation.protocols import Gauges
+from spackle.evaluation.rows import DISPARITIES
 from spackle.folders import digest_of
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.pipeline import FillOptions
@@ -151,8 +151,8 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     InputError for an option, a dataset, weights or a package that cannot be used.
     """
     options.check()
-    dataset = get_dataset(options.dataset)
-    cases, limit = dataset.cases(options.root), options.limit
+    dataset = DATASETS[options.dataset]
+    cases, limit = read_cases(dataset.name, options.root), options.limit
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)

@@ -10,8 +10,20 @@ from spackle.errors import InputError
 from spackle.evaluation.efficiency import efficiency_tables
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, SPLIT, definitions, reduction
-from spackle.evaluation.paper import IMAGES, PAPER, datasets, images_text, paper_rows, setting_title
-from spackle.evaluation.rows import NEAR, Mean, Row, Run, mean, pivot
+from spackle.evaluation.rows import (
+    IMAGES,
+    NEAR,
+    PAPER,
+    Mean,
+    Row,
+    Run,
+    datasets,
+    images_text,
+    mean,
+    paper_rows,
+    pivot,
+    setting_title,
+)
 from spackle.evaluation.table import (
     EMPTY,
     NOT_RUN,

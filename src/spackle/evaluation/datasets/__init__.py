@@ -1,19 +1,64 @@
-"""The paper's six evaluation datasets, each read from its official folders."""
+"""The paper's six evaluation datasets, and their scenes below a folder."""
 
 from __future__ import annotations
 
-from spackle.errors import check_name
-from spackle.evaluation.case import EvalDataset
-from spackle.evaluation.datasets.posed_photos import Eth3d, Llff, Tanks, WildRgbd
-from spackle.evaluation.datasets.stereo import Booster, Middlebury
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
 
-__all__ = ["DATASETS", "get_dataset"]
+from spackle.errors import InputError
+from spackle.evaluation.case import Case, EvalDataset
+from spackle.evaluation.datasets.posed_photos import ETH3D, LLFF, TANKS, WILDRGBD
+from spackle.evaluation.datasets.stereo import BOOSTER, MIDDLEBURY
 
-_ALL: tuple[EvalDataset, ...] = (Middlebury(), Booster(), WildRgbd(), Tanks(), Eth3d(), Llff())
-DATASETS: dict[str, EvalDataset] = {dataset.name: dataset for dataset in _ALL}  # in the order of the paper's tables
+__all__ = ["DATASETS", "read_cases"]
+
+# In the order of the paper's tables.
+DATASETS = {dataset.name: dataset for dataset in (MIDDLEBURY, BOOSTER, WILDRGBD, TANKS, ETH3D, LLFF)}
+MAX_DEPTH = 4  # of a scene below the root; the deepest official one is root/train/balanced/SCENE
+MAX_FOLDERS = 100_000  # opened in search of scenes; WildRGB-D has 23,000 of them
+GUESS_FOLDERS = 300  # opened to guess what a folder is instead
 
 
-def get_dataset(name: str) -> EvalDataset:
-    """A dataset by its name as it is typed; InputError with the nearest name otherwise."""
-    check_name("dataset", name, DATASETS)
-    return DATASETS[name]
+def read_cases(name: str, root: Path) -> list[Case]:
+    """All inputs of a dataset at or below `root`, in an order that depends on names alone.
+
+    Raises:
+        InputError: no such folder, no scene of the dataset in it (the message names what was expected), two scenes of
+            one name, or a scene whose files are missing or damaged.
+    """
+    dataset = DATASETS[name]
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder: give the one that {name} was unpacked in")
+    if root.name in ("", ".."):  # a scene is called like its folder
+        root = root.resolve()
+    found = sorted(_walk(root, dataset, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
+    if not found:
+        # The dataset that has most scenes there, after a short look; of equals the later one has the plainer marks.
+        counts = {one.name: sum(1 for _ in _walk(root, one, GUESS_FOLDERS)) for one in reversed(DATASETS.values())}
+        likely = max(counts, key=lambda name: counts[name])
+        hint = f"; this looks like {likely}" if counts[likely] else ""
+        raise InputError(f"{root}: no scene of {name} at or below it: expected {dataset.expected}{hint}")
+    scenes: dict[str, Path] = {}
+    for folder in found:
+        other = scenes.setdefault(dataset.scene_name(folder), folder)
+        if other is not folder:
+            raise InputError(f"{folder}: {other} is called the same: give the folder of one size or part alone")
+    return dataset.cases(scenes)
+
+
+def _walk(root: Path, dataset: EvalDataset, budget: int) -> Iterator[Path]:
+    """Scenes in breadth-first order; what lies inside a scene is none."""
+    level = [root]
+    for depth in range(MAX_DEPTH + 1):
+        below: list[Path] = []
+        for folder in level:
+            if dataset.is_scene(folder):
+                yield folder
+            elif depth < MAX_DEPTH and budget > 0:
+                budget -= 1
+                with contextlib.suppress(OSError), os.scandir(folder) as entries:  # no right to look into it
+                    names = [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+                    below += [folder / name for name in sorted(names) if name not in dataset.skip]
+        level = below

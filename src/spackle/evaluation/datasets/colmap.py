@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.errors import InputError, reason_in_a_line, shown
+from spackle.errors import InputError, reading, shown
 from spackle.evaluation.case import Points
 from spackle.files import check_file
 from spackle.formats.camera_files import LARGEST, checked_camera
 from spackle.gaussians import quat_to_matrix
 
 Array = NDArray[Any]
-T = TypeVar("T")
 
 # A lens that bends the corner by more than this part of the long side is refused. What is less is left alone: photos
 # that stand close to each other are bent alike, so a 1 % bend moves a pixel against its twin by a few percent of the
@@ -30,10 +29,6 @@ MAX_ERROR_PX = 2.0  # of a point's reprojection, on average over its photos
 # Name and number of parameters by COLMAP's model id; the others' lenses are too far from a pinhole's.
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 POINT_2D = np.dtype([("uv", "<f8", (2,)), ("id", "<i8")])  # id -1: matched with nothing
-
-CameraRecord = tuple[int, int | str, int, int, list[float]]  # id, model, width, height, parameters
-ImageRecord = tuple[list[float], int, str, Array]  # wxyz and translation, camera id, name, POINT_2D [n]
-PointRecord = tuple[float, float, float, float, float]  # id, x, y, z, error in pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,23 +51,18 @@ class Model:
 
     def points(self, view: ColmapView) -> Points:
         """The reliable points that a view sees, with their depth in front of it."""
-        place = np.searchsorted(self.ids, view.ids)
-        place = np.minimum(place, max(0, len(self.ids) - 1))
-        known = self.ids[place] == view.ids if len(self.ids) else np.zeros(len(view.ids), bool)
-        z = view.camera.to_camera(torch.from_numpy(self.xyz[place[known]]))[:, 2]
+        _, seen, known = np.intersect1d(view.ids, self.ids, assume_unique=True, return_indices=True)
+        z = view.camera.to_camera(torch.from_numpy(self.xyz[known]))[:, 2]
         front = z > 0
-        return Points(torch.from_numpy(view.uv[known]).float()[front], z.float()[front])
+        return Points(torch.from_numpy(view.uv[seen]).float()[front], z.float()[front])
 
 
 def model_folder(scene: Path) -> Path:
     """Where a scene's model is: sparse/0, sparse, or the same in dense/, as COLMAP's undistorter leaves it."""
-    places = [scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")]
-    found = next(
-        (place for place in places if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt"))), None
-    )
-    if found is None:
-        raise InputError(f"{scene / 'sparse/0'}: no COLMAP model: expected cameras, images, points3D as .bin or .txt")
-    return found
+    for place in (scene / name for name in ("sparse/0", "sparse", "dense/sparse/0", "dense/sparse")):
+        if any((place / f"cameras{end}").is_file() for end in (".bin", ".txt")):
+            return place
+    raise InputError(f"{scene / 'sparse/0'}: no COLMAP model: expected cameras, images, points3D as .bin or .txt")
 
 
 def read_model(folder: Path) -> Model:
@@ -81,34 +71,27 @@ def read_model(folder: Path) -> Model:
     Raises:
         InputError: a file that is missing or damaged, or a lens that is no pinhole's.
     """
+    damaged = "not a COLMAP file ({reason}): it is damaged or cut off"
     binary = (folder / "cameras.bin").is_file()
-    at = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in ("cameras", "images", "points3D")]
-    images = _whole(at[1], images_bin if binary else images_txt)
-    points = _whole(at[2], points_bin if binary else points_txt)
-    lenses = {camera[0]: _lens(at[0], camera) for camera in _whole(at[0], cameras_bin if binary else cameras_txt)}
-    try:
-        views = [_view(lenses[camera], name, pose, observed) for pose, camera, name, observed in images]
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{at[1]}: {reason_in_a_line(error)}: the file is damaged") from error
-    try:
-        table = np.array([point for point in points if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
-    except OverflowError as error:  # a number of 400 digits
-        raise InputError(f"{at[2]}: {reason_in_a_line(error)}: the file is damaged") from error
+    cameras, images, points = (
+        folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images", "points3D")
+    )
+    for path in (cameras, images, points):
+        check_file(path, "part of a COLMAP model")
+    with reading(points, damaged):
+        records = _points_bin(points) if binary else _points_txt(points)
+        table = np.array([point for point in records if point[4] <= MAX_ERROR_PX], np.float64).reshape(-1, 5)
     table = table[(np.abs(table[:, :4]) <= [2**53, LARGEST, LARGEST, LARGEST]).all(axis=1)]
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    return Model(tuple(sorted(views, key=lambda view: view.name)), table[:, 0].astype(np.int64), table[:, 1:4])
+    ids, first = np.unique(table[:, 0], return_index=True)
+    with reading(cameras, damaged):
+        lenses = {key: _lens(cameras, *lens) for key, *lens in (_cameras_bin if binary else _cameras_txt)(cameras)}
+    with reading(images, damaged):
+        photos = (_images_bin if binary else _images_txt)(images)
+        views = [_view(images, lenses[camera], name, pose, seen) for pose, camera, name, seen in photos]
+    return Model(tuple(sorted(views, key=lambda view: view.name)), ids.astype(np.int64), table[first, 1:4])
 
 
-def _whole(path: Path, read: Callable[[Path], Iterable[T]]) -> list[T]:
-    check_file(path, "part of a COLMAP model")
-    try:
-        return list(read(path))
-    except (struct.error, ValueError, IndexError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path}: not a COLMAP file ({reason_in_a_line(error)}): it is damaged or cut off") from error
-
-
-def _lens(path: Path, camera: CameraRecord) -> Camera:
-    _, model, width, height, parameters = camera
+def _lens(path: Path, model: int | str, width: int, height: int, parameters: list[float]) -> Camera:
     known = next((m for key, m in MODELS.items() if model in (key, m[0])), None)
     if known is None or len(parameters) != known[1]:
         raise InputError(f"{path}: lens model {model} is no pinhole: undistort the photos with COLMAP first")
@@ -128,35 +111,36 @@ def _lens(path: Path, camera: CameraRecord) -> Camera:
     return lens
 
 
-def _view(lens: Camera, name: str, pose: list[float], observed: Array) -> ColmapView:
+def _view(path: Path, lens: Camera, name: str, pose: list[float], observed: Array) -> ColmapView:
     quaternion, shift = torch.tensor(pose[:4], dtype=torch.float64), torch.tensor(pose[4:], dtype=torch.float64)
+    where = f"{path}: the pose of {name}"
     if len(shift) != 3 or not 1e-6 < float(quaternion.norm()) < LARGEST:
-        raise ValueError(f"the pose of {name} is no rotation")
+        raise InputError(f"{where} is no rotation: the file is damaged")
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3], matrix[:3, 3] = quat_to_matrix(quaternion), shift
     seen = observed[observed["id"] >= 0]
     _, first = np.unique(seen["id"], return_index=True)  # a point may have been found twice in a photo
     seen = seen[first]
-    camera = checked_camera(lens.K, matrix, lens.width, lens.height, f"the pose of {name}", dtype=torch.float64)
+    camera = checked_camera(lens.K, matrix, lens.width, lens.height, where, dtype=torch.float64)
     return ColmapView(name, camera, seen["uv"].copy(), seen["id"].copy())
 
 
-# The records of each file. A damaged file raises struct.error, ValueError or the like.
+# --- the records of each file
 
 
-def cameras_bin(path: Path) -> Iterator[CameraRecord]:
+def _cameras_bin(path: Path) -> Iterator[tuple[Any, ...]]:
+    """Key, model, width, height, parameters."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         key, model, width, height = struct.unpack_from("<iiQQ", data, at)
         number = MODELS[model][1] if model in MODELS else 0  # another's length is unknown, and it is refused
         yield key, model, width, height, list(struct.unpack_from(f"<{number}d", data, at + 24))
-        if model not in MODELS:
-            return
         at += 24 + 8 * number
 
 
-def images_bin(path: Path) -> Iterator[ImageRecord]:
+def _images_bin(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
+    """Quaternion wxyz and translation, camera, name, POINT_2D [n]."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
@@ -168,12 +152,13 @@ def images_bin(path: Path) -> Iterator[ImageRecord]:
         at = end + 9 + points * POINT_2D.itemsize
 
 
-def points_bin(path: Path) -> Iterator[PointRecord]:
+def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
+    """Key, x, y, z, error in pixels."""
     data = path.read_bytes()
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        key, x, y, z, error, track = struct.unpack_from("<Q3d3xdQ", data, at)
-        yield key, x, y, z, error
+        *point, track = struct.unpack_from("<Q3d3xdQ", data, at)
+        yield tuple(point)
         at += 51 + 8 * track
 
 
@@ -182,12 +167,12 @@ def _lines(path: Path) -> Iterator[str]:
         yield from (line.rstrip("\n") for line in file if not line.startswith("#"))
 
 
-def cameras_txt(path: Path) -> Iterator[CameraRecord]:
+def _cameras_txt(path: Path) -> Iterator[tuple[Any, ...]]:
     for key, model, width, height, *parameters in (line.split() for line in _lines(path) if line.strip()):
         yield int(key), model, int(width), int(height), [float(p) for p in parameters]
 
 
-def images_txt(path: Path) -> Iterator[ImageRecord]:
+def _images_txt(path: Path) -> Iterator[tuple[list[float], int, str, Array]]:
     """Two lines a photo; the second is empty where nothing was found in it."""
     lines = _lines(path)
     for line in lines:
@@ -200,8 +185,6 @@ def images_txt(path: Path) -> Iterator[ImageRecord]:
         yield [float(p) for p in pose], int(camera), name.strip(), observed
 
 
-def points_txt(path: Path) -> Iterator[PointRecord]:
-    for line in _lines(path):
-        if line.strip():
-            key, x, y, z, _, _, _, error = line.split(maxsplit=8)[:8]
-            yield int(key), float(x), float(y), float(z), float(error)
+def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
+    for key, x, y, z, _, _, _, error, *_ in (line.split(maxsplit=8) for line in _lines(path) if line.strip()):
+        yield int(key), float(x), float(y), float(z), float(error)

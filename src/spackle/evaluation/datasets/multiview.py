@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.evaluation.case import Case, SecondView
+from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
 MAX_SECONDS = 3
@@ -36,6 +36,8 @@ class Posed:
     camera: Camera  # world of the scene, float64
     depth: float  # in the middle of what it sees; nan where that is not known
     ids: NDArray[Any] | None = None  # of the points that it sees
+    points: Callable[[], Points] | None = None  # of these, where they are in the photo
+    bounds: tuple[float, float] | None = None  # nearest and farthest depth
 
 
 def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[str] | None = None) -> list[Posed]:
@@ -45,12 +47,12 @@ def posed_by(scene: Path, model: Model, photos: Sequence[Path], names: Sequence[
         InputError: a single view.
     """
     check_two(scene, len(model.views))
-    stems = names or [photo.stem for photo in photos]
     posed = []
-    for view, name, photo in zip(model.views, stems, photos, strict=True):
+    for view, photo, name in zip(model.views, photos, names or [photo.stem for photo in photos], strict=True):
         z = model.points(view).z
         middle = float(z.median()) if len(z) else math.nan
-        posed.append(Posed(f"{scene.name}/{name}", photo, view.camera, middle, view.ids))
+        points = partial(model.points, view) if len(view.ids) else None
+        posed.append(Posed(f"{scene.name}/{name}", photo, view.camera, middle, view.ids, points))
     return posed
 
 
@@ -60,35 +62,24 @@ def check_two(scene: Path, count: int) -> None:
         raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
 
 
-def make_cases(
-    views: Sequence[Posed],
-    wanted: Iterable[int] | None = None,
-    *,
-    model: Model | None = None,
-    bounds: Mapping[Path, tuple[float, float]] | None = None,
-    metric: bool = False,
-) -> list[Case]:
-    """Photos as cases, their second views in their own frames.
+def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None, *, metric: bool = False) -> list[Case]:
+    """Photos as cases, their second views (of all `views`) in their own frames.
 
     Args:
-        views: all photos of a scene; those at the indices `wanted` become cases, all where None.
-        wanted: see `views`.
-        model: has the views' points, and views in the same order.
-        bounds: nearest and farthest depth by photo, where known.
+        views: all photos of a scene.
+        wanted: indices of the photos that become cases; all where None.
         metric: the poses' lengths are metres.
     """
-
     cases = []
     for index, others in near_views(views, range(len(views)) if wanted is None else wanted).items():
         view, to_world = views[index], torch.linalg.inv(views[index].camera.world_to_camera)
         seconds = [
-            SecondView(v.name, v.photo, _placed(v.camera, v.camera.world_to_camera @ to_world))
-            for v in (views[k] for k in others)
+            SecondView(other.name, other.photo, _placed(other.camera, other.camera.world_to_camera @ to_world))
+            for other in (views[k] for k in others)
         ]
-        seen = partial(model.points, model.views[index]) if model and len(model.views[index].ids) else None
-        camera, near_far = _placed(view.camera, torch.eye(4)), (bounds or {}).get(view.photo)
-        case = Case(view.name, view.photo, camera, points=seen, bounds=near_far, seconds=tuple(seconds), metric=metric)
-        cases.append(case)
+        camera = _placed(view.camera, torch.eye(4))
+        known: dict[str, Any] = {"points": view.points, "bounds": view.bounds, "metric": metric}
+        cases.append(Case(view.name, view.photo, camera, seconds=tuple(seconds), **known))
     return cases
 
 
@@ -124,11 +115,10 @@ def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple
 def _sees_the_same(view: Posed, other: Posed) -> bool:
     if view.ids is not None and other.ids is not None:
         return len(np.intersect1d(view.ids, other.ids, assume_unique=True)) >= MIN_SHARED * max(1, len(view.ids))
-    for one, two in ((view, other), (other, view)):  # the middle of each picture and depth, in the other picture
-        size, seen_in = torch.tensor([two.camera.width, two.camera.height], dtype=torch.float64), one.camera
-        middle = two.camera.unproject(size / 2, torch.tensor(two.depth, dtype=torch.float64))
-        uv, z = seen_in.project(middle)
-        if not bool((z > 0) & (uv >= 0).all() & (uv <= torch.tensor([seen_in.width, seen_in.height])).all()):
+    for one, two in ((view.camera, other), (other.camera, view)):  # the middle of each picture, in the other one
+        size = torch.tensor([two.camera.width, two.camera.height], dtype=torch.float64)
+        uv, z = one.project(two.camera.unproject(size / 2, torch.tensor(two.depth, dtype=torch.float64)))
+        if not bool((z > 0) & (uv >= 0).all() & (uv <= torch.tensor([one.width, one.height])).all()):
             return False
     return True
 
@@ -149,24 +139,18 @@ def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count:
     Returns:
         Scenes in the order of `scenes`, each with its frames in their order; those that are not used are left out.
     """
-    order = _in_turns(scenes)[:count]
-    held = {scene: frames(scene) for scene in order}
-    shares = _shares({scene: len(held[scene]) for scene in order}, count)
+    groups: dict[str, list[str]] = {}
+    for scene in sorted(scenes, key=_hash):
+        groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
+    turns = [(turn, _hash(group), scene) for group, names in groups.items() for turn, scene in enumerate(names)]
+    held = {scene: frames(scene) for _, _, scene in sorted(turns)[:count]}
+    shares = _shares({scene: len(frames) for scene, frames in held.items()}, count)
     picked: dict[str, list[int]] = {}
     for scene in (scene for scene in scenes if scene in held):
         length, share = len(held[scene]), shares[scene]
         start = _hash(scene) % length / length if share else 0
         picked[scene] = [held[scene][int((place + start) * length / share)] for place in range(share)]
     return picked
-
-
-def _in_turns(scenes: Sequence[str]) -> list[str]:
-    """Round after round, one scene of each group."""
-    groups: dict[str, list[str]] = {}
-    for scene in sorted(scenes, key=_hash):
-        groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
-    rounds = [(place, _hash(group), scene) for group, names in groups.items() for place, scene in enumerate(names)]
-    return [scene for _, _, scene in sorted(rounds)]
 
 
 def _shares(sizes: dict[str, int], count: int) -> dict[str, int]:

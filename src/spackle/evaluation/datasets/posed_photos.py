@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,12 @@ from torch import Tensor
 
 from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
-from spackle.errors import InputError, reason_in_a_line
-from spackle.evaluation import paper
-from spackle.evaluation.case import Case
-from spackle.evaluation.datasets.colmap import Model, model_folder, read_model
-from spackle.evaluation.datasets.folders import by_name, is_two_view, photo_files, scene_folders
+from spackle.errors import InputError, reading
+from spackle.evaluation.case import Case, EvalDataset, has_any, photo_files
+from spackle.evaluation.datasets.colmap import model_folder, read_model
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
-from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, pair_of_2014
+from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, is_two_view, pair_of_2014
+from spackle.evaluation.rows import IMAGES
 from spackle.formats.camera_files import checked_camera
 
 ETH3D_MODEL = "dslr_calibration_undistorted"
@@ -31,10 +31,29 @@ LLFF_BOUNDS = "poses_bounds.npy"
 MAX_POSES_BYTES = 1 << 24
 POSE_TOLERANCE = 0.05  # of published poses' rotations, see `checked_camera`
 MIDDLE_DEPTH_M = 0.8  # objects are held before the phone; so second views are 4 to 20 cm beside
+LLFF_SCENES = {"fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex"}
+TANKS_SCENES = {
+    *("barn", "caterpillar", "church", "courthouse", "ignatius", "meetingroom", "truck"),
+    *("family", "francis", "horse", "lighthouse", "m60", "panther", "playground", "train"),
+    *("auditorium", "ballroom", "courtroom", "museum", "palace", "temple"),
+}
 
 
-class Eth3d:
-    """The undistorted DSLR photos of the training scenes, or the two-view scenes.
+def _called(folder: Path, scenes: set[str]) -> bool:
+    return not scenes.isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
+
+
+def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
+    """A float64 camera by its pose in the world; InputError where one of them cannot be."""
+    camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
+    return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
+
+
+# --- ETH3D
+
+
+def _eth3d(scenes: Mapping[str, Path]) -> list[Case]:
+    """The undistorted DSLR photos of the training scenes, or the two-view scenes: a case for each photo, or each pair.
 
     Multi-view: `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and
     `SCENE/images/dslr_images_undistorted/*.JPG`. The model is metric (it was aligned to laser scans); its sparse points
@@ -44,37 +63,24 @@ class Eth3d:
     Two-view: `SCENE_1l/im0.png`, `im1.png`, `calib.txt`, and the truth beside them or, as it is unpacked, in
     `two_view_training_gt/SCENE_1l`. A root with both kinds gives both; give the folder of one of them alone.
     """
-
-    name = "eth3d"
-    title = "ETH3D"
-    terms = "CC BY-NC-SA 4.0"
-
-    def cases(self, root: Path) -> Sequence[Case]:
-        """One case for each photo, or each pair; see `EvalDataset`."""
-        scenes = by_name(scene_folders(root, self.name)).values()
-        multi = [case for scene in scenes if not is_two_view(scene) for case in _photos_of(scene)]
-        return multi + [_pair_of(scene) for scene in scenes if is_two_view(scene)]
+    pairs = [scene for scene in scenes.values() if is_two_view(scene)]
+    multi = [case for scene in scenes.values() if scene not in pairs for case in _photos_of(scene)]
+    return multi + [_pair_of(scene) for scene in pairs]
 
 
 def _photos_of(scene: Path) -> list[Case]:
     folder = scene / ETH3D_MODEL
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: unpack the scene's dslr_undistorted archive")
-    model = read_model(folder)
-    return make_cases(
-        posed_by(scene, model, [_photo(scene, view.name) for view in model.views]), model=model, metric=True
-    )
-
-
-def _photo(scene: Path, name: str) -> Path:
-    """The model names a photo by its folder: dslr_images_undistorted/DSC_0286.JPG."""
-    places = [scene / "images" / name, scene / name, scene / "images" / Path(name).name]
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
-        raise InputError(
-            f"{places[0]}: no such photo, but the model has it: unpack the scene's dslr_undistorted archive"
-        )
-    return found
+    model, photos = read_model(folder), []
+    for view in model.views:  # named by its folder: dslr_images_undistorted/DSC_0286.JPG
+        places = [scene / "images" / view.name, scene / view.name, scene / "images" / Path(view.name).name]
+        photo = next((place for place in places if place.is_file()), None)
+        if photo is None:
+            why = "no such photo, but the model has it: unpack the scene's dslr_undistorted archive"
+            raise InputError(f"{places[0]}: {why}")
+        photos.append(photo)
+    return make_cases(posed_by(scene, model, photos), metric=True)
 
 
 def _pair_of(scene: Path) -> Case:
@@ -84,7 +90,23 @@ def _pair_of(scene: Path) -> Case:
     return pair_of_2014(scene, next((place for place in places if place.is_file()), None))
 
 
-class Tanks:
+ETH3D = EvalDataset(
+    "eth3d",
+    title="ETH3D",
+    terms="CC BY-NC-SA 4.0",
+    expected="SCENE/dslr_calibration_undistorted/images.txt, or two views: SCENE_1l/im0.png",
+    is_scene=lambda folder: (
+        has_any(folder, ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted") or is_two_view(folder)
+    ),
+    cases=_eth3d,
+    skip=frozenset({"two_view_testing"}),
+)
+
+
+# --- Tanks and Temples
+
+
+def _tanks(scenes: Mapping[str, Path]) -> list[Case]:
     """`SCENE/images` with `SCENE/sparse/0`: what COLMAP, 3D Gaussian splatting and most of the field call a scene.
 
     `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens has to be nearly a pinhole's
@@ -95,24 +117,12 @@ class Tanks:
     see `near_views`. The paper's 331,776 cells are those of 1920×1080, the size of most scenes' frames; those of
     2048×1080 give 1536×810, and the 980×545 that came with 3D Gaussian splatting stay as they are.
     """
-
-    name = "tanks"
-    title = "Tanks"
-    terms = "see its page; research, cite"
-
-    def cases(self, root: Path) -> Sequence[Case]:
-        """One case for each photo that is taken; see `EvalDataset`."""
-        scenes = by_name(scene_folders(root, self.name))
-        read = {name: _read_tanks(scene) for name, scene in scenes.items()}
-        picked = spread(list(scenes), lambda name: range(len(read[name][1])), paper.IMAGES[self.title])
-        return [
-            case
-            for name, (model, views) in read.items()
-            for case in make_cases(views, picked.get(name, []), model=model)
-        ]
+    read = {name: _tanks_views(scene) for name, scene in scenes.items()}
+    picked = spread(list(scenes), lambda name: range(len(read[name])), IMAGES[TANKS.title])
+    return [case for name, views in read.items() for case in make_cases(views, picked.get(name, []))]
 
 
-def _read_tanks(scene: Path) -> tuple[Model, list[Posed]]:
+def _tanks_views(scene: Path) -> list[Posed]:
     folder = model_folder(scene)
     model = read_model(folder)
     top = scene / "dense" if "dense" in folder.relative_to(scene).parts else scene
@@ -120,10 +130,28 @@ def _read_tanks(scene: Path) -> tuple[Model, list[Posed]]:
     for photo in photos:
         if not os.path.isfile(photo):  # False for a name that is too long
             raise InputError(f"{photo}: no such photo, but {folder} has it: put the scene's photos there")
-    return model, posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
+    return posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
 
 
-class Llff:
+def _is_tanks(folder: Path) -> bool:
+    other = has_any(folder, LLFF_BOUNDS) or _called(folder, LLFF_SCENES)
+    return has_any(folder, "sparse", "dense/sparse") and (_called(folder, TANKS_SCENES) or not other)
+
+
+TANKS = EvalDataset(
+    "tanks",
+    title="Tanks",
+    terms="see its page; research, cite",
+    expected="SCENE/sparse/0 beside SCENE/images",
+    is_scene=_is_tanks,
+    cases=_tanks,
+)
+
+
+# --- LLFF
+
+
+def _llff(scenes: Mapping[str, Path]) -> list[Case]:
     """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
@@ -133,17 +161,10 @@ class Llff:
 
     The paper's 190,512 cells are those of `images_4` (1008×756); `images` (4032×3024) gives 1536×1152.
     """
-
-    name = "llff"
-    title = "LLFF"
-    terms = "research, cite"
-
-    def cases(self, root: Path) -> Sequence[Case]:
-        """One case for each photo; see `EvalDataset`."""
-        return [case for scene in by_name(scene_folders(root, self.name)).values() for case in _llff_cases(scene)]
+    return [case for scene in scenes.values() for case in make_cases(_llff_views(scene))]
 
 
-def _llff_cases(scene: Path) -> list[Case]:
+def _llff_views(scene: Path) -> list[Posed]:
     photos = next((found for name in LLFF_PHOTOS if (found := photo_files(scene / name))), None)
     if photos is None:
         raise InputError(f"{scene}: no photos: expected them in {', '.join(LLFF_PHOTOS)}")
@@ -153,46 +174,38 @@ def _llff_cases(scene: Path) -> list[Case]:
     if (scene / "sparse").is_dir():
         model = read_model(model_folder(scene))
         files = _match(scene, [view.name for view in model.views], photos)
-        return make_cases(posed_by(scene, model, files), model=model, bounds=bounds)
+        return [dataclasses.replace(v, bounds=bounds.get(v.photo)) for v in posed_by(scene, model, files)]
     views = []
     for photo, row in zip(photos, rows, strict=True):  # a scene has one or the other
         near, far = bounds[photo]
         camera = _camera_of_row(row, f"{scene / LLFF_BOUNDS}: {photo.name}")
-        views.append(Posed(f"{scene.name}/{photo.stem}", photo, camera, 2 / (1 / near + 1 / far)))
-    return make_cases(views, bounds=bounds)
+        middle = 2 / (1 / near + 1 / far)
+        views.append(Posed(f"{scene.name}/{photo.stem}", photo, camera, middle, bounds=bounds[photo]))
+    return views
 
 
 def _read_bounds(path: Path, count: int) -> NDArray[Any]:
     """[count, 17]: for each photo by name a 3×5 matrix and its nearest and farthest depth."""
-    try:
+    with reading(path, "not LLFF's table ({reason}): expected finite floats, [photos, 17]"):
         table: NDArray[Any] = np.load(path, allow_pickle=False)
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f" or not np.isfinite(table).all():
             raise ValueError(f"{table.dtype} of shape {table.shape}")
         if not (table[:, [4, 9, 14, 15, 16]] > 0).all():
             raise ValueError("a size, a focal length or a bound is not positive")
-    except Exception as error:  # NumPy at work on a stranger's bytes raises anything
-        reason = reason_in_a_line(error)
-        raise InputError(f"{path}: not LLFF's table ({reason}): expected finite floats, [photos, 17]") from error
     if len(table) != count:
         raise InputError(f"{path}: {len(table)} rows, but there are {count} photos: unpack the scene again")
     return table
 
 
 def _camera_of_row(row: NDArray[Any], where: str) -> Camera:
-    """A row of `poses_bounds.npy` as a float64 camera: down, right, backwards, the eye; height, width, focal length."""
+    """A row of `poses_bounds.npy`: columns down, right, backwards, the eye, and (height, width, focal length)."""
     matrix = torch.from_numpy(np.asarray(row[:15], np.float64).reshape(3, 5))
     down, right, backwards, eye, lens = matrix.unbind(1)
     height, width, focal = (float(number) for number in lens)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = torch.stack([right, down, -backwards, eye], dim=1)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return _from_world_pose(K, pose, round(width), round(height), where)
-
-
-def _from_world_pose(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
-    """A float64 camera by its pose in the world; InputError where one of them cannot be."""
-    camera = checked_camera(K, pose, width, height, where, dtype=torch.float64, tolerance=POSE_TOLERANCE)
-    return dataclasses.replace(camera, world_to_camera=torch.linalg.inv(pose))
+    return _camera(K, pose, round(width), round(height), where)
 
 
 def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Path]:
@@ -208,7 +221,20 @@ def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Pa
     return list(photos)
 
 
-class WildRgbd:
+LLFF = EvalDataset(
+    "llff",
+    title="LLFF",
+    terms="research, cite",
+    expected="SCENE/poses_bounds.npy or SCENE/sparse/0 beside SCENE/images_4 or SCENE/images",
+    is_scene=lambda folder: has_any(folder, LLFF_BOUNDS, "sparse") and not _called(folder, TANKS_SCENES),
+    cases=_llff,
+)
+
+
+# --- WildRGB-D
+
+
+def _wildrgbd(scenes: Mapping[str, Path]) -> list[Case]:
     """Phone videos around objects, with the depth of the phone's laser.
 
     `CATEGORY/scenes/SCENE/` has `rgb/00000.png`, `depth/00000.png` (mm), `metadata` and `cam_poses.txt`.
@@ -220,22 +246,14 @@ class WildRgbd:
     come from all frames of the scene, see `near_views`, the middle depth taken as 0.8 m. At 640×480, upright or not,
     the photos stay as they are: the paper's 76,800 cells.
     """
+    read: dict[str, list[Posed]] = {}
 
-    name = "wildrgbd"
-    title = "WildRGBD"
-    terms = "MIT"
+    def frames(name: str) -> range:
+        read[name] = _wildrgbd_views(name, scenes[name])
+        return range(len(read[name]))
 
-    def cases(self, root: Path) -> Sequence[Case]:
-        """One case for each frame that is taken; see `EvalDataset`."""
-        scenes = by_name(scene_folders(root, self.name), _scene_name)
-        read: dict[str, list[Posed]] = {}
-
-        def frames(name: str) -> range:
-            read[name] = _views(name, scenes[name])
-            return range(len(read[name]))
-
-        picked = spread(sorted(scenes), frames, paper.IMAGES[self.title])
-        return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
+    picked = spread(sorted(scenes), frames, IMAGES[WILDRGBD.title])
+    return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
 
 
 def _scene_name(folder: Path) -> str:
@@ -255,38 +273,34 @@ def _with_depth(case: Case) -> Case:
     return dataclasses.replace(case, depth=lambda: dataclasses.replace(load_depth(at), K=K))
 
 
-def _views(name: str, scene: Path) -> list[Posed]:
-    lens = _lens(next((at for n in ("metadata", "metadata.json") if (at := scene / n).is_file()), scene / "metadata"))
-    there = {photo.stem: photo for photo in (scene / "rgb").glob("*.png")}
+def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
+    metadata, poses = scene / "metadata", scene / "cam_poses.txt"
+    metadata = metadata if metadata.is_file() else next(iter(scene.glob("metadata.json")), metadata)
+    with reading(metadata, "not the metadata of a scene ({reason}): needs w, h and K of nine numbers"):
+        facts = json.loads(read_text(metadata, "description of the camera"))
+        width, height = int(facts["w"]), int(facts["h"])
+        K = torch.tensor(facts["K"], dtype=torch.float64).reshape(3, 3).T.clone()
+        K[:2, 2] += HALF_PIXEL
+        checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, f"{metadata}: the lens")
+    with reading(poses, "not a list of poses ({reason}): needs a frame and 16 numbers a line"):
+        lines = [line.split() for line in read_text(poses, "list of poses", MAX_POSES_BYTES).splitlines()]
+        frames = [(int(line[0]), np.array(line[1:], np.float64).reshape(4, 4)) for line in lines if line]
+    photos = {photo.stem: photo for photo in (scene / "rgb").glob("*.png")}
     views = []
-    for number, pose in _poses(scene / "cam_poses.txt"):
-        if photo := there.get(f"{number:05d}"):
-            where = f"{scene / 'cam_poses.txt'}: {photo.name}"
-            camera = _from_world_pose(lens.K, torch.from_numpy(pose), lens.width, lens.height, where)
+    for number, pose in sorted(frames, key=lambda frame: frame[0]):
+        if photo := photos.get(f"{number:05d}"):
+            camera = _camera(K, torch.from_numpy(pose), width, height, f"{poses}: {photo.name}")
             views.append(Posed(f"{name}/{photo.stem}", photo, camera, MIDDLE_DEPTH_M))
     check_two(scene, len(views))
     return views
 
 
-def _lens(path: Path) -> Camera:
-    try:
-        facts = json.loads(read_text(path, "description of the camera"))
-        width, height = int(facts["w"]), int(facts["h"])
-        K = torch.tensor(facts["K"], dtype=torch.float64).reshape(3, 3).T.clone()
-        K[:2, 2] += HALF_PIXEL
-        return checked_camera(K, torch.eye(4, dtype=torch.float64), width, height, "the lens", dtype=torch.float64)
-    except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError) as error:
-        raise InputError(
-            f"{path}: not the metadata of a scene ({reason_in_a_line(error)}): needs w, h and K of nine numbers"
-        ) from error
-
-
-def _poses(path: Path) -> list[tuple[int, NDArray[Any]]]:
-    try:
-        rows = [line.split() for line in read_text(path, "list of poses", MAX_POSES_BYTES).splitlines() if line.strip()]
-        found = [(int(row[0]), np.array(row[1:], np.float64).reshape(4, 4)) for row in rows]
-    except ValueError as error:
-        raise InputError(
-            f"{path}: not a list of poses ({reason_in_a_line(error)}): needs a frame and 16 numbers a line"
-        ) from error
-    return sorted(found, key=lambda entry: entry[0])
+WILDRGBD = EvalDataset(
+    "wildrgbd",
+    title="WildRGBD",
+    terms="MIT",
+    expected="CATEGORY/scenes/SCENE/ with rgb/, depth/, metadata and cam_poses.txt",
+    is_scene=lambda folder: has_any(folder, "rgb") and has_any(folder, "cam_poses.txt", "metadata", "masks"),
+    cases=_wildrgbd,
+    scene_name=_scene_name,
+)
