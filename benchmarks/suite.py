@@ -27,8 +27,9 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from spackle.bases.lift import lift
-from spackle.bases.open import BaseSettings, open_base
+from spackle.bases.open import open_base
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_processor
 from spackle.camera import Camera
@@ -260,7 +261,7 @@ def section(name: str, options: argparse.Namespace, peaks: Peaks) -> Section:
         photo = Photo(torch.rand(SIDE, SIDE, 3), 1.2 * SIDE, "", Path("photo.png"))
         speed = {"windows": options.windows, "compiled": options.compile, "precision": options.precision}
         settings = BaseSettings("sharp", checkpoint=options.checkpoint, device=device.type, **speed)
-        base = open_base(settings).load(photo).load()
+        base = open_base(settings).load(photo)
         assert isinstance(base, SharpBase)
         return sharp_section(options.base_runs, base, photo, peaks, device)
     renderer = get_renderer(device.type)

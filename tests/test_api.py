@@ -16,7 +16,7 @@ from scenes import psnr, same_bits
 
 import spackle
 from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseSettings
+from spackle.bases.settings import BaseSettings
 from spackle.formats import PlyFile
 from spackle.pipeline import Options, complete_photo
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from spackle import DepthMap, Photo, Scene, get_renderer, hole_mask
 from spackle import complete as complete_scene
-from spackle.bases.open import AUTO, KINDS, BaseSettings, OpenedBase, open_base
+from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
 from spackle.gaussians import Gaussians
 from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
@@ -38,7 +39,7 @@ class LoadBase:
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
         """`checkpoint` is a file of SHARP's or lite's weights; empty takes what `spackle weights get` brought."""
-        names = [AUTO, *(name for name, kind in KINDS.items() if kind.network and ":" not in name)]
+        names = [AUTO, *AUTO_NETWORKS]
         return {"required": {"name": (names,)}, "optional": {"checkpoint": ("STRING", {"default": ""})}}
 
     def load(self, name: str, checkpoint: str = "") -> tuple[OpenedBase]:

@@ -17,8 +17,9 @@ from typing import Literal
 from torch import Tensor
 
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.open import BaseSettings, OpenedBase, ResolvedBase, open_base, open_loaded
+from spackle.bases.open import OpenedBase, ResolvedBase, open_base, open_loaded
 from spackle.bases.protocol import Base, BasePrediction
+from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, TrajectoryKind
 from spackle.device import Precision
@@ -147,10 +148,7 @@ class Pipeline:
         name = photo.path.name
         if photo.frame is not None:
             reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")
-        with reporter.stage("prepare"):
-            base = self.base.load(photo, log=reporter.warn)
-        with reporter.stage("base") as step:
-            prediction, choice = base.predict(step)
+        prediction, choice = self.base.predict(photo, log=reporter.warn, stage=reporter.stage)
         if choice.note:
             reporter.log(f"{name}: {choice.note}")
         disparity = self._disparity(prediction)

@@ -28,8 +28,9 @@ from spackle.bases import hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import FARTHEST_M, HfBase, meaning_of, to_depth_map
 from spackle.bases.lift import lift
-from spackle.bases.open import BaseSettings, open_base
+from spackle.bases.open import open_base
 from spackle.bases.protocol import NEAREST_M
+from spackle.bases.settings import BaseSettings
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
 from spackle.image import DEFAULT_FOCAL_MM, Photo
@@ -645,5 +646,5 @@ def test_auto_takes_depth_anything_before_lite(
         assert choice.base == "depth"
         assert torch.equal(prediction.gaussians.means, expected.means)
     file.write_bytes(content[::-1])
-    choice = open_base(BaseSettings(), lambda line: None).predict(photo)[1]
+    choice = open_base(BaseSettings()).predict(photo)[1]
     assert (choice.base, "SHA-256 is not the published one" in choice.failures[0]) == ("lite", True)

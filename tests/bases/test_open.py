@@ -23,9 +23,10 @@ import spackle
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite import LiteBase
-from spackle.bases.open import KINDS, BaseError, BaseSettings, ResolvedBase, open_base
+from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases.settings import KINDS, BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.layers import TINY
 from spackle.errors import InputError
@@ -77,7 +78,8 @@ def broken_portrait(path: Path) -> Path:
 
 def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
     """A photo's Gaussians by a base that is opened for it alone."""
-    return open_base(BaseSettings(**settings), ([] if log is None else log).append).predict(load_photo(path))
+    log = [] if log is None else log
+    return open_base(BaseSettings(**settings)).predict(load_photo(path), log=log.append)
 
 
 # The order of auto, and why.
@@ -88,7 +90,7 @@ def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
 ) -> None:
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get depth` (99 MB, Apache-2.0)" in choice.note
+    assert "--depth FILE, `spackle weights get depth` (99.2 MB, Apache-2.0)" in choice.note
     (tmp_path / "weights").mkdir()
     shutil.copy(made["sharp"], tmp_path / "weights")
     prediction, choice = pick(photo)
@@ -130,7 +132,7 @@ def test_a_machine_without_a_home_has_no_sharp(photo: Path, monkeypatch: pytest.
         monkeypatch.delenv(name, raising=False)
     assert pick(photo)[1].why == f"{NO_DEPTH}, {NO_SHARP}"
     assert FillOptions().texture == "exemplar"  # nor LaMa
-    with pytest.raises(InputError, match="SPACKLE_WEIGHTS"):
+    with pytest.raises(InputError, match="no weights on this machine"):
         pick(photo, name="sharp")
 
 
@@ -236,8 +238,8 @@ def test_damaged_weights_of_sharp_fail_once_for_all_photos(
     publish(monkeypatch, "sharp", content)
     sharp.write_bytes(content[::-1])
     said, log = "SHA-256 is not the published one", list[str]()
-    base = open_base(BaseSettings(), log.append)
-    choices = [base.predict(load_photo(photo))[1] for _ in range(2)]
+    base = open_base(BaseSettings())
+    choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
     assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no Depth Anything here"] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
@@ -262,8 +264,8 @@ def test_what_fails_for_one_photo_is_tried_for_the_next(
 
     monkeypatch.setattr(StandIn, "predict", picky)
     log: list[str] = []
-    base = open_base(BaseSettings(), log.append)
-    names = [base.predict(load_photo(write_photo(tmp_path / f"{name}.png")))[1].base for name in "abcd"]
+    base, paths = open_base(BaseSettings()), [write_photo(tmp_path / f"{name}.png") for name in "abcd"]
+    names = [base.predict(load_photo(path), log=log.append)[1].base for path in paths]
     assert names == ["sharp", "lite", "lite", "sharp"]
     assert ("not this one" in log[0], "range of float32" in log[1]) == (True, True)
     assert len(quick) == 1
@@ -324,7 +326,7 @@ def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
     settings = BaseSettings(f"hf:{folder}")
     assert set(settings.files) == {"config.json", "model.safetensors"}
-    assert (settings.public_name, settings.title) == ("hf:small", "hf:small")
+    assert settings.public_name == "hf:small"
     assert BaseSettings("hf:me/small").public_name == "hf:me/small"
     prints = open_base(settings).fingerprints
     (folder / "README.md").write_text("more about it")
@@ -339,8 +341,8 @@ def test_tables_call_weights_apples_where_name_and_size_are(tmp_path: Path, monk
     unknown = f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {SHARP_FILE}"
     assert BaseSettings("sharp", checkpoint=file).description == unknown
     publish(monkeypatch, "sharp", b"weights")
-    assert BaseSettings("sharp", checkpoint=file).description == KINDS["sharp"].description
-    assert BaseSettings("lite", checkpoint=file).description == KINDS["lite"].description
+    assert BaseSettings("sharp", checkpoint=file).description == KINDS["sharp"][0]
+    assert BaseSettings("lite", checkpoint=file).description == KINDS["lite"][0]
 
 
 # In Python.

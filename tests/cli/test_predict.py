@@ -28,7 +28,8 @@ from PIL import Image
 from safetensors.torch import save_file
 
 import spackle
-from spackle.bases.open import BaseSettings, open_base
+from spackle.bases.open import open_base
+from spackle.bases.settings import BaseSettings
 from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
 from spackle.image import film_to_pixels, load_photo

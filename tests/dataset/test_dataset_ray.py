@@ -15,7 +15,7 @@ import pytest
 from command import Run, names_in
 from dataset_builds import build, content, refused
 
-from spackle.bases.open import BaseSettings
+from spackle.bases.settings import BaseSettings
 from spackle.dataset.build import DatasetOptions, Made, Maker
 from spackle.dataset.photos import PhotoFile
 from spackle.workers import ray as on_ray

@@ -15,8 +15,9 @@ from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
 
 from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseError, BaseSettings
+from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp.layers import TINY
 from spackle.device import MemoryShort
 from spackle.errors import InputError

@@ -23,8 +23,9 @@ from scenes import box_before_wall, shifted
 from torch import Tensor
 
 from spackle.bases.lift import RgbdBase
-from spackle.bases.open import BaseError, BaseSettings
+from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
 from spackle.device import MemoryShort

@@ -21,7 +21,7 @@ from scenes import box_before_wall
 from viewer_client import ask, events, send
 
 import spackle
-from spackle.bases.open import ROUGH, BaseSettings
+from spackle.bases.settings import ROUGH, BaseSettings
 from spackle.cli.view_page import Teller, ViewOptions, complete_for_page
 from spackle.formats import save_ply
 from spackle.image import film_to_pixels, load_photo

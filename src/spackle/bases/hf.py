@@ -26,8 +26,6 @@ from spackle.device import Precision, enough_memory, own_arithmetic, pick_device
 from spackle.errors import InputError, reading, reason_in_a_line
 from spackle.image import LENSES, Photo, resize_photo
 
-SETTINGS = ["config.json", "preprocessor_config.json", "processor_config.json"]
-WEIGHTS = ["model.safetensors", "model-*.safetensors", "model.safetensors.index.json"]
 NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it

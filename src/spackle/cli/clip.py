@@ -125,7 +125,7 @@ class _FirstBase:
 
     def predict(self, photo: Photo) -> BasePrediction:
         """A frame's Gaussians."""
-        prediction, choice = self._base.load(photo, log=self._reporter.log).predict()
+        prediction, choice = self._base.predict(photo, log=self._reporter.log)
         if self.first is None:
             self._base, self.first = self._base.only(choice), (photo, prediction, choice)
             name, focal = self._clip.path.name, prediction.camera.focal[0]

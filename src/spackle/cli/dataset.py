@@ -73,7 +73,7 @@ def dataset_build(
     verbose: VerboseOption = False,
 ) -> None:
     """Build a pseudo-supervised dataset: manifest.json and shard-000000.tar, … (the paper's appendix)."""
-    from spackle.bases.open import BaseSettings
+    from spackle.bases.settings import BaseSettings
     from spackle.dataset.build import DatasetOptions, build_dataset
     from spackle.progress import Reporter
 

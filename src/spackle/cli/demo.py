@@ -13,8 +13,9 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 from torch import Tensor
 
-from spackle.bases.open import BaseSettings, open_base
+from spackle.bases.open import open_base
 from spackle.bases.protocol import BasePrediction
+from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.cli.first_use import compiled_ahead
 from spackle.cli.photo import save_views

@@ -90,7 +90,7 @@ def evaluate(
     verbose: VerboseOption = False,
 ) -> None:
     """Measure on a dataset, in the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
-    from spackle.bases.open import BaseSettings
+    from spackle.bases.settings import BaseSettings
     from spackle.evaluation.evaluate import evaluate as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
@@ -157,7 +157,7 @@ def bench(
     verbose: VerboseOption = False,
 ) -> None:
     """Count and time what Spackle adds to the base, in the paper's tables: rows.jsonl, bench.md, bench.tex."""
-    from spackle.bases.open import BaseSettings
+    from spackle.bases.settings import BaseSettings
     from spackle.evaluation.bench import bench as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter

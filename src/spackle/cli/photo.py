@@ -14,7 +14,7 @@ from torch import Tensor
 
 import spackle
 from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
-from spackle.bases.open import AUTO, AUTO_NETWORKS, BaseSettings
+from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.errors import InputError
 from spackle.files import fingerprint, write_json
 from spackle.folders import digest_of, file_records, results_folder, whole_set
@@ -243,7 +243,7 @@ def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, rep
     before, now = earlier_report(folder).get("base"), done.choice.base
     better = before.get("name") if isinstance(before, dict) else None
     if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
-        file = base.files.get("checkpoint" if better == "sharp" else "depth weights")
+        file = base.files.get(str(better))
         reporter.log(
             f"{done.photo.path.name}: warning: {folder} was made by {better} and is made again by {now}: "
             f"{done.choice.why}{'' if file is None else f' ({file})'}"

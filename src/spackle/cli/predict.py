@@ -111,7 +111,7 @@ def predict(
 
     A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
-    from spackle.bases.open import BaseSettings
+    from spackle.bases.settings import BaseSettings
     from spackle.cli.photo import PredictOptions
     from spackle.cli.photos import predict_all
     from spackle.pipeline import FillOptions, Options

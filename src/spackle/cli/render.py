@@ -99,7 +99,7 @@ def view(
     verbose: VerboseOption = False,
 ) -> None:
     """Look at a scene, or complete a photo and look at that, on a page of this machine. Ctrl-C ends it."""
-    from spackle.bases.open import BaseSettings
+    from spackle.bases.settings import BaseSettings
     from spackle.cli.view_page import ViewOptions
     from spackle.cli.view_page import view as view_target
     from spackle.progress import Reporter

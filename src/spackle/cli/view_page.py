@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from spackle.bases.lite import LiteBase
-from spackle.bases.open import AUTO, ROUGH, BaseSettings
+from spackle.bases.settings import AUTO, ROUGH, BaseSettings
 from spackle.cli.export_scene import page_of
 from spackle.errors import InputError, check_name
 from spackle.files import check_file

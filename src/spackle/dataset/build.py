@@ -12,7 +12,8 @@ from rich.filesize import decimal
 
 import spackle
 from spackle.bases.depth_map import find_depth
-from spackle.bases.open import NETWORKS, BaseError, BaseSettings, kind_of, open_base
+from spackle.bases.open import BaseError, open_base
+from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, DepthRange, TrajectoryKind
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.sample import pack_sample
@@ -59,15 +60,14 @@ class DatasetOptions:
 
     @property
     def processes(self) -> Workers:
-        network = self.base.kind.network or self.inpaints_by_network
+        network = self.base.network or self.inpaints_by_network
         return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
 
     def check(self) -> None:
         """InputError for options that contradict each other; inpainters check theirs themselves."""
-        kind_of(self.base.name)  # refuses `auto`: a dataset names its base
-        self.base.check()
+        self.base.check(one=True)
         depth = self.base.depth
-        if depth is None and not self.base.kind.network:
+        if depth is None and not self.base.network:
             raise InputError(
                 f"--base {self.base.name} needs the photos' depth: give --depth FOLDER; {', '.join(NETWORKS)} need none"
             )

@@ -50,11 +50,11 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     for name, value in (("--runs", runs), ("--base-runs", base_runs)):
         if value is not None and not 1 <= value <= MAX_RUNS:
             raise InputError(f"{name} must be between 1 and {MAX_RUNS}, got {value}")
-    evaluation, kind = open_evaluation(options), options.base.kind
-    device = options.device if kind.network else torch.device("cpu")
+    evaluation, slow = open_evaluation(options), options.base.named == "sharp"
+    device = options.device if options.base.network else torch.device("cpu")
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": ["spackle"]}
     config |= {name: evaluation.config[name] for name in SHARED}
-    config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if kind.slow else runs)}
+    config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if slow else runs)}
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
     about = {"parameters": count_parameters()}
@@ -91,11 +91,14 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     """
     load, device, options = load_average(), torch.device(config["base"]["device"]), evaluation.options
     loaded = load_case(dataclasses.replace(case, seconds=()))
-    opened = evaluation.open(loaded).load(loaded.full)  # a network is loaded before the clock starts
+    opened = evaluation.open(loaded)
+    opened.load(loaded.full)  # before the clock starts
     latest: dict[str, BasePrediction] = {}
     # Compiling kernels is a small part of SHARP's first prediction on a processor, which takes a minute.
-    counts = warm or (options.base.kind.slow and device.type == "cpu")
-    times = measure(config["base_runs"], {"": lambda _: latest.update(base=opened.predict()[0])}, device, warm=counts)
+    counts = warm or (options.base.named == "sharp" and device.type == "cpu")
+    times = measure(
+        config["base_runs"], {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}, device, warm=counts
+    )
     seconds, found = (times["", TOTAL] / MS).tolist(), latest["base"]
     context = FillContext(
         found.gaussians, found.camera, evaluation.renderer, evaluation.network, precision=options.base.precision

@@ -99,7 +99,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
         raise InputError(f"{case.name}: has no second photo")
     loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
-    alignment = _align(loaded, prediction, evaluation, not options.base.kind.network) if options.near else None
+    alignment = _align(loaded, prediction, evaluation, not options.base.network) if options.near else None
     if alignment:
         lenses = loaded.camera, prediction.camera, alignment.scale
         views = [view._replace(camera=to_base(view.camera, *lenses)) for view in loaded.seconds]

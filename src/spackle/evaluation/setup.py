@@ -12,7 +12,8 @@ import torch
 
 import spackle
 from spackle.bases.lift import RgbdBase
-from spackle.bases.open import NETWORKS, BaseSettings, OpenedBase, kind_of, open_base, open_loaded
+from spackle.bases.open import OpenedBase, open_base, open_loaded
+from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.errors import InputError, check_name
@@ -72,7 +73,7 @@ class EvaluateOptions:
     @property
     def opened(self) -> BaseSettings:
         """The base's settings, without a precision that is the residual's alone."""
-        alone = "--precision" in self.base.kind.refuses
+        alone = self.base.named in ("rgbd", "lite")
         return dataclasses.replace(self.base, precision="auto") if alone else self.base
 
     def check(self) -> None:
@@ -88,9 +89,8 @@ class EvaluateOptions:
                 raise InputError(f"--metrics {metric}: needs a true second view: add --protocol near-view")
         if not self.methods:
             raise InputError(f"--methods: none is given: choose of {', '.join(METHODS)}")
-        kind_of(self.base.name)  # not auto
         check_name("--precision", self.base.precision, PRECISIONS)
-        self.opened.check()
+        self.opened.check(one=True)
         if self.residual == "none":
             raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
         if "direct-ft" in self.methods:
@@ -141,7 +141,7 @@ class Evaluation:
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
         """The base of a case: the network, or the case's own depth or points; InputError where it lacks those."""
-        network = self.options.base.kind.network
+        network = self.options.base.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
 
@@ -187,7 +187,7 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
         return  # each is named in its turn
     if options.near and not any(case.seconds for case in cases):
         raise InputError(f"{where}: has no second photos: take --protocol large-view")
-    if not options.base.kind.network and not any(case.depth or case.points for case in cases):
+    if not options.base.network and not any(case.depth or case.points for case in cases):
         raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take {', '.join(NETWORKS)}")
 
 
@@ -209,7 +209,7 @@ def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequen
         "disparities": None if options.near else list(options.disparities),
         "base": {
             "name": base.public_name,
-            "title": base.title,
+            "title": "SHARP" if base.named == "sharp" else base.public_name,
             "says": base.description,
             "weights": weights_digests(base.files),
             "precision": base.precision,

@@ -1,0 +1,138 @@
+"""What `--base` may name, and a person's options for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from rich.filesize import decimal
+
+from spackle.bases import lite
+from spackle.bases.depth_map import DepthMap
+from spackle.bases.sharp.base import check_windows
+from spackle.device import PRECISIONS, Precision
+from spackle.errors import InputError, check_name
+from spackle.weights import PUBLISHED, installed, published_as
+
+AUTO, RGBD = "auto", "rgbd"
+HF = "hf:"  # a folder, or owner/name of the hub, follows
+AUTO_NETWORKS = ("sharp", "depth", "lite")  # in the order that `auto` tries them
+NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
+NOT_SHARP = "lifted; not SHARP, so not the paper's base"
+KINDS = {  # the description below tables, and the options that only some bases take
+    RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib")),
+    "sharp": ("Apple's network, from the photo alone", ("-c", "--precision", "--sharp")),
+    "depth": (f"Depth-Anything-V2-Small, from the photo alone, {NOT_SHARP}", ("--precision",)),
+    "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
+    "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
+    AUTO: ("", ("--calib", "--precision", "--sharp")),  # for the base that it chooses
+}
+HF_SETTINGS = ("config.json", "preprocessor_config.json", "processor_config.json")
+HF_WEIGHTS = ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
+Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named as the photos
+
+
+def _download(name: str) -> str:
+    return f"`spackle weights get {name}` ({decimal(PUBLISHED[name].bytes)}, {PUBLISHED[name].licence})"
+
+
+ROUGH = f"rough geometry; for better: --depth FILE, {_download('depth')}, or {_download('sharp')}"
+MISSING = {  # what to do without the weights of a base
+    "sharp": f"no weights on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
+    "depth": f"not on this machine: {_download('depth')} downloads it",
+}
+
+
+def _weights_here(name: str) -> Path | None:
+    try:
+        shipped = lite.SHIPPED if name == "lite" and lite.SHIPPED.is_file() else None
+        return installed(name) if name in MISSING else shipped
+    except InputError:  # the machine has no folder for downloads
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseSettings:
+    """A base's name, and the user's options for it."""
+
+    name: str = AUTO  # or one of `KINDS`, or `hf:…`
+    depth: Depth = None
+    calib: Path | None = None  # calibration of a disparity map
+    checkpoint: Path | None = None  # weights of SHARP or of lite
+    precision: Precision = "auto"  # of the network
+    windows: int | None = None  # that SHARP computes at once; 1 takes the least memory
+    compiled: bool = False
+    device: str = "auto"
+
+    @property
+    def named(self) -> str:
+        """The base's name, where `auto` with a depth map means `rgbd`, and with a checkpoint `sharp`."""
+        if self.name != AUTO:
+            return self.name
+        return RGBD if self.depth is not None else AUTO if self.checkpoint is None else "sharp"
+
+    @property
+    def network(self) -> bool:
+        """Whether it predicts from the photo alone; otherwise it needs the photo's depth."""
+        return self.named != RGBD
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder that `hf:…` names; None for a model of the hub and for other bases."""
+        folder = os.path.expanduser(self.name.removeprefix(HF))
+        return Path(folder) if self.name.startswith(HF) and os.path.isdir(folder) else None
+
+    @property
+    def public_name(self) -> str:
+        """The name in published results: of a folder only the last part."""
+        return self.named if self.folder is None else HF + self.folder.resolve().name
+
+    @property
+    def description(self) -> str:
+        """The base's description below tables; it calls weights Apple's only if they were downloaded from Apple."""
+        file = self.files.get("sharp")
+        if file is None or published_as(file) is PUBLISHED["sharp"]:
+            return KINDS[self.named.partition(":")[0]][0]
+        return f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {file.name}"
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Existing weight files that decide the predictions, by the base's name; those in a folder by their own."""
+        if self.folder is not None:
+            return {
+                file.name: file
+                for p in (*HF_SETTINGS, *HF_WEIGHTS)
+                for file in sorted(self.folder.glob(p))
+                if file.is_file()
+            }
+        names = AUTO_NETWORKS if self.named == AUTO else (self.named,)
+        found = {name: self.checkpoint or _weights_here(name) for name in names}
+        return {name: file for name, file in found.items() if file is not None}
+
+    def check(self, *, one: bool = False) -> None:
+        """InputError for an unknown base, an option that it cannot use, or `auto` where `one` base must be named."""
+        if one and self.name == AUTO:
+            known = ", ".join((RGBD, *NETWORKS))
+            raise InputError(f"--base {AUTO}: results must say what they are of: name one of {known}")
+        if self.name == HF:
+            raise InputError(f"--base {HF} names no model: give owner/name of the hub, or a folder")
+        if not self.name.startswith(HF):
+            check_name("--base", self.name, (AUTO, RGBD, *NETWORKS))
+        check_name("--precision", self.precision, PRECISIONS)
+        options = {
+            "--depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
+            "--calib": self.calib,
+            "-c": self.checkpoint,
+            "--precision": None if self.precision == "auto" else self.precision,
+            "--sharp": "compile=yes" if self.compiled else self.windows and f"windows={self.windows}",
+        }
+        kind = self.named.partition(":")[0]
+        for option, value in options.items():
+            if value is not None and option not in KINDS[kind][1]:
+                raise InputError(f"{option} {value}: the {kind} base has no use for it: leave the option out")
+        check_windows("--sharp windows", self.windows)
+        if self.calib is not None and self.depth is None:
+            raise InputError(f"--calib {self.calib}: is for a disparity map: give that with --depth")
+        if self.named in MISSING and not self.files:
+            raise InputError(f"--base {self.named}: {MISSING[self.named]}")
