@@ -45,7 +45,7 @@ from spackle.residual.network import ResidualNet, shipped_network
 from spackle.scene_fill import FillContext, fill_view
 from spackle.training.losses import total_loss
 from spackle.training.residual import complete_samples
-from spackle.training.sample import Sample
+from spackle.training.samples import Sample
 
 REPOSITORY = Path(__file__).parents[1]
 SKIPPED, LIMIT_S, RUNS = 77, 1200, 20

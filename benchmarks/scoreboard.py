@@ -60,8 +60,7 @@ from spackle.bases.silhouettes import Layers
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import GREY, sharpness
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.training.features import FeatureNet, load_features
-from spackle.training.losses import covered, dilate, hole_psnr
+from spackle.training.losses import FeatureNet, covered, dilate, hole_psnr, load_features
 from spackle.training.sources import load_pair
 
 Row = dict[str, float]  # a scene's figures

@@ -13,7 +13,7 @@ import torch
 from photos import box, picture, write_photo
 from PIL import Image
 
-from spackle.training.features import SqueezeNet
+from spackle.training.losses import SqueezeNet
 
 WALL_PX, BOX_PX = 4, 12  # disparities
 

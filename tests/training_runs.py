@@ -25,7 +25,7 @@ def one_thread() -> Iterator[None]:
 
 
 def state(folder: Path) -> Checkpoint:
-    checkpoint, _ = load_checkpoint(folder)
+    checkpoint = load_checkpoint(folder, print)
     assert checkpoint is not None
     return checkpoint
 

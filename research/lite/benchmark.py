@@ -32,9 +32,9 @@ from spackle.bases.lite import LiteBase
 from spackle.evaluation.datasets.stereo import pair_of_2014
 from spackle.formats import save_png
 from spackle.image import PHOTO_SUFFIXES, load_photo
-from spackle.training.data import find_files
 from spackle.training.recipe import RgbdFolder
-from spackle.training.task import sheet
+from spackle.training.residual import sheet
+from spackle.training.sources import find_files
 
 GUESSES = ("constant", "ramp", "lite")
 STREETS, STREETS_SEED = 40, 202

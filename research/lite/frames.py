@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from spackle.errors import InputError
-from spackle.training.data import find_files
 from spackle.training.recipe import RgbdFolder
-from spackle.training.sources import load_frame, load_pair
+from spackle.training.sources import find_files, load_frame, load_pair
 
 Rng = np.random.Generator
 FOCAL = 1.1  # in widths: of photos whose lens is not known; only turning the camera asks for it

@@ -15,7 +15,6 @@ from pydantic import Field
 from spackle.bases.lite import STAGES, STRIDE, Size
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES
-from spackle.training.data import find_files, short_digest
 from spackle.training.recipe import (
     FREE,
     AnyRecipe,
@@ -28,6 +27,8 @@ from spackle.training.recipe import (
     Share,
     Whole,
 )
+from spackle.training.samples import short_digest
+from spackle.training.sources import find_files
 
 RANDOM = Path("random")  # in place of the encoder's file: weights that have seen nothing, for tests and experiments
 Side = Annotated[Whole, Field(ge=STRIDE, le=2048, multiple_of=STRIDE)]

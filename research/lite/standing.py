@@ -17,7 +17,7 @@ from synthetic_scenes import SAMPLES, drawn
 from textures import LATTICE, LEAVES, RING, WHOLE
 from torch import Tensor
 
-from spackle.training.composites import Photos
+from spackle.training.sources import Photos
 
 Things = list[list[Solid]]
 MOST = 64  # things in a scene: there are fewer

@@ -21,7 +21,7 @@ from torch.nn.functional import avg_pool2d
 from spackle.errors import InputError
 from spackle.files import atomic_path
 from spackle.image import load_photo
-from spackle.training.composites import Photos
+from spackle.training.sources import Photos
 
 SAMPLES = 2  # rays along each side of a pixel
 KINDS: tuple[tuple[Callable[[Rng], Scene], float], ...] = (  # and how often

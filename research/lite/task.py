@@ -20,9 +20,8 @@ from spackle.bases.lite import LiteBase, LiteNet
 from spackle.device import pick_dtype
 from spackle.folders import make_folder
 from spackle.progress import Reporter, Step
-from spackle.training.data import CACHE
-from spackle.training.ranks import rank, wait_for_ranks
-from spackle.training.task import PICTURED, Task, parameters, sheet
+from spackle.training.residual import CACHE, PICTURED, parameters, sheet
+from spackle.training.train import Task, rank, wait_for_ranks
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side
 # Viridis at nine places: even steps to the eye, in grey and for the colour-blind too.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from spackle.training.composites import Photos, outline, random_crop
+from spackle.training.sources import Photos, outline, random_crop
 
 Floats = NDArray[np.float32]
 Rng = np.random.Generator

@@ -31,9 +31,9 @@ from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
 from spackle.folders import hold
 from spackle.render import get_renderer
-from spackle.training.data import Supply
 from spackle.training.recipe import DataRecipe
-from spackle.training.sources import PseudoViews
+from spackle.training.samples import digest_of_samples
+from spackle.training.sources import find_sources, open_pseudo, pseudo_view, views_with_holes
 from spackle.workers.local import results_of
 
 # The same bytes, however --------------------------------------------------------------------------
@@ -322,8 +322,8 @@ run: {{validate_every: 2, save_every: 2}}
 
 
 def test_a_sample_of_a_dataset_is_one_of_its_views(whole: Path) -> None:
-    source = PseudoViews(whole)
-    sample, again = (source.view(np.random.default_rng(3)) for _ in range(2))
+    files = open_pseudo(whole)
+    sample, again = (pseudo_view(np.random.default_rng(3), files, views_with_holes(files)) for _ in range(2))
     assert torch.equal(sample.target, again.target)
     assert bool(sample.hole.any())
     drawn = get_renderer().render(sample.base, sample.camera)
@@ -336,8 +336,9 @@ def test_datasets_are_told_apart_and_open_holes_refused(whole: Path, place: Path
     options = ("--sample", 1, "--views", 2)
     assert build(place, tmp_path / "none", *options, "--inpainter", "none").code == 0
     with pytest.raises(InputError, match="--inpainter none"):
-        PseudoViews(tmp_path / "none")
+        open_pseudo(tmp_path / "none")
     assert build(place, tmp_path / "other", *options).code == 0
     places = whole, shutil.copytree(whole, tmp_path / "copy"), tmp_path / "other"
-    one, same, other = (Supply.of(DataRecipe(pseudo=at), get_renderer()).digest for at in places)
+    recipes = [DataRecipe(pseudo=at) for at in places]
+    one, same, other = (digest_of_samples(recipe, find_sources(recipe, get_renderer())) for recipe in recipes)
     assert one == same != other

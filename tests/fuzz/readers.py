@@ -221,7 +221,7 @@ def _safetensors(folder: Path) -> None:
 
 def _read_weights(folder: Path) -> None:
     if (folder / "checkpoint.pt").exists():
-        load_checkpoint(folder)
+        load_checkpoint(folder, print)
         read_checkpoint_tensors(folder / "checkpoint.pt")
     else:
         read_checkpoint_tensors(_only(folder))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import InputError
-from spackle.training.features import ResNet50, SqueezeNet, load_features
+from spackle.training.losses import ResNet50, SqueezeNet, load_features
 
 WITHOUT_HEAD = 25_557_032 - 2048 * 1000 - 1000  # parameters of torchvision's ResNet-50 less its classifier
 

@@ -25,13 +25,28 @@ from spackle.render import TILE, CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual.compose import DELTA_CHANNELS, compose
 from spackle.residual.view_features import CELL, ViewFeatures
-from spackle.training import composites
-from spackle.training.composites import composite
-from spackle.training.data import Supply
+from spackle.training import sources
 from spackle.training.recipe import DataRecipe
 from spackle.training.residual import MIN_AUX, training_cells
-from spackle.training.sample import HALVED, HOLE_SHARE, Sample, load_sample, random_crops, save_sample
-from spackle.training.sources import frame_photo, left_photo, load_pair, random_reverse_view, reverse_view, right_view
+from spackle.training.samples import (
+    HALVED,
+    HOLE_SHARE,
+    Sample,
+    Source,
+    load_sample,
+    make_samples,
+    random_crops,
+    save_sample,
+)
+from spackle.training.sources import (
+    composite,
+    frame_photo,
+    left_photo,
+    load_pair,
+    random_reverse_view,
+    reverse_view,
+    right_view,
+)
 
 CPU = CpuRenderer()
 RIM_PX = 2  # blobs are no pixels: what stands in front hides so much more or less than a line says
@@ -285,7 +300,7 @@ PALETTE = torch.tensor(
 
 def plain_composite(seed: int, objects: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, Tensor]:
     """A composite of so many cut-outs; with one more, those before it stay the same."""
-    monkeypatch.setattr(composites, "OBJECTS", (objects, objects))
+    monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
     colors = itertools.cycle(PALETTE)  # photos of one colour each, every one another
     return composite(np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160)
 
@@ -304,7 +319,7 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
             assert not moved.any()
             continue
         assert (next_inverse > 1.03 * inverse)[moved].all()
-        assert composites.AREA[0] < float(moved.float().mean()) < composites.AREA[1]
+        assert sources.AREA[0] < float(moved.float().mean()) < sources.AREA[1]
         mixed = (next_rgb - PALETTE[count + 1]).abs().amax(-1) > 1e-4
         assert (mixed & ~grow(~moved)).float().mean() < 2e-3
         assert not (moved & ~painted).any()
@@ -316,7 +331,7 @@ def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.M
 def test_a_random_crop_fills_the_frame_whatever_the_photos_shape(size: tuple[int, int]) -> None:
     ramp = torch.linspace(0, 1, size[1])[None, :, None].expand(*size, 3)
     for seed in range(4):
-        part = composites.random_crop(np.random.default_rng(seed), ramp, 96, 128)
+        part = sources.random_crop(np.random.default_rng(seed), ramp, 96, 128)
         assert part.shape == (96, 128, 3)
         across = part[48, :, 0].diff()
         assert (across > -1e-4).all() or (across < 1e-4).all()  # upright, by chance mirrored
@@ -366,8 +381,8 @@ def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[fl
         return reverse(scene, shifted(scene.camera, asked[-1]))
 
     warnings: list[str] = []
-    supply = Supply(DataRecipe(crops=2, cells=16), [view], [1.0], [])
-    files = supply.fill(folder, 7, 5, lambda done, total: None, warnings.append)
+    data, source = DataRecipe(crops=2, cells=16), Source(1.0, view, [])
+    files = make_samples(data, [source], folder, 7, 5, lambda done, total: None, warnings.append)
     assert not warnings
     return [file.name for file in files], asked
 

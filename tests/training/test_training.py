@@ -28,7 +28,7 @@ from spackle.training import train as training
 from spackle.training.losses import total_loss
 from spackle.training.recipe import OptimRecipe
 from spackle.training.residual import complete_samples
-from spackle.training.sample import Sample, load_sample, save_sample
+from spackle.training.samples import Sample, load_sample, save_sample
 
 pytest.importorskip("yaml")
 __all__ = ["one_thread"]  # a fixture

@@ -18,8 +18,7 @@ from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim
 from spackle.evaluation.rows import REMARK, Row
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.training.features import FeatureNet
-from spackle.training.losses import hole_distance
+from spackle.training.losses import FeatureNet, hole_distance
 
 
 @dataclasses.dataclass(frozen=True)

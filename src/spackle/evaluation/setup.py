@@ -28,7 +28,7 @@ from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpaint
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
-from spackle.training.features import load_features
+from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")

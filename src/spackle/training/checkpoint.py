@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spackle.errors import InputError, reading, reason_in_a_line
+from spackle.errors import InputError, reason_in_a_line
 from spackle.files import atomic_path
 from spackle.folders import NEW
 from spackle.training.recipe import AnyRecipe, differences
@@ -24,6 +26,7 @@ NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
 BEST, LAST, RUN = "best.safetensors", "last.safetensors", "run.json"
 RESULTS = (NEWEST, PREVIOUS, BEST, LAST, RUN)
 PICTURES, LOGS, BAD = "pictures", "logs", "bad_batch"
+Log = Callable[[str], None]
 
 
 @dataclasses.dataclass
@@ -58,7 +61,7 @@ class Checkpoint:
     optimizer: dict[str, Any]
     recipe: dict[str, Any]
     digest: str  # of the samples
-    method: str = "residual"  # checkpoints from before there was another do not say
+    method: str = "residual"  # older checkpoints do not name one
 
 
 def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
@@ -75,8 +78,8 @@ def save_checkpoint(checkpoint: Checkpoint, folder: Path) -> None:
             os.replace(newest, folder / PREVIOUS)
 
 
-def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
-    """The last whole checkpoint of a folder or None, and what is wrong with a newer one, if anything.
+def load_checkpoint(folder: Path, log: Log) -> Checkpoint | None:
+    """The last whole checkpoint of a folder, if any; logs what is wrong with a newer one.
 
     InputError for checkpoints of which none can be read.
     """
@@ -86,16 +89,20 @@ def load_checkpoint(folder: Path) -> tuple[Checkpoint | None, str | None]:
             continue
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-            return Checkpoint(**{**state, "progress": Progress(**state["progress"])}), problem
+            found = Checkpoint(**{**state, "progress": Progress(**state["progress"])})
         except Exception as error:  # a damaged file can raise anything
             problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
+        else:
+            if problem:
+                log(f"{problem}: going on from the one before it")
+            return found
     if problem:
         raise InputError(f"{problem}, nor is there one before it: --overwrite starts anew")
-    return None, None
+    return None
 
 
 def find_run(
-    output: Path, overwrite: bool, method: str, recipe: AnyRecipe, digest: str, log: Callable[[str], None]
+    output: Path, overwrite: bool, method: str, recipe: AnyRecipe, digest: str, log: Log
 ) -> tuple[Path, Checkpoint | None]:
     """The folder of a run, and the checkpoint in it that the run goes on from, if any.
 
@@ -107,36 +114,32 @@ def find_run(
     anew = overwrite and any((output / name).exists() for name in RESULTS)
     folder = output / NEW if anew else output
     try:
-        found, problem = load_checkpoint(folder)
+        found = load_checkpoint(folder, log)
         if found:
             _check_same_run(found, method, recipe, digest, output)
+            log(f"{folder}: going on from step {found.progress.step}")
     except InputError:
         if not anew:
             raise
-        found = problem = None  # begun by another recipe, or damaged
-    if found:
-        if problem:
-            log(f"{problem}: going on from the one before it")
-        log(f"{folder}: going on from step {found.progress.step}")
+        found = None  # begun by another recipe, or damaged
     return folder, found
 
 
 def _check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
     """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
-    other = differences(checkpoint.recipe, recipe)
-    if not other and checkpoint.digest != digest:
-        other = ["the files that data names"]
+    what, other = "", differences(checkpoint.recipe, recipe)
     if checkpoint.method != method:
         what = f"--method {checkpoint.method}, not of {method}"
     elif other:
         what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
-    else:
-        return
-    raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
+    elif checkpoint.digest != digest:
+        what = "another recipe (the files that data names differ)"
+    if what:
+        raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
 
 
 def replace_run(folder: Path, new: Path) -> None:
-    """Move a run that has ended from `new` to where an older one was, but not the samples.
+    """Move a run that has ended from `new` to where an older one was; the samples there stay.
 
     Where it is killed, the checkpoint is still in `new`, and a second call does the rest.
     """
@@ -149,34 +152,17 @@ def replace_run(folder: Path, new: Path) -> None:
     shutil.rmtree(new)
 
 
-class Logs:
-    """TensorBoard's event files in a run's folder, where it is installed."""
+def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:
+    """A writer of TensorBoard's event files in a run's folder, None where TensorBoard is not installed.
 
-    def __init__(self, folder: Path, first: int, log: Callable[[str], None], wanted: bool = True) -> None:
-        """Hide what an earlier start logged after the step `first`; write nothing unless `wanted`."""
-        self.folder, self.writer = folder / LOGS, None
-        if not wanted:
-            return
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of protobuf's, about itself
-                import tensorboard  # noqa: F401  # torch's own import of it fails with other words
-                from torch.utils.tensorboard import SummaryWriter
-            self.writer = SummaryWriter(str(self.folder), purge_step=first)
-        except ImportError:
-            log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
-
-    def numbers(self, group: str, values: Mapping[str, float], step: int) -> None:
-        """Points of the curves GROUP/NAME."""
-        for name, value in values.items():
-            self.write("add_scalar", f"{group}/{name}", value, step)
-
-    def write(self, method: str, *arguments: object, **options: object) -> None:
-        """Call a method of torch's writer; InputError for a disk that is full, which it notices a call later."""
-        if self.writer is not None:
-            with reading(self.folder, "cannot write the logs: {reason}", OSError):
-                getattr(self.writer, method)(*arguments, **options)
-
-    def close(self) -> None:
-        """Write what is still in memory."""
-        self.write("close")
+    What an earlier start logged after the step `first` is hidden.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of protobuf's, about itself
+            import tensorboard  # noqa: F401  # torch's own import of it fails with other words
+            from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        log("no TensorBoard logs: pip install 'spackle-nvs[train]'")
+        return contextlib.nullcontext()
+    return SummaryWriter(str(folder / LOGS), purge_step=first)

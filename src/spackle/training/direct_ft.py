@@ -24,10 +24,10 @@ from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of
-from spackle.training.data import short_digest
 from spackle.training.recipe import DataRecipe, Recipe
-from spackle.training.sources import PseudoViews
-from spackle.training.task import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask, sheet
+from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask, sheet
+from spackle.training.samples import short_digest
+from spackle.training.sources import open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
 BASE = "sharp"  # the base whose decoder can learn
@@ -45,13 +45,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
         place = place_of(renderer)
         gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera), place)
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
-    return ViewBatch(
-        rgb=torch.stack([rendering.rgb for rendering in drawn]),
-        alpha=torch.stack([rendering.alpha for rendering in drawn]),
-        base_rgb=torch.stack([view.rendering.rgb for view in views]).to(place),
-        target=torch.stack([view.target for view in views]).to(place),
-        hole=torch.stack([view.mask for view in views]).to(place),
-    )
+    return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
 
 
 class DirectFt(ViewTask):
@@ -80,7 +74,7 @@ class DirectFt(ViewTask):
                 "and from nothing else: samples of other sources have Gaussians that cannot change"
             )
         self.owner = _find_owner(checkpoint)
-        self.files = PseudoViews(data.pseudo).files
+        self.files = open_pseudo(data.pseudo)
         self.learned, self.validation = _divided(self.files, data, self.owner.sha256)
         self.digest = short_digest((self.files.manifest.digest, self.learned, self.validation))
         self.items, self.validation_items = len(self.learned), len(self.validation)

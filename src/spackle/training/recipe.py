@@ -21,7 +21,7 @@ PACKAGED = Path(__file__).parent / "recipes"
 MAX_BYTES = 1 << 16
 LEAST_SIDE = 36  # pixels that the feature networks need
 # Marks keys that may differ when a run is resumed: how long it is, how often it validates, where its files lie. The
-# samples themselves are held together by their digest.
+# samples themselves are told apart by their digest.
 FREE = "free"
 
 
@@ -49,6 +49,7 @@ Whole = Annotated[int, BeforeValidator(_as_number)]
 Share = Annotated[float, Field(ge=0, le=1e6)]
 Count = Annotated[Whole, Field(ge=1, le=1_000_000)]  # six digits name a sample's file
 Beta = Annotated[float, Field(ge=0, lt=1)]
+Disparity = Annotated[float, Field(ge=0, le=MAX_DISPARITY)]
 Interval = Annotated[Whole, Field(ge=1), FREE]  # steps
 Place = Annotated[Path | None, FREE]
 Seed = Annotated[Whole, Field(ge=0, le=2**31 - 2)]
@@ -92,10 +93,7 @@ class DataRecipe(RecipePart):
     pseudo: Place = None  # a dataset that `spackle dataset build` made
     shares: Shares = Shares()
     # How far the virtual camera goes, from and to.
-    disparity: Annotated[
-        tuple[Annotated[float, Field(ge=0, le=MAX_DISPARITY)], Annotated[float, Field(ge=0, le=MAX_DISPARITY)]],
-        AfterValidator(_ascending),
-    ] = (0.1, 0.6)
+    disparity: Annotated[tuple[Disparity, Disparity], AfterValidator(_ascending)] = (0.1, 0.6)
     views: Count = 20_000  # the paper's: 1,000 photos, 20 views of each
     crops: Annotated[Whole, Field(ge=1, le=100)] = 3  # of a view, at most
     cells: Annotated[Whole, Field(ge=16, le=768)] = 96  # along a crop's side, of 2×2 pixels
@@ -147,7 +145,7 @@ class OptimRecipe(RecipePart):
 
 
 class RunRecipe(RecipePart):
-    """What has no part in what is learned, but for the seed and when to stop."""
+    """What has no part in what is learned, except for the seed and when to stop."""
 
     seed: Seed = 0  # of the first weights and of the samples' order
     validate_every: Interval = 1000
@@ -258,7 +256,7 @@ def _set(content: Any, keys: Sequence[str], value: object) -> None:
 def _first_problem(kind: Any, error: ValidationError) -> str:
     """The first wrong value's key, and what it takes."""
     first = error.errors()[0]
-    key = "".join(f"{str(name)[:60]}." for name in first["loc"])[:-1]
+    key = ".".join(str(name)[:60] for name in first["loc"])
     message = first["msg"][0].lower() + first["msg"][1:]
     if first["type"] == "extra_forbidden":
         for name in first["loc"][:-1]:

@@ -1,7 +1,13 @@
-"""The paper's own method: a residual network learns to complete cached samples, the base stays as it is."""
+"""The paper's own method: a residual network learns to complete cached samples, the base stays as it is.
+
+`ViewTask` is what it has in common with all that completes views: the loss of eq. 6, and what is measured.
+"""
 
 from __future__ import annotations
 
+import abc
+import dataclasses
+import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,20 +16,122 @@ from typing import Any, ClassVar
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
+from spackle.device import pick_dtype
 from spackle.files import write_whole
 from spackle.folders import make_folder
+from spackle.formats.png import thumbnail
 from spackle.progress import Reporter
-from spackle.render import Renderer, place_of, render_batch
+from spackle.render import Renderer, get_renderer, place_of, render_batch
+from spackle.render.protocol import Rendering
 from spackle.residual.compose import compose
+from spackle.residual.mask import hole_area_ratio
 from spackle.residual.network import ResidualNet, load_residual, network_input
 from spackle.residual.view_features import ViewFeatures
-from spackle.training.data import CACHE, Supply
+from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
-from spackle.training.sample import Sample, load_sample
-from spackle.training.task import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask, sheet
+from spackle.training.samples import Sample, digest_of_samples, load_sample, make_samples
+from spackle.training.sources import find_sources
+from spackle.training.train import Task
 
 MIN_AUX = 64  # aux Gaussians of a view, however small its holes (paper, "Training Details and Loss Weights")
+PICTURED = 6  # views in the picture
+PICTURE_SIDE = 512  # pixels of a picture's longer side
+CACHE = "cache"  # in the output, where the recipe names no other folder
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewBatch:
+    """Completed views and their truth, stacked."""
+
+    rgb: Tensor  # [B, H, W, 3] sRGB of base and aux Gaussians, with gradients
+    alpha: Tensor  # [B, H, W] likewise
+    base_rgb: Tensor  # [B, H, W, 3] of the base alone
+    target: Tensor  # [B, H, W, 3]
+    hole: Tensor  # [B, H, W] bool
+
+    @staticmethod
+    def of(
+        drawn: Sequence[Rendering], base: Sequence[Tensor], target: Sequence[Tensor], hole: Sequence[Tensor]
+    ) -> ViewBatch:
+        """Stack renderings and the other images, on the renderings' device."""
+        rgb, alpha = [view.rgb for view in drawn], [view.alpha for view in drawn]
+        return ViewBatch(*(torch.stack(list(images)).to(rgb[0].device) for images in (rgb, alpha, base, target, hole)))
+
+
+class ViewTask(Task):
+    """A task whose batches become completed views, with the loss of eq. 6."""
+
+    measures = ("loss", "color", "alpha", "preserve", "perceptual", "hole_psnr", "seen_psnr", "har_before", "har_after")
+
+    def __init__(self, recipe: Recipe, device: torch.device) -> None:
+        """Load the feature network; InputError where it cannot be read."""
+        self.recipe, self.device, self.renderer = recipe, device, get_renderer()
+        self.precision = pick_dtype(recipe.optim.precision, device)
+        features = recipe.loss.features if recipe.loss.perceptual else "none"
+        self.features = load_features(features, recipe.loss.features_file, device)
+
+    @abc.abstractmethod
+    def complete(self, network: nn.Module, batch: Any) -> ViewBatch:
+        """The views of a batch, completed."""
+
+    def total(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The recipe's loss [] of completed views, and its terms [] unweighted, on the task's device."""
+        loss = self.recipe.loss
+        return total_loss(
+            **{name: tensor.to(self.device) for name, tensor in vars(views).items()},
+            features=self.features,
+            weights=vars(loss),
+            dilation=loss.dilation,
+            size=loss.feature_size,
+            blur=loss.color_blur,
+            gram=loss.gram,
+        )
+
+    def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.total(self.complete(network, batch))
+
+    def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
+        """Of each view: loss and its terms; hole_psnr and seen_psnr in dB, inside of the hole against the target and
+        outside of it against the base, where they are not infinite; har_before and har_after, the share of hole pixels.
+        """
+        views = self.complete(network, batch)
+        loss, terms = self.total(views)
+        decibels = {
+            "hole_psnr": map(hole_psnr, views.rgb, views.target, views.hole),
+            "seen_psnr": map(hole_psnr, views.rgb, views.base_rgb, ~views.hole),
+        }
+        return {
+            **{name: [float(value)] * len(views.rgb) for name, value in {"loss": loss, **terms}.items()},
+            **{name: [value for value in values if math.isfinite(value)] for name, values in decibels.items()},
+            "har_before": [float(hole.double().mean()) for hole in views.hole],
+            "har_after": [hole_area_ratio(alpha) for alpha in views.alpha],
+        }
+
+    def facts(self, network: nn.Module) -> dict[str, Any]:
+        """For run.json: what is learned from, and how much of a whole network learns."""
+        return {
+            "features": self.features.name if self.features else "none",
+            "samples": {"train": self.items, "validation": self.validation_items, "digest": self.digest},
+            "parameters": parameters(network),
+            "precision": str(self.precision).removeprefix("torch."),
+        }
+
+
+def parameters(network: nn.Module) -> dict[str, int]:
+    """How many weights of a network learn and how many stay, for run.json."""
+    counts = {"learn": 0, "stay": 0}
+    for weight in network.parameters():
+        counts["learn" if weight.requires_grad else "stay"] += weight.numel()
+    return counts
+
+
+def sheet(rows: Sequence[Sequence[Tensor]], side: int) -> Tensor:
+    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` long; narrower rows are black at their end."""
+    shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
+    widest = max(row.shape[1] for row in shown)
+    return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1])) for row in shown])
 
 
 def complete_samples(
@@ -52,12 +160,8 @@ def complete_samples(
         scenes.append([sample.base, compose(sample.seeds.select(index), deltas, sample.camera)])
     cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
     views = render_batch(renderer, scenes, cameras, tiles=tiles, onto=onto)
-    return ViewBatch(
-        rgb=torch.stack([view.rgb for view in views]),
-        alpha=torch.stack([view.alpha for view in views]),
-        base_rgb=torch.stack([sample.rendering.rgb for sample in samples]),
-        target=torch.stack([sample.target for sample in samples]),
-        hole=torch.stack([sample.hole for sample in samples]),
+    return ViewBatch.of(
+        views, [s.rendering.rgb for s in samples], [s.target for s in samples], [s.hole for s in samples]
     )
 
 
@@ -87,8 +191,8 @@ class ResidualTask(ViewTask):
                 torch.manual_seed(recipe.run.seed)
                 network = ResidualNet()
         self.network = network.requires_grad_()
-        self.supply = Supply.of(recipe.data, self.renderer)
-        self.digest, self.items_a_step = self.supply.digest, recipe.optim.batch
+        self.sources = find_sources(recipe.data, self.renderer)
+        self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources), recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make the samples that are missing."""
@@ -103,7 +207,14 @@ class ResidualTask(ViewTask):
         make_folder(folder)
         reporter.log(f"samples of {data.views + data.validation_views} views in {folder}")
         with reporter.stage("samples") as step:
-            self.learned, self.validation = self.supply.samples(folder, step, skip)
+            # Other seeds, other views: no view is in both.
+            self.validation, self.learned = (
+                make_samples(data, self.sources, folder / self.digest / name, seed, views, step, skip)
+                for name, seed, views in (
+                    ("validation", 2 * data.seed + 1, data.validation_views),
+                    ("train", 2 * data.seed, data.views),
+                )
+            )
         if skipped:
             reporter.log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
         self.items, self.validation_items = len(self.learned), len(self.validation)

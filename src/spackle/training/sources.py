@@ -1,20 +1,23 @@
 """Where views with holes and their truth come from: photos, RGB-D frames, stereo pairs, a pseudo-supervised dataset.
 
 `reverse_view` needs no inpainter: what a virtual camera cannot see of a photo is a hole in it, and it is the truth.
+Photos without depth become scenes: cut-outs of some stand at known depths in front of another (`composite`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
@@ -23,14 +26,70 @@ from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.dataset.shards import DatasetFiles
 from spackle.errors import InputError, reading
+from spackle.files import files_in
 from spackle.gaussians import Gaussians
-from spackle.image import film_to_pixels, load_photo
+from spackle.image import PHOTO_SUFFIXES, film_to_pixels, load_photo
 from spackle.render import Renderer
-from spackle.training.composites import composite
-from spackle.training.sample import Sample
+from spackle.training.recipe import DataRecipe
+from spackle.training.samples import Sample, Source
 
 TOLERANCE = 0.02  # how far behind what the virtual camera sees a Gaussian may lie and still count as seen, relative
 CORNER = 0.25  # pixels; centres of pixels are half of one from their corners
+FRAMES = 24  # of a path, one of which is the virtual camera
+UNCOMPLETED = "none"  # the inpainter that leaves its holes open
+
+Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # a photo [H, W, 3] sRGB with depth
+
+
+def find_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
+    """Look for a recipe's files; InputError for a folder that is missing or without such files, or no data."""
+    shares, found = data.shares, list[Source]()
+
+    def add(name: str, share: float, folder: Path, files: Sequence[Path], view: Callable[..., Sample]) -> None:
+        if share > 0:
+            names = [file.relative_to(folder).as_posix() for file in files]
+            found.append(Source(share, view, [name, *names]))
+
+    def reverse(draw: Draw) -> Callable[[np.random.Generator], Sample]:
+        return partial(random_reverse_view, draw=draw, disparity=data.disparity, renderer=renderer)
+
+    if data.photos is not None:
+        photos = find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
+        draw: Draw = partial(composite_photo, photos=photos)
+        add("composites", shares.composites, data.photos, photos, reverse(draw))
+    frames = [find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for camera in data.rgbd]
+    for camera, files in zip(data.rgbd, frames, strict=True):
+        share = shares.rgbd * len(files) / sum(map(len, frames))  # every frame counts alike
+        draw = partial(frame_photo, frames=files, focal_px=camera.focal_px, unit_m=camera.unit_m)
+        add("rgbd", share, camera.folder, files, reverse(draw))
+    if data.stereo is not None:
+        scenes = [file.parent for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
+        add("stereo", shares.stereo, data.stereo, scenes, reverse(partial(left_photo, folders=scenes)))
+        view = partial(right_view, folders=scenes, renderer=renderer)
+        add("pairs", shares.pairs, data.stereo, scenes, view)
+    if data.pseudo is not None and shares.pseudo > 0:
+        dataset = open_pseudo(data.pseudo)
+        view = partial(pseudo_view, files=dataset, places=views_with_holes(dataset))
+        found.append(Source(shares.pseudo, view, ["pseudo", dataset.manifest.digest]))
+    if not found:
+        raise InputError(
+            "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
+            "and a share above 0"
+        )
+    return found
+
+
+def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
+    """All files below a folder whose names end so, in order; InputError for no folder, or no such file in it."""
+    if not os.path.isdir(folder):
+        raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
+    found = files_in(folder, endings, below=True)
+    if not found:
+        raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
+    return found
+
+
+# Views --------------------------------------------------------------------------------------------
 
 
 def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, renderer: Renderer) -> Sample:
@@ -82,15 +141,6 @@ def with_backing(seen: Tensor, gaussians: Gaussians, camera: Camera) -> Tensor:
     return torch.where(backing, seen[backed], seen)
 
 
-COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
-FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
-FRAMES = 24  # of a path, one of which is the virtual camera
-UNCOMPLETED = "none"  # the inpainter that leaves its holes open
-
-View = Callable[[np.random.Generator], Sample]  # one of a source's views; InputError for a file that cannot be used
-Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # likewise a photo [H, W, 3] sRGB with depth
-
-
 def random_reverse_view(
     rng: np.random.Generator, draw: Draw, disparity: tuple[float, float], renderer: Renderer
 ) -> Sample:
@@ -103,14 +153,38 @@ def random_reverse_view(
     return reverse_view(prediction, rgb, viewer, renderer)
 
 
-def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
-    """Photos without depth, cut-outs of some in front of others."""
-    height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
-    rgb, inverse_depth = composite(rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width)
-    focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
-    every = torch.ones_like(inverse_depth, dtype=torch.bool)
-    depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
-    return rgb, depth, Camera.from_focal(focal, width, height)
+def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
+    """The left photo of a stereo pair seen from the right camera, whose photo is the truth."""
+    left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
+    base = lift(left, depth, camera).gaussians
+    return Sample.of(base, renderer.render(base, beside), beside, camera, right)
+
+
+def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
+    """A pseudo-supervised dataset (appendix, "Dataset"); InputError for one that is not finished or teaches nothing."""
+    files = DatasetFiles(location)
+    if files.manifest.config.get("inpainter", {}).get("name") == UNCOMPLETED:
+        raise InputError(f"{location}: built with --inpainter none, so its targets teach nothing: build another")
+    if not views_with_holes(files):
+        raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
+    return files
+
+
+def views_with_holes(files: DatasetFiles) -> list[tuple[int, int]]:
+    """Photo and view of each view that has a hole."""
+    samples = (sample for _, sample in files.samples)
+    return [(photo, view) for photo, sample in enumerate(samples) for view, hole in enumerate(sample.holes) if hole > 0]
+
+
+def pseudo_view(rng: np.random.Generator, files: DatasetFiles, places: Sequence[tuple[int, int]]) -> Sample:
+    """One of a dataset's views as it is stored, rendering and all; InputError for a file that cannot be used."""
+    photo, index = places[int(rng.integers(len(places)))]
+    view = files.group(photo).view(index, with_base=True)
+    assert view.base is not None
+    return Sample.of(view.base, view.rendering, view.camera, view.photo_camera, view.target)
+
+
+# Photos with depth --------------------------------------------------------------------------------
 
 
 def frame_photo(
@@ -127,46 +201,8 @@ def left_photo(rng: np.random.Generator, folders: Sequence[Path]) -> tuple[Tenso
     return left, depth, camera
 
 
-def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Renderer) -> Sample:
-    """The left photo of a stereo pair seen from the right camera, whose photo is the truth."""
-    left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
-    base = lift(left, depth, camera).gaussians
-    return Sample.of(base, renderer.render(base, beside), beside, camera, right)
-
-
 def _chosen(rng: np.random.Generator, files: Sequence[Path]) -> Path:
     return files[int(rng.integers(len(files)))]
-
-
-class PseudoViews:
-    """Random views with holes and their completed targets of a pseudo-supervised dataset (appendix, "Dataset")."""
-
-    def __init__(self, location: str | os.PathLike[str]) -> None:
-        """Read the manifest; InputError for no finished dataset, or one without holes or without completed targets."""
-        self.files = DatasetFiles(location)
-        config = self.files.manifest.config
-        if config.get("inpainter", {}).get("name") == UNCOMPLETED:
-            raise InputError(f"{location}: built with --inpainter none, so its targets teach nothing: build another")
-        self._open = [
-            (photo, view)
-            for photo, (_, sample) in enumerate(self.files.samples)
-            for view, hole in enumerate(sample.holes)
-            if hole > 0
-        ]
-        if not self._open:
-            raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
-
-    @property
-    def digest(self) -> str:
-        """The same for the same dataset, wherever it lies."""
-        return self.files.manifest.digest
-
-    def view(self, rng: np.random.Generator) -> Sample:
-        """A view as it is stored, rendering and all; InputError for a file that cannot be used."""
-        photo, index = self._open[int(rng.integers(len(self._open)))]
-        found = self.files.group(photo).view(index, with_base=True)
-        assert found.base is not None
-        return Sample.of(found.base, found.rendering, found.camera, found.photo_camera, found.target)
 
 
 def load_frame(color: Path, unit_m: float) -> tuple[Tensor, DepthMap]:
@@ -201,3 +237,109 @@ def load_pair(folder: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
     height, width = left.shape[:2]
     cameras = Camera(K, torch.eye(4), width, height), Camera(right_K, moved, width, height)
     return left, right, depth, *cameras
+
+
+# Photos without depth -----------------------------------------------------------------------------
+
+COMPOSITE_SIZE = (336, 448)  # height, width; half of them stand upright
+FOCAL_MM = (20.0, 50.0)  # lenses of photos that do not tell theirs
+BACKGROUND_M = (3.0, 8.0)  # depth of the farthest plane
+NEARER = (1.15, 4.0)  # a cut-out's inverse depth over that of what it covers
+NEAREST_M = 0.7
+OBJECTS = (1, 4)
+AREA = (0.01, 0.35)  # share of the frame that a cut-out may take
+
+Photos = Callable[[np.random.Generator], Tensor]  # a random photo, [H, W, 3] sRGB
+
+
+def composite_photo(rng: np.random.Generator, photos: Sequence[Path]) -> tuple[Tensor, DepthMap, Camera]:
+    """A composite, and the camera that took it."""
+    height, width = COMPOSITE_SIZE if rng.random() < 0.5 else COMPOSITE_SIZE[::-1]
+    rgb, inverse_depth = composite(rng, lambda rng: load_photo(_chosen(rng, photos)).rgb, height, width)
+    focal = film_to_pixels(rng.uniform(*FOCAL_MM), width, height)
+    every = torch.ones_like(inverse_depth, dtype=torch.bool)
+    depth = DepthMap(1.0 / inverse_depth, every, None, None, "depth", Path("composite"))
+    return rgb, depth, Camera.from_focal(focal, width, height)
+
+
+def composite(rng: np.random.Generator, photos: Photos, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A picture [H, W, 3] sRGB of several photos, and its inverse depth [H, W] in 1/m, known exactly."""
+    rgb = random_crop(rng, photos(rng), height, width)
+    inverse_depth = _background(rng, height, width)
+    for _ in range(rng.integers(OBJECTS[0], OBJECTS[1] + 1)):
+        picture = random_crop(rng, photos(rng), height, width)
+        shape = outline(rng, picture)
+        share = float((shape > 0.5).float().mean())
+        if not AREA[0] < share < AREA[1]:
+            continue
+        inside = shape > 0.5
+        depth = float(inverse_depth[inside].max()) * rng.uniform(*NEARER)
+        if depth > 1 / NEAREST_M:
+            continue
+        plane = depth * (1 + _tilt(rng, height, width, 0.1))
+        rgb = torch.lerp(rgb, picture, shape[..., None])
+        inverse_depth = torch.where(inside, plane, inverse_depth)
+    return rgb, inverse_depth
+
+
+def random_crop(rng: np.random.Generator, photo: Tensor, height: int, width: int) -> Tensor:
+    """A part of a photo [h, w, 3] at a random scale, by chance mirrored, [height, width, 3]."""
+    rows, columns = photo.shape[:2]
+    smallest = max(height / rows, width / columns)
+    scale = smallest * rng.uniform(1.0, 1.5)
+    size = max(height, math.ceil(rows * scale)), max(width, math.ceil(columns * scale))
+    resized = interpolate(photo.permute(2, 0, 1)[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
+    top, left = (int(rng.integers(0, have - want + 1)) for have, want in zip(size, (height, width), strict=True))
+    part = resized[:, top : top + height, left : left + width].permute(1, 2, 0)
+    return part.flip(1).contiguous() if rng.random() < 0.5 else part.contiguous()
+
+
+def _background(rng: np.random.Generator, height: int, width: int) -> Tensor:
+    """A wall, and by chance the ground in front of it or a second wall beside it."""
+    far = 1.0 / rng.uniform(*BACKGROUND_M)
+    plane = far * (1 + _tilt(rng, height, width, 0.3))
+    if rng.random() < 0.5:  # the ground: inverse depth grows linearly below the horizon
+        rows = (torch.arange(height) + 0.5) / height
+        ground = far * rng.uniform(1.5, 4.0) * (rows - rng.uniform(0.2, 0.6))[:, None].clamp_min(0)
+        plane = torch.maximum(plane, ground.expand(height, width))
+    if rng.random() < 0.3:
+        plane = torch.maximum(plane, far * (1 + _tilt(rng, height, width, 1.0)))
+    return plane.clamp(0.5 * far, 1 / NEAREST_M)
+
+
+def _tilt(rng: np.random.Generator, height: int, width: int, most: float) -> Tensor:
+    """A linear ramp [H, W] of random direction, within ±most."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, height), torch.linspace(-1, 1, width), indexing="ij")
+    a, b = (rng.uniform(-most, most) / 2 for _ in range(2))
+    return a * x + b * y
+
+
+def outline(rng: np.random.Generator, picture: Tensor) -> Tensor:
+    """An outline [H, W] in 0..1, soft over about a pixel as a camera's edges are."""
+    height, width = picture.shape[:2]
+    cloud = _noise(rng, height, width, rng.uniform(0.1, 0.35))
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    cy, cx = rng.uniform(0.1, 1.0) * height, rng.uniform(0.0, 1.0) * width
+    kind = rng.random()
+    if kind < 0.35:  # what resembles the colour at a point: outlines that follow those of real things
+        smooth = avg_pool2d(picture.permute(2, 0, 1)[None], 9, stride=1, padding=4, count_include_pad=False)[0]
+        color = smooth[:, min(int(cy), height - 1), min(int(cx), width - 1)]
+        unlike = ((smooth - color[:, None, None]) ** 2).sum(0) / rng.uniform(0.01, 0.04)
+        away = ((x - cx) ** 2 + (y - cy) ** 2) / (rng.uniform(0.15, 0.5) * width) ** 2
+        field = 1 - unlike - away + 0.1 * cloud
+    elif kind < 0.75:  # a blob
+        ry, rx = (rng.uniform(0.08, 0.4) * side for side in (height, width))
+        field = 1 - ((x - cx) / rx) ** 2 - ((y - cy) / ry) ** 2 + rng.uniform(0.0, 0.8) * cloud
+    else:  # a bar: poles, legs and frames
+        angle = rng.uniform(-0.4, 0.4) + (math.pi / 2 if rng.random() < 0.25 else 0.0)
+        across = ((x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)).abs()
+        field = 1 - across / (rng.uniform(0.008, 0.06) * width) + 0.2 * cloud
+    soft = (field > 0).float()[None, None]
+    return avg_pool2d(soft, 3, stride=1, padding=1, count_include_pad=False)[0, 0]
+
+
+def _noise(rng: np.random.Generator, height: int, width: int, size: float) -> Tensor:
+    """Smooth noise [H, W] of about ±1; `size` is that of its features over the width."""
+    rows, columns = max(2, round(height / (size * width))), max(2, round(1 / size))
+    coarse = torch.from_numpy(rng.standard_normal((1, 1, rows, columns)).astype(np.float32))
+    return interpolate(coarse, size=(height, width), mode="bicubic", align_corners=True)[0, 0]

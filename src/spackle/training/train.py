@@ -1,6 +1,7 @@
 """The training loop, from top to bottom: batch, forward, losses, step, validate, save.
 
-A `Task` says what learns, and from what. Whatever stops a run, it goes on from its last checkpoint.
+A `Task` says what learns, and from what. Several processes that torchrun started train one network together. Whatever
+stops a run, it goes on from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -10,15 +11,18 @@ import copy
 import dataclasses
 import functools
 import math
+import os
 import shutil
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor, nn
@@ -41,17 +45,16 @@ from spackle.training.checkpoint import (
     RESULTS,
     RUN,
     Checkpoint,
-    Logs,
     Progress,
     find_run,
+    open_logs,
     replace_run,
     save_checkpoint,
 )
-from spackle.training.ranks import joined_ranks, rank, rank_count, sum_of_ranks, wait_for_ranks
 from spackle.training.recipe import AnyRecipe, OptimRecipe
-from spackle.training.task import Task
 
 EMA_START = 10  # the average forgets the first, bad weights this quickly: decay (s + 1) / (s + 10)
+PATIENCE = timedelta(hours=24)  # making samples takes one process longer than another
 END = {
     "steps": "all steps are done",
     "patience": "no improvement any more",
@@ -60,6 +63,51 @@ END = {
 R = TypeVar("R", bound=AnyRecipe)
 K = TypeVar("K")
 V = TypeVar("V")
+
+
+class Task(Protocol):
+    """What learns, and from which items; they are counted from 0.
+
+    To make one is quick, and refuses with an InputError what cannot be used. `prepare` gives it the rest of its values.
+    """
+
+    name: ClassVar[str]  # as `--method` and checkpoints have it
+    aim: ClassVar[str] = "loss"  # the measure that chooses the best weights: the lower the better
+    at_once: ClassVar[int | None] = None  # items that go through the network together; None: all of a process's step
+    digest: str  # of everything that decides what is learned from, but not of where it lies
+    items_a_step: int  # of all processes together
+    network: nn.Module  # its weights that ask for gradients learn, in place
+    measures: Sequence[str]  # names of what `measure` finds
+    items: int  # to learn from; an epoch has each once
+    validation_items: int
+
+    def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
+        """Do the long work, in every process; returns facts for run.json. InputError for files that cannot be used."""
+
+    def groups(self) -> list[dict[str, Any]]:
+        """The optimiser's groups of weights; "lr_scale" in one is a factor on the learning rate."""
+        return [{"params": [weight for weight in self.network.parameters() if weight.requires_grad]}]
+
+    def batch(self, step: int | None, items: Sequence[int]) -> Any:
+        """Items that a step learns from, or validation items (None), by nothing but the arguments; in any thread.
+
+        InputError for one that cannot be read.
+        """
+
+    def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss [] of a batch, with gradients, and its terms []."""
+
+    def measure(self, network: nn.Module, batch: Any) -> dict[str, list[float]]:
+        """How good a network is on a batch of validation items: each measure's values."""
+
+    def picture(self, network: nn.Module) -> Tensor:
+        """[H, W, 3] sRGB: a few validation items."""
+
+    def names(self, step: int, items: Sequence[int]) -> list[str]:
+        """What a step's items are called, for a person who looks for a bad one."""
+
+    def export(self, network: nn.Module, path: Path) -> None:
+        """Write weights as the rest of the package reads them; InputError where that cannot be."""
 
 
 def train(
@@ -72,8 +120,7 @@ def train(
         open_task: makes the task whose networks run on a device; refuses what cannot be used, before any long work.
         output: a folder for all results.
         reporter: the first process reports to it.
-        overwrite: start anew where `output` holds a run; the samples in it stay, and so does the old run until the new
-            one, in `output`/.new, has ended.
+        overwrite: start anew, in `output`/.new until the new run has ended; samples stay.
 
     Returns:
         Why the run ended: "steps" (all are done), "patience" (nothing improved) or "stopped" (by a signal).
@@ -97,7 +144,8 @@ def train(
             if found is None:
                 shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(exist_ok=True)
-        why, step = _learn(recipe, task, folder, found, facts, device, reporter)
+        with reading(folder, "cannot write: {reason}", OSError):
+            why, step = _learn(recipe, task, folder, found, facts, device, reporter)
         if rank() == 0:
             if folder != output and why != "stopped":
                 replace_run(output, folder)
@@ -115,7 +163,7 @@ def _learn(
     device: torch.device,
     reporter: Reporter,
 ) -> tuple[str, int]:
-    """The loop of one process; all processes of a run do the same steps. Returns why it ended, and the steps done."""
+    """Why the run ended, and at which step."""
     optim, run = recipe.optim, recipe.run
     network: nn.Module = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(network).requires_grad_(False)
@@ -154,9 +202,14 @@ def _learn(
         size = task.at_once or len(own)
         return [own[start : start + size] for start in range(0, len(own), size)]
 
+    def curves(group: str, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            if logs is not None:
+                logs.add_scalar(f"{group}/{name}", value, progress.step)
+
     todo = ((step, part) for step in range(progress.step, optim.steps) for part in parts(step))
     with (
-        contextlib.closing(Logs(folder, progress.step, reporter.log, rank() == 0)) as logs,
+        open_logs(folder, progress.step, reporter.log) if rank() == 0 else contextlib.nullcontext() as logs,
         contextlib.closing(made_ahead(lambda key: task.batch(*key), todo)) as batches,
         reporter.steps("train", progress.step, optim.steps) as tell,
         asked_to_stop(alone=rank_count() == 1) as asked,
@@ -177,10 +230,10 @@ def _learn(
                 for name, value in {"loss": loss.detach(), **terms}.items():
                     sums[name] = sums.get(name, 0.0) + share * value.double()
             sums["gradient"] = clip_grad_norm_(network.parameters(), optim.clip).double()
-            mine = {**dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True)), "stop": float(asked())}
-            means = [total / rank_count() for total in sum_of_ranks(list(mine.values()), device)]
-            numbers = dict(zip(mine, means, strict=True))
-            stopped = numbers.pop("stop") > 0
+            mine = dict(zip(sums, torch.stack(list(sums.values())).tolist(), strict=True))
+            totals = sum_of_ranks({**mine, "stop": float(asked())}, device)
+            stopped = totals.pop("stop") > 0
+            numbers = {name: total / rank_count() for name, total in totals.items()}
             if bad := [name for name, value in numbers.items() if not math.isfinite(value)]:
                 if rank() == 0:
                     (folder / BAD).mkdir(exist_ok=True)
@@ -207,7 +260,7 @@ def _learn(
             # Log
             if progress.step % run.log_every == 0 or last:
                 numbers = {name: sum(each[name] for each in recent) / len(recent) for name in recent[0]}
-                logs.numbers("train", numbers, progress.step)
+                curves("train", numbers)
                 tell(progress.step, f"loss {numbers['loss']:.4f}")
                 recent = []
 
@@ -221,8 +274,9 @@ def _learn(
                     save_png(sheet, folder / PICTURES / f"{progress.step:07d}.png")
                     if best:
                         task.export(average, folder / BEST)
-                    logs.numbers("validation", measures, progress.step)
-                    logs.write("add_image", "views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
+                    curves("validation", measures)
+                    if logs is not None:
+                        logs.add_image("views", sheet.clamp(0, 1), progress.step, dataformats="HWC")
                     told = "the best so far" if best else f"best {progress.best:.4f} at step {progress.best_step}"
                     rest = ", ".join(f"{name} {value:.4f}" for name, value in measures.items() if name != task.aim)
                     line = f"validation {task.aim} {measures[task.aim]:.4f} ({told}), {rest}"
@@ -244,15 +298,14 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
 
     A measure that no item has is missing.
     """
-    totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0)
+    totals, counts = dict.fromkeys(task.measures, 0.0), dict.fromkeys(task.measures, 0.0)
     mine, size = range(rank(), task.validation_items, rank_count()), task.at_once or task.items_a_step // rank_count()
     for start in range(0, len(mine), size):
         for name, values in task.measure(network, task.batch(None, mine[start : start + size])).items():
             totals[name] += sum(values)
             counts[name] += len(values)
-    sums = sum_of_ranks([*totals.values(), *counts.values()], device)
-    pairs = zip(totals, sums[: len(totals)], sums[len(totals) :], strict=True)
-    return {name: total / count for name, total, count in pairs if count}
+    totals, counts = sum_of_ranks(totals, device), sum_of_ranks(counts, device)
+    return {name: total / counts[name] for name, total in totals.items() if counts[name]}
 
 
 def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
@@ -295,3 +348,49 @@ def samples_of_step(step: int, count: int, batch: int, seed: int, rank: int = 0,
 @functools.lru_cache(maxsize=2)
 def _epoch(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
     return np.random.default_rng([seed, epoch]).permutation(count)
+
+
+# Several processes --------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def joined_ranks(kind: str) -> Iterator[torch.device]:
+    """Join the processes of this run, as torchrun's environment names them; yields this one's device of a kind.
+
+    "cuda" talks by nccl, "cpu" by gloo. InputError for variables that are no numbers, or others that cannot be reached.
+    """
+    local = 0
+    if "WORLD_SIZE" in os.environ:
+        with reading("RANK and WORLD_SIZE are set", "but the processes cannot join: {reason}"):
+            local = int(os.environ.get("LOCAL_RANK", "0"))
+            dist.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
+    try:
+        yield torch.device(kind, local) if kind == "cuda" else torch.device(kind)
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+
+def rank() -> int:
+    """This process among those that train together, from 0; the first one writes and reports."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def rank_count() -> int:
+    """How many processes train together."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def wait_for_ranks() -> None:
+    """Until all have come here."""
+    if rank_count() > 1:
+        dist.barrier()
+
+
+def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str, float]:
+    """Each number's sum over the processes, the same in all of them."""
+    # In float64: what is compared and decided upon must not depend on how many processes there are.
+    tensor = torch.tensor(list(numbers.values()), dtype=torch.float64, device=device)
+    if rank_count() > 1:
+        dist.all_reduce(tensor)
+    return dict(zip(numbers, tensor.tolist(), strict=True))

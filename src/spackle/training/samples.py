@@ -1,14 +1,18 @@
-"""What one training step looks at: a view with holes, its truth, crops of it small enough for a step, and its file."""
+"""What one training step looks at: a view with holes, its truth, crops of it small enough for a step, and their files.
+
+Each view is made once and read many times: `make_samples` writes the crops of all views into a folder.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import math
+import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -17,18 +21,22 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
-from spackle.errors import reading
+from spackle.errors import InputError, reading
 from spackle.files import write_whole
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import ALPHA_MIN, TILE, Rendering
+from spackle.progress import Step
+from spackle.render.cpu import project, wanted_tiles
+from spackle.render.project import KernelCamera
+from spackle.render.protocol import TILE, Rendering
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.mask import hole_mask
 from spackle.residual.rim import Rim, find_rim
 from spackle.residual.view_features import CELL, ViewFeatures
+from spackle.training.recipe import DataRecipe
+from spackle.training.train import rank, rank_count, wait_for_ranks
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
-FAINTEST = math.sqrt(-2 * math.log(ALPHA_MIN))  # standard deviations at which an opaque blob is no longer drawn
 # Half precision is enough for these, and halves what is read at every step. Not for positions.
 HALVED = (
     "base.quats", "base.scales", "base.opacities", "base.colors", "rendering.rgb", "rendering.depth",
@@ -37,6 +45,7 @@ HALVED = (
 )  # fmt: skip
 PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
+SAMPLES_VERSION = 4  # goes up whenever the same recipe would make other samples
 P = TypeVar("P")
 
 
@@ -75,7 +84,7 @@ class Sample:
         return max_pool2d(near[None, None].float(), TILE, ceil_mode=True)[0, 0] > 0
 
     def to(self, device: torch.device) -> Sample:
-        """The same on another device, but for the camera, whose numbers are read by the host."""
+        """The same on another device, except for the camera, whose numbers are read by the host."""
         move = partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
         parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
         return dataclasses.replace(self, **parts, target=move(self.target))
@@ -104,24 +113,11 @@ class Sample:
         )._with_near_base()
 
     def _with_near_base(self) -> Sample:
-        """Without the base Gaussians that touch no tile of interest."""
-        rows, columns = self.tiles.shape
-        uv, z = self.camera.project(self.base.means)
-        # No blob is drawn beyond FAINTEST deviations, and none stretched more than at the renderer's steepest ray.
-        middle, focal = self.camera.K[:2, 2], self.camera.K.diagonal()[:2]
-        size = torch.tensor([self.camera.width, self.camera.height]).to(middle)
-        steepest = float(((torch.maximum(middle.abs(), (size - middle).abs()) + 0.15 * size) / focal).max())
-        stretch = max(self.camera.focal) * math.hypot(1.0, steepest)
-        reach = FAINTEST * self.base.scales.amax(-1) * stretch / z.clamp_min(1e-6) + 1.0
-        wide = max_pool2d(self.tiles.float()[None, None], 3, stride=1, padding=1)[0, 0] > 0
-        # Most blobs are smaller than a tile; one whose centre lies in a tile beside a wanted one may touch it.
-        x, y = (uv / TILE).floor().long().unbind(-1)
-        inside = (x >= -1) & (y >= -1) & (x <= columns) & (y <= rows) & (z > 0)
-        small = reach < TILE
-        near = inside & small & wide[y.clamp(0, rows - 1), x.clamp(0, columns - 1)]
-        big = ~small & (z > 0) & (uv[:, 0] > -reach) & (uv[:, 1] > -reach)
-        big &= (uv[:, 0] < self.camera.width + reach) & (uv[:, 1] < self.camera.height + reach)
-        return dataclasses.replace(self, base=self.base.select(near | big))
+        """Without the base Gaussians that touch no tile of interest: no renderer draws anything of them there."""
+        view = KernelCamera.of(self.camera, 0.0)
+        splats, spans = project([self.base], view, wanted_tiles(view, self.tiles))
+        near = np.concatenate([splats.ids[:0], *(splats.ids[start : start + count] for start, count in spans)])
+        return dataclasses.replace(self, base=self.base.select(torch.from_numpy(near).long()))
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
@@ -183,3 +179,77 @@ def _mapped(part: P, function: Callable[[Tensor], Tensor]) -> P:
     """A dataclass with a function applied to its tensors."""
     tensors = {name: value for name, value in vars(part).items() if isinstance(value, Tensor)}
     return dataclasses.replace(part, **{name: function(value) for name, value in tensors.items()})  # type: ignore[type-var]
+
+
+class Source(NamedTuple):
+    """A kind of views with holes and truth, of which a share of the samples is made."""
+
+    share: float  # among all sources, which need not add up to 1
+    view: Callable[[np.random.Generator], Sample]  # one of its views; InputError for a file that cannot be used
+    names: Sequence[str]  # of the source and of its files, relative to their folder
+
+
+def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
+    """Twelve digits: the same samples have the same ones, wherever the files lie and however many are made."""
+    facts = data.model_dump(mode="json")
+    for name in ("photos", "stereo", "pseudo", "cache", "views", "validation_views"):
+        facts.pop(name)
+    for camera in facts["rgbd"]:
+        camera.pop("folder")
+    names = [name for source in sources for name in source.names]
+    return short_digest((SAMPLES_VERSION, facts, [source.share for source in sources], names))
+
+
+def short_digest(value: Any) -> str:
+    """Twelve hexadecimal digits that tell one recipe's data from another's."""
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:12]
+
+
+def make_samples(
+    data: DataRecipe,
+    sources: Sequence[Source],
+    folder: Path,
+    seed: int,
+    views: int,
+    progress: Step,
+    warn: Callable[[str], None],
+) -> list[Path]:
+    """The files of all samples of a folder's first views, in order; what is missing is made, by each process a part.
+
+    Many recipes may share the folder. `seed` decides the views; `progress` is called with the views of this process
+    that are there, of how many, and `warn` with the reason for each view that gives no sample. InputError where nothing
+    can be written, or no view has a hole to learn from.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shares = np.array([source.share for source in sources])
+    mine = range(rank(), views, rank_count())
+    for done, index in enumerate(mine, 1):
+        if _crop_files(folder, index) is None:
+            rng = np.random.default_rng([seed, index])
+            source, crops = sources[rng.choice(len(sources), p=shares / shares.sum())], list[Sample]()
+            try:
+                crops = random_crops(source.view(rng), rng, data.crops, data.cells)
+            except (InputError, ValueError) as error:
+                warn(str(error))
+            for number, crop in enumerate(crops):
+                save_sample(crop, folder / f"{index:06d}-{number}.safetensors")
+            write_whole(folder / f"{index:06d}.done", f"{len(crops)}\n".encode())  # last: it vouches for the crops
+        progress(done, len(mine))
+    wait_for_ranks()
+    files = [file for index in range(views) for file in _crop_files(folder, index) or ()]
+    if not files:
+        raise InputError(
+            f"{folder}: none of {views} views gave a sample: photos must be readable, larger than "
+            f"{2 * data.cells} pixels each way, and seen from aside (data.disparity)"
+        )
+    return files
+
+
+def _crop_files(folder: Path, index: int) -> list[Path] | None:
+    """The files of a view's crops; None where they are still to be made."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        count = int((folder / f"{index:06d}.done").read_text())
+        files = [folder / f"{index:06d}-{number}.safetensors" for number in range(count)]
+        if all(file.is_file() for file in files):
+            return files
+    return None
