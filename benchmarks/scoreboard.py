@@ -113,7 +113,7 @@ def one_surface(own: Any) -> Any:
     return layers
 
 
-NO_SKY: dict[str, Replace] = {"beyond_border._sky": lambda own: lambda rgb, known: torch.zeros_like(rgb[..., 0])}
+NO_SKY: dict[str, Replace] = {"base_values._sky": lambda own: lambda rgb, known: torch.zeros_like(rgb[..., 0])}
 # What is switched off while a photo is lifted, and while it is completed: names in the package, and what replaces them.
 LIFT: dict[str, dict[str, Replace]] = {
     "smooth_noise": {"smooth_noise": first},
@@ -136,15 +136,15 @@ FILL: dict[str, dict[str, Replace]] = {
     "beyond_border": {"fill_around": filled_from_around},
     "beyond_border's colours": {
         **NO_SKY,
-        "beyond_border.MIXED": lambda own: 10.0,
-        "beyond_border.CARRIED": lambda own: 20.0,
+        "base_values.MIXED": lambda own: 10.0,
+        "base_values.CARRIED": lambda own: 20.0,
     },
     "patches beyond the border": {"texture.SHARE": lambda own: 0.0},
     "in proportion": {"_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)},
     "repeat count": {"texture.REPEATS": lambda own: math.inf},
     "extended": {"extended": lambda own: lambda view: view.structure},
     "widened": {"widened": first},
-    "ALIKE": {"rim.ALIKE": lambda own: math.inf},
+    "ALIKE": {"network.ALIKE": lambda own: math.inf},
     "solid sources": {"_sources": all_covered},
 }
 MECHANISMS = (*FILL, *LIFT)

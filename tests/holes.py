@@ -15,8 +15,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, Seeds, ViewFeatures, make_seeds
-from spackle.residual.network import shipped_network
-from spackle.residual.rim import Rim, find_rim
+from spackle.residual.network import Rim, find_rim, shipped_network
 from spackle.scene_fill import FillContext
 
 CPU = CpuRenderer()

@@ -14,12 +14,8 @@ from typer.main import get_command
 from spackle.cli import app
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [
-        *ROOT.glob("*.md"),
-        *(page for d in ("docs", "integrations", "research", "src") for page in (ROOT / d).rglob("*.md")),
-    ]
-)
+FOLDERS = ("docs", "integrations", "research", "src")
+PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 
 
 def names_in(path: Path) -> set[str]:
@@ -55,9 +51,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def commands() -> list[str]:
     """Every command of ours in the docs, whatever it needs."""
-    blocks = [
-        b for page in PAGES for b in re.findall(r"```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    ]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
     lines = re.sub(r"\\\n\s*", "", "\n".join(blocks)).splitlines()
     return sorted({line.partition(" #")[0].strip() for line in lines if line.startswith("spackle ")})
 

@@ -26,20 +26,12 @@ CPU = "https://download.pytorch.org/whl/cpu"
 def test_the_cpu_build_is_taken_where_no_gpu_is(
     tmp_path: Path, system: str, gpu: bool, answers: bool, index: str | None, asked: str
 ) -> None:
-    fakes = {
-        "uname": f"echo {system}",
-        "nvidia-smi": f"exit {1 - gpu}",
-        "python": f"exit {1 - answers}",
-        "pip": 'echo "$@"',
-    }
-    for name, line in fakes.items():
+    fakes = {"uname": f"echo {system}", "nvidia-smi": f"exit {1 - gpu}", "python": f"exit {1 - answers}"}
+    for name, line in {**fakes, "pip": 'echo "$@"'}.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
         (tmp_path / name).chmod(0o755)
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"} | (
-        {} if index is None else {"TORCH_INDEX": index}
-    )
-    if index is None:
-        environment.pop("TORCH_INDEX", None)
+    environment = {name: value for name, value in os.environ.items() if name != "TORCH_INDEX"}
+    environment |= {"PATH": f"{tmp_path}:{os.environ['PATH']}"} | ({} if index is None else {"TORCH_INDEX": index})
     command = [SCRIPT, tmp_path / "pip", "install"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=30)
     assert done.stdout.strip() == asked

@@ -73,6 +73,12 @@ def nearest_known(hole: NDArray[np.bool_]) -> NDArray[np.int32]:
     return near
 
 
+def distance_to(near: NDArray[np.int32]) -> Tensor:
+    """[H, W] pixels from each pixel to the one that `nearest_known` gives, [2, H, W]."""
+    row, column = torch.from_numpy(near - np.indices(near.shape[1:], np.int32)).float()
+    return torch.hypot(row, column)
+
+
 @kernel
 def _propagate_nearest(hole: Any, near: Any) -> None:
     """Each cell takes its neighbours' nearest cell if that is nearer: four sweeps, each the other way around."""

@@ -17,8 +17,7 @@ from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, make_seeds
-from spackle.residual.network import network_input
-from spackle.residual.rim import find_rim
+from spackle.residual.network import find_rim, network_input
 from spackle.surface import surface_gaussians
 
 R = ReferenceRenderer()

@@ -10,24 +10,19 @@ import torch
 from holes import CPU, box_view, features_of, random_network
 from safetensors.torch import save_file
 from scenes import box_before_wall
-from torch import Tensor
 
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.residual import ResidualNet
-from spackle.residual.compose import DELTA_CHANNELS, compose
-from spackle.residual.network import IN_CHANNELS, load_residual, network_input
+from spackle.residual.complete import compose
+from spackle.residual.network import DELTA_CHANNELS, IN_CHANNELS, load_residual, network_input
 
 
-def test_the_network_has_the_papers_size() -> None:
-    count = sum(parameter.numel() for parameter in ResidualNet().parameters())
-    assert count == pytest.approx(8.02e6, abs=0.02e6)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31), (32, 48)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31)])
 def test_the_network_takes_any_size_and_does_not_mix_a_batch(size: tuple[int, int]) -> None:
     network = random_network()
+    assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(8.02e6, abs=0.02e6)
     features = torch.randn(2, IN_CHANNELS, *size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         deltas, alone = network(features), torch.cat([network(f[None]) for f in features])
@@ -38,20 +33,19 @@ def test_the_network_takes_any_size_and_does_not_mix_a_batch(size: tuple[int, in
 
 
 def test_the_networks_input_knows_no_unit_of_length() -> None:
-    completer, camera = box_view()
-    view = CPU.render(completer.base, camera)
-
-    def features(unit: float) -> Tensor:
-        eye = camera.world_to_camera.clone()
-        eye[:3, 3] *= unit
-        scaled = dataclasses.replace(camera, world_to_camera=eye)
-        seen = dataclasses.replace(view, depth=view.depth * unit)
-        return network_input(*features_of(seen, scaled, completer.photo_camera))
-
-    found = features(1.0)
-    assert found.shape == (1, IN_CHANNELS, 36, 48)
-    assert bool(found.isfinite().all())
-    torch.testing.assert_close(features(1000.0), found, rtol=0, atol=0.02)
+    context, camera = box_view()
+    view, found = CPU.render(context.base, camera), []
+    for unit in (1.0, 1000.0):
+        pose = camera.world_to_camera.clone()
+        pose[:3, 3] *= unit
+        scaled, seen = (
+            dataclasses.replace(camera, world_to_camera=pose),
+            dataclasses.replace(view, depth=view.depth * unit),
+        )
+        found.append(network_input(*features_of(seen, scaled, context.photo_camera)))
+    assert found[0].shape == (1, IN_CHANNELS, 36, 48)
+    assert bool(found[0].isfinite().all())
+    torch.testing.assert_close(found[1], found[0], rtol=0, atol=0.02)
 
 
 def test_a_rendered_loss_trains_the_network_alone() -> None:

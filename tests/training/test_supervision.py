@@ -23,7 +23,8 @@ from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer
 from spackle.render.protocol import Rendering
-from spackle.residual.compose import DELTA_CHANNELS, compose
+from spackle.residual.complete import compose
+from spackle.residual.network import DELTA_CHANNELS
 from spackle.residual.view_features import CELL, ViewFeatures
 from spackle.training import sources
 from spackle.training.recipe import DataRecipe

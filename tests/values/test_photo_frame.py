@@ -22,32 +22,28 @@ Picture = NDArray[np.float64]
 def scene(width: int = WIDTH, height: int = HEIGHT) -> Picture:
     """A smooth coloured pattern in 0..1, [H, W, 3]."""
     y, x = np.mgrid[:height, :width] / 30.0
-    waves = (np.sin(x + y), np.cos(2 * x - y), np.sin(3 * y) * np.cos(x))
-    return 0.5 + 0.2 * np.stack(waves, axis=-1)
+    return 0.5 + 0.2 * np.stack((np.sin(x + y), np.cos(2 * x - y), np.sin(3 * y) * np.cos(x)), axis=-1)
 
 
 def framed(picture: Picture, widths: Sequence[int], color: Sequence[float]) -> Picture:
     """With a frame of so many pixels (left, top, right, bottom) around it."""
     left, top, right, bottom = widths
-    height, width = picture.shape[:2]
-    whole = np.ones((height + top + bottom, width + left + right, 3)) * color
-    whole[top : top + height, left : left + width] = picture
-    return whole
+    sides = [(top, bottom), (left, right)]
+    return np.stack([np.pad(picture[..., c], sides, constant_values=color[c]) for c in range(3)], axis=-1)
 
 
 def found(picture: Picture, quality: int | None = None) -> PhotoFrame | None:
     """In a picture with 8 bits, perhaps saved as a JPEG before."""
     image = Image.fromarray(np.round(255 * picture.clip(0, 1)).astype(np.uint8))
     if quality is not None:
-        file = io.BytesIO()
-        image.save(file, "JPEG", quality=quality)
+        image.save(file := io.BytesIO(), "JPEG", quality=quality)
         image = Image.open(file)
     return find_frame(torch.from_numpy(np.array(image)).float() / 255)
 
 
-def cut(*widths: int) -> tuple[int, ...]:
+def cut(shade: str, *widths: int) -> PhotoFrame:
     """What is cut off a frame with a sharp edge."""
-    return tuple(n + MIXED_PX * (n > 0) for n in widths)
+    return PhotoFrame(*(n + MIXED_PX * (n > 0) for n in widths), shade)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -62,50 +58,29 @@ def cut(*widths: int) -> tuple[int, ...]:
     ],
 )
 def test_a_frame_is_found_on_the_sides_that_have_it(widths: Sequence[int], color: Sequence[float], shade: str) -> None:
-    frame = found(framed(scene(), widths, color))
-    assert frame is not None
-    assert (frame.widths, frame.shade) == (cut(*widths), shade)
     whole = framed(scene(), widths, color)
+    assert found(whole) == cut(shade, *widths)
     frame = found(whole + np.random.default_rng(0).normal(0, 1.5 / 255, whole.shape), quality=75)
     assert frame is not None
     for ours, wanted in zip(frame.widths, widths, strict=True):
         assert (ours == 0) if wanted == 0 else wanted <= ours <= wanted + 4
 
 
-def test_an_edge_that_a_scanner_darkened_is_cut_off_and_lines_of_the_picture_are_not() -> None:
+def test_a_scanners_dark_edge_and_a_line_beside_a_mount_belong_to_the_frame() -> None:
     picture = scene()
     picture[:, -2:] *= 0.6
     picture[:1] *= 0.8
-    frame = found(picture, 92)
-    assert frame is not None
-    assert (frame.widths, frame.shade) == ((0, 1, 2, 0), "dark")
-    picture = scene()
-    picture[np.arange(HEIGHT) % 6 < 2] *= 0.6  # blinds begin at the border, and go on
-    assert found(picture) is None
-
-
-def test_a_line_between_mount_and_picture_belongs_to_the_frame() -> None:
+    assert found(picture, 92) == PhotoFrame(0, 1, 2, 0, "dark")
     inner = framed(scene(), (2, 2, 2, 2), (0.0, 0.0, 0.0))
-    frame = found(framed(inner, (12, 12, 12, 12), (1.0, 1.0, 1.0)))
-    assert frame is not None
-    assert (frame.widths, frame.shade) == (cut(14, 14, 14, 14), "light")
+    assert found(framed(inner, (12, 12, 12, 12), (1.0, 1.0, 1.0))) == cut("light", 14, 14, 14, 14)
 
 
-def with_box(background: Picture) -> Picture:
-    """A box in the middle that leaves an eighth of the picture to each side."""
-    height, width = background.shape[:2]
-    rows, columns = slice(height // 8, -(height // 8)), slice(width // 8, -(width // 8))
-    picture = background.copy()
-    picture[rows, columns] = scene()[rows, columns]
-    return picture
-
-
-PLAIN = np.ones((HEIGHT, WIDTH, 3))
 Y, X = (grid[..., None] for grid in np.mgrid[:HEIGHT, :WIDTH])
 DISC = (X - WIDTH / 2) ** 2 + (Y - HEIGHT / 2) ** 2 < (HEIGHT / 3) ** 2
 FRAMELESS = {
     "a picture": scene(),
-    "one colour": 0 * PLAIN,
+    "blinds that begin at the border": np.where(Y % 6 < 2, 0.6 * scene(), scene()),
+    "one colour": np.zeros((HEIGHT, WIDTH, 3)),
     "a sky that fades to its horizon": np.where(Y < 25, (0.3, 0.5, 0.9) + 0.01 * Y, scene()),
     "a blue sky above a wall's straight edge": np.where(Y < 25, (0.3, 0.5, 0.9), scene()),
     "a white sky above roofs": np.where(25 + 8 * np.sin(X / 9) > Y, 1.0, scene()),
@@ -128,15 +103,14 @@ def test_what_only_looks_like_a_frame_is_none(kind: str) -> None:
 
 def test_a_loaded_photo_is_what_is_inside_and_so_is_its_lens(tmp_path: Path) -> None:
     whole = np.round(255 * framed(scene(), (9, 8, 10, 11), (1.0, 1.0, 1.0))).astype(np.uint8)
-    opaque = np.full((*whole.shape[:2], 1), 255, np.uint8)
-    opaque[:8] = opaque[-11:] = opaque[:, :9] = opaque[:, -10:] = 0  # transparent, hence white
+    opaque = np.zeros((*whole.shape[:2], 1), np.uint8)
+    opaque[8:-11, 9:-10] = 255  # the frame is transparent, hence white
     Image.fromarray(np.concatenate([whole, opaque], axis=-1)).save(path := tmp_path / "a.png")
     as_it_is = load_photo(path)
-    assert as_it_is.frame is None
-    assert (as_it_is.width, as_it_is.height) == as_it_is.framed_size == whole.shape[1::-1]
+    assert (as_it_is.frame, (as_it_is.width, as_it_is.height)) == (None, whole.shape[1::-1])
     photo = load_photo(path, fov=90, keep_frame=False)
-    assert photo.frame == PhotoFrame(*cut(9, 8, 10, 11), "light")
+    assert photo.frame == cut("light", 9, 8, 10, 11)
     assert torch.equal(photo.rgb, as_it_is.rgb[9:-12, 10:-11])
-    assert photo.framed_size == whole.shape[1::-1]
+    assert photo.framed_size == as_it_is.framed_size == whole.shape[1::-1]
     assert photo.focal_px == pytest.approx(photo.width / 2)
     assert load_photo(path, focal_px=70, keep_frame=False).focal_px == 70

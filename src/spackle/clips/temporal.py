@@ -21,8 +21,7 @@ from spackle.fill import far_fill
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.mask import hole_mask
-from spackle.residual.view_features import CELL
+from spackle.residual.view_features import CELL, hole_mask
 
 # Of two sRGB pictures [H, W, 3]: how far from each pixel of the first its content lies in the second, [H, W, 2].
 Flow = Callable[[Tensor, Tensor], Tensor]

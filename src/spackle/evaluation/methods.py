@@ -19,9 +19,8 @@ from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, hole_mask
 from spackle.residual.base_values import make_seeds
-from spackle.residual.compose import compose
-from spackle.residual.network import predict_deltas
-from spackle.residual.rim import find_rim
+from spackle.residual.complete import compose
+from spackle.residual.network import find_rim, predict_deltas
 from spackle.residual.view_features import ViewFeatures
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view
 from spackle.scene_fill.occlusion_guard import push_behind

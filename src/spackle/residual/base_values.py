@@ -1,6 +1,8 @@
 """Base values of the aux Gaussians (paper, section 3.3): f_res predicts deltas over them, as SHARP does over its own.
 
-Colour and depth are propagated from a hole's rim into it, biased to the far side.
+What a hole reveals depends on why it is there. Behind a surface of the photo, colour and depth are propagated from the
+far side of the rim. Beyond the photo's border nothing was in front: what reaches the border is extended along the
+epipolar line, at the same distance from the photo's plane. So a level floor and a wall stay the planes that they are.
 """
 
 from __future__ import annotations
@@ -12,16 +14,22 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from spackle.camera import Camera, beside
-from spackle.fill import far_fill
-from spackle.filters import greatest_around
-from spackle.residual.beyond_border import fill_around
+from spackle.color import bright_or_blue
+from spackle.fill import FAR_BIAS, far_fill
+from spackle.filters import broadly_blurred, distance_to, greatest_around, nearest_known
+from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers
 from spackle.surface import surface_slope
 
 BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaussian must not spill over it
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
-SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
-OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
+AT_BORDER = 0.03  # of the photo's width: what ends farther inside is not extended beyond it
+DETOUR = 2.0  # how many times farther than the nearest seen cell a line's far rim may lie
+MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those traced along the line
+FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
+SKY, CALM, CALM_CELLS = 0.85, 0.2, 4.0  # a sky is so bright, or blue; its colours vary so little among so many cells
+AT_ONCE = 0.03  # of the view's width from the border: from there a sky is extended as it is
+LEAST = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,20 +52,14 @@ class Seeds:
 
 
 def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> Seeds:
-    """Seeds for every cell of a view (covered cells keep what they show).
-
-    What a hole reveals depends on why it is there. Behind a surface of the photo the far side of the rim continues;
-    beyond the frame of the photo's camera nothing was in front, and what reaches the frame is extended.
-    """
-    known = _sources(features)
+    """Seeds for every cell of a view; covered cells keep what they show."""
+    known, uv = _sources(features), beside(cell_centers(camera), features.rgb)
     if not bool(known.any()):
         # Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any.
-        uv = cell_centers(camera).to(features.rgb)
-        return Seeds(
-            uv, torch.full_like(features.alpha, 0.1), torch.zeros_like(uv), torch.full_like(features.rgb, 0.5), 0.1
-        )
+        grey = torch.full_like(features.rgb, 0.5)
+        return Seeds(uv, torch.full_like(features.alpha, 0.1), torch.zeros_like(uv), grey, 0.1)
     across, _ = far_fill(features.inverse_depth, features.rgb.permute(2, 0, 1)[:0], known, far_bias=0.0)
-    inside, uv = inside_photo(across, camera, photo_camera), beside(cell_centers(camera), across)
+    inside = inside_photo(across, camera, photo_camera)
     filled, rgb = fill_around(features, across, uv, known, inside, camera, photo_camera)
     inverse_depth = placed_behind(filled, features.mask, features.inverse_depth, BLOB_CELLS)
     slope = surface_slope(inverse_depth) / CELL
@@ -76,14 +78,22 @@ def _sources(features: ViewFeatures) -> Tensor:
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
     """[h, w] bool: which cells' points lie in the photo's frame."""
-    to_photo = photo_camera.world_to_camera.cpu().double() @ camera.world_to_camera.cpu().double().inverse()
-    lens, photo_lens = camera.K.cpu().double(), photo_camera.K.cpu().double()
-    across = (cell_centers(camera).cpu().double() - lens[:2, 2]) / lens.diagonal()[:2]
-    # Points come multiplied by their inverse depth, which spares divisions.
-    points = across @ to_photo[:3, :2].T + to_photo[:3, 2] + inverse_depth[..., None] * to_photo[:3, 3]
-    place, z = points[..., :2] * photo_lens.diagonal()[:2] + points[..., 2:] * photo_lens[:2, 2], points[..., 2:]
+    rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
+    points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
+    place, z = points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2], points[..., 2:]
     size = torch.tensor([photo_camera.width, photo_camera.height])
     return ((z > 0) & (place >= 0) & (place < size * z)).all(-1)
+
+
+def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
+    """Rays [h, w, 3] of a view's cells in the photo's frame, and the motion [4, 4] from the view's frame to it.
+
+    A cell's point times its inverse depth is ray + shift · inverse depth, with the motion's shift; this spares
+    divisions.
+    """
+    here, photo = (view.world_to_camera.cpu().double() for view in (camera, photo_camera))
+    motion, lens = beside(photo @ here.inverse(), uv), beside(camera.K, uv)
+    return (uv - lens[:2, 2]) / lens.diagonal()[:2] @ motion[:3, :2].T + motion[:3, 2], motion
 
 
 def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int) -> Tensor:
@@ -93,3 +103,67 @@ def placed_behind(filled: Tensor, chosen: Tensor, seen: Tensor, radius: int) -> 
     """
     farthest = -greatest_around(-torch.where(seen > 0, seen, torch.inf), radius)
     return torch.where(chosen, torch.minimum(filled, farthest) * (1 - BEHIND), filled)
+
+
+def fill_around(
+    features: ViewFeatures,
+    across: Tensor,
+    uv: Tensor,
+    known: Tensor,
+    inside: Tensor,
+    camera: Camera,
+    photo_camera: Camera,
+) -> tuple[Tensor, Tensor]:
+    """Inverse depth [h, w] and colours [3, h, w] of all cells, the photo extended beyond its border.
+
+    Args:
+        features: of the view.
+        across: [h, w] inverse depth, in holes that of all around.
+        uv: [h, w, 2] pixels of the cells.
+        known: [h, w] bool: cells to start from.
+        inside: [h, w] bool: cells whose points lie in the photo's frame; there what is behind is extended.
+        camera, photo_camera: the view's and the photo's.
+    """
+    mask, bias = features.mask, FAR_BIAS * inside
+    beyond = mask & ~inside
+    if int(beyond.count_nonzero()) <= FEW * beyond.numel():
+        return far_fill(features.inverse_depth, features.rgb.permute(2, 0, 1), known, far_bias=bias)
+    rays, motion = _rays_in_photo(uv, camera, photo_camera)
+    points, lens = rays + motion[:3, 3] * across[..., None], beside(photo_camera.K, uv)
+    depth = points[..., 2:].clamp_min(LEAST)
+    place = points[..., :2] / depth * lens.diagonal()[:2] + lens[:2, 2]
+    size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
+    ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
+    looks = torch.cat([features.rgb, _sky(features.rgb, known)[..., None]], dim=-1)
+    values = torch.cat([looks, (across / depth[..., 0])[..., None], ends[..., None].float()], dim=-1)
+
+    far, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
+    apart = distance_to(nearest_known(mask.numpy()))
+    traced = beyond & (steps > 0) & (steps <= DETOUR * apart)
+    hidden = traced & (far[..., 5] == 0)  # by something nearer, beside which the photo is extended
+    far = widened(far, traced & ~hidden, WIDENING * steps)
+    away = 1 / far[..., 4].clamp_min(LEAST) - motion[2, 3]
+    traced = traced & ~hidden & (away > 0) & (rays[..., 2] > 0)
+    nearest = torch.where(known, features.inverse_depth, 0).amax()
+    extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
+
+    bias = torch.where(hidden, FAR_BIAS, bias)
+    depths, mixed = far_fill(features.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
+    depths, colors = torch.where(traced, extended, depths), torch.where(traced, far[..., :4].movedim(-1, 0), mixed)
+    others = beyond & ~traced
+    if bool(others.any()):
+        refilled = far_fill(depths, colors, traced | known, far_bias=bias)
+        depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
+    out = apart / mask.shape[1]
+    sky = colors[3] * (rays[..., 1] < 0) * (out / AT_ONCE).clamp_max(1)  # there is none below the middle of the photo
+    share = torch.maximum((out - MIXED) / (CARRIED - MIXED), sky).clamp(0, 1) * beyond
+    return depths, torch.lerp(mixed[:3], colors[:3], share)
+
+
+def _sky(rgb: Tensor, known: Tensor) -> Tensor:
+    """How much known cells [h, w], of sRGB colours [h, w, 3], look like a sky: [h, w] from 0 to 1."""
+    seen = known[..., None].float()
+    sums = broadly_blurred(torch.cat([rgb * seen, rgb.square() * seen, seen], dim=-1), CALM_CELLS)
+    means = sums[..., :6] / sums[..., 6:].clamp_min(LEAST)
+    variance = (means[..., 3:] - means[..., :3].square()).sum(-1).clamp_min(0)
+    return bright_or_blue(rgb, SKY) * torch.exp(-variance / CALM**2)

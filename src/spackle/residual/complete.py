@@ -1,4 +1,4 @@
-"""One view completed as the paper does it: eq. 2 to 7 in one pass.
+"""One view completed as the paper does it: eqs. 2 to 7 in one pass.
 
 Eq. 8, the union with the base, is `Gaussians.cat([base, aux])`; rendering that is eq. 9.
 """
@@ -6,21 +6,40 @@ Eq. 8, the union with the base, is `Gaussians.cat([base, aux])`; rendering that 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from spackle.camera import Camera
+from spackle.color import srgb_to_linear
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
-from spackle.patches import Patches
 from spackle.render import Renderer
 from spackle.residual.base_values import Seeds, make_seeds
-from spackle.residual.compose import compose
-from spackle.residual.mask import MASK_THRESHOLD
-from spackle.residual.network import ResidualNet, predict_deltas
-from spackle.residual.rim import Rim, find_rim
-from spackle.residual.view_features import ViewFeatures
+from spackle.residual.network import (
+    ALPHA,
+    COLOR,
+    INVERSE_DEPTH,
+    QUAT,
+    SCALE,
+    XY,
+    ResidualNet,
+    color_logit,
+    find_rim,
+    predict_deltas,
+)  # fmt: skip
+from spackle.residual.view_features import MASK_THRESHOLD, ViewFeatures
+from spackle.surface import surface_gaussians
+
+SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
+OPACITY = 0.99  # not higher, or the renderer's stop would skip the blob behind a thin veil
+# A delta of one moves the position by a pixel, and the colour and the opacity by one in the sigmoid's domain.
+INVERSE_DEPTH_GAIN = 0.1  # in units of the view's median inverse depth
+LEAST_DEPTH = 1e-4  # and least inverse depth, so that no delta makes a distance infinite
+QUAT_GAIN = 0.1
+MIN_SCALE, MAX_SCALE = 0.25, 4.0  # bounds of the scale factor, which is 1, with slope 1, at zero
 
 
 @torch.no_grad()
@@ -46,28 +65,49 @@ def complete_view(
         precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
     """
     features = ViewFeatures.of(renderer.render(base, camera), threshold)  # eqs. 2 to 4
-    if not bool(features.mask.any()):
+    mask = features.mask
+    if not bool(mask.any()):
         return Gaussians.empty(base.means.device)
-    return complete_cells(features, camera, photo_camera, network, precision).aux.to(base.means.device)
-
-
-@dataclasses.dataclass(frozen=True)
-class CompletedCells:
-    """The aux Gaussians of a view's n masked cells, and what they were made of."""
-
-    aux: Gaussians  # [n]
-    seeds: Seeds  # base values of all cells
-    deltas: Tensor | None  # [n, 14]; None without a network
-    rim: tuple[Rim, Patches] | None  # likewise
-
-
-def complete_cells(
-    features: ViewFeatures, camera: Camera, photo_camera: Camera, network: ResidualNet | None, precision: Precision
-) -> CompletedCells:
-    """f_res over base values, for the masked cells alone (eqs. 5 and 7)."""
-    seeds = make_seeds(features, camera, photo_camera)
-    rim, deltas = None, None
+    seeds, deltas = make_seeds(features, camera, photo_camera), None
     if network is not None:
-        rim = find_rim(features, seeds, camera, photo_camera)
-        deltas = predict_deltas(network, features, seeds, rim[0], precision)[features.mask]
-    return CompletedCells(compose(seeds.select(features.mask), deltas, camera), seeds, deltas, rim)
+        rim, _ = find_rim(features, seeds, camera, photo_camera)
+        deltas = predict_deltas(network, features, seeds, rim, precision)[mask]  # eq. 5
+    return compose(seeds.select(mask), deltas, camera).to(base.means.device)  # eq. 7
+
+
+def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: float = SPREAD_PX) -> Gaussians:
+    """Aux Gaussians [n] of flat seeds; deltas of None or zero give the seeds themselves.
+
+    Args:
+        seeds: flat, as `Seeds.select` gives them: fields [n, ...].
+        deltas: [n, 14], or None. Gradients flow through them.
+        camera: the view that the seeds belong to.
+        spread_px: standard deviation of a blob.
+    """
+    uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
+    opacities = torch.full_like(inverse_depth, OPACITY)
+    if deltas is not None:
+        uv = uv + deltas[:, XY]
+        shift = INVERSE_DEPTH_GAIN * deltas[:, INVERSE_DEPTH].squeeze(1)
+        inverse_depth = _shift_positive(inverse_depth, shift, seeds.unit)
+        rgb = torch.sigmoid(color_logit(rgb) + deltas[:, COLOR])
+        opacities = torch.sigmoid(color_logit(opacities) + deltas[:, ALPHA].squeeze(1))
+    surfels = surface_gaussians(camera, uv, inverse_depth, seeds.slope, spread_px, srgb_to_linear(rgb), opacities)
+    if deltas is None:
+        return surfels
+    quats = surfels.quats + QUAT_GAIN * deltas[:, QUAT]
+    return dataclasses.replace(surfels, quats=quats, scales=surfels.scales * _scale_factor(deltas[:, SCALE]))
+
+
+def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:
+    """softplus(softplus⁻¹(base) + delta), both in multiples of `unit`."""
+    relative = (base / unit).clamp_min(LEAST_DEPTH)
+    return unit * softplus(relative + torch.log(-torch.expm1(-relative)) + delta).clamp_min(LEAST_DEPTH)
+
+
+def _scale_factor(delta: Tensor) -> Tensor:
+    """A sigmoid between the bounds."""
+    low, high = MIN_SCALE, MAX_SCALE
+    center = math.log((1 - low) / (high - 1))
+    steepness = (high - low) / ((1 - low) * (high - 1))
+    return low + (high - low) * torch.sigmoid(steepness * delta + center)

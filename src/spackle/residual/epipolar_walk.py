@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,19 +17,12 @@ from spackle.residual.view_features import CELL, GRAIN
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
 WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
-CRISP = 0.12  # of a view's width: so far the network sees a rim as it is
 WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
 
 
-class Walk(NamedTuple):
-    """For each masked cell, what its line meets; elsewhere the cell itself."""
-
-    found: Tensor  # [h, w, c] values at the far rim
-    mirrored: Tensor  # [h, w, c] values as far beyond the rim as the cell is before it, if that is the same surface
-    distance: Tensor  # [h, w] cells to the rim; 0 elsewhere, and where no line meets anything
-
-
-def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor) -> Walk:
+def walk(
+    uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera: Camera, eye: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
 
     Args:
@@ -39,18 +32,20 @@ def walk(uv: Tensor, values: Tensor, inverse_depth: Tensor, mask: Tensor, camera
         mask: [h, w] bool.
         camera: of the view.
         eye: [3] position of the other camera, through whose image the lines go.
+
+    Returns:
+        Values [h, w, c] at the far rim; values [h, w, c] as far beyond the rim as the cell is before it, if that is the
+        same surface, else those at the rim; cells [h, w] to the rim. Where no line meets anything, and outside of the
+        mask, both are the cell's own values, and the distance is 0.
     """
-    there = eye.double()
+    eye = eye.double()
     # Where the view sees that eye: homogeneous, for it may lie at infinity.
-    epipole = (camera.K.to(there) @ camera.to_camera(there)).detach().cpu().numpy()
-    places, colors, depths, closed = (image.contiguous().numpy() for image in (uv, values, inverse_depth, mask))
-    grids = (colors.copy(), colors.copy(), np.zeros(closed.shape, np.float32))
-    run_chunks(
-        lambda start, stop: _walk(start, stop, places, colors, depths, closed, epipole, SAME_DEPTH, *grids),
-        len(closed),
-        GRAIN,
-    )
-    return Walk(*(torch.from_numpy(grid) for grid in grids))
+    epipole = (camera.K.to(eye) @ camera.to_camera(eye)).detach().cpu().numpy()
+    view = [image.contiguous().numpy() for image in (uv, values, inverse_depth, mask)]
+    grids = (view[1].copy(), view[1].copy(), np.zeros(mask.shape, np.float32))
+    run_chunks(lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask), GRAIN)
+    far, mirrored, distance = map(torch.from_numpy, grids)
+    return far, mirrored, distance
 
 
 def widened(values: Tensor, mask: Tensor, radius: Tensor) -> Tensor:

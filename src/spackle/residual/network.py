@@ -1,4 +1,8 @@
-"""The residual network f_res (paper, section 3.3, eq. 5): features of a view's holes in, a delta for every cell out."""
+"""The residual network f_res (paper, section 3.3, eq. 5): features of a view's holes in, a delta for every cell out.
+
+It sees what the view shows, the base values, and what stands at a hole's far rim: along the epipolar line on which the
+hole opened, and in patches of the view that match.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +12,39 @@ import itertools
 import math
 import os
 from pathlib import Path
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
+from spackle.camera import Camera
 from spackle.device import Precision, own_arithmetic, pick_dtype
+from spackle.filters import broadly_blurred
 from spackle.network_file import fill_network, read_tensors
-from spackle.residual.base_values import Seeds
-from spackle.residual.compose import COLOR, DELTA_CHANNELS, GEOMETRY_CHANNELS, TEXTURE_CHANNELS, color_logit
+from spackle.patches import TONE_CELLS, Patches, match_patches
+from spackle.residual.base_values import Seeds, inside_photo
 from spackle.residual.crops import crops_around
-from spackle.residual.rim import Rim
+from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.view_features import ViewFeatures
 
+ALIKE = 1.4  # factor by which the inverse depths of a line's far rim and of the seed there may differ
+CRISP = 0.12  # of a view's width: so far the network sees a rim as it is
+
+# Channels of the features.
 CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
 MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
 EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the patches'
 IN_CHANNELS = EXEMPLAR.stop + 1  # and the patch distance
 COPIES = 3  # channels that say how much of each to copy
+# Channels of the deltas: three of geometry, eleven of texture, as in SHARP.
+XY, INVERSE_DEPTH, SCALE, QUAT, COLOR, ALPHA = (
+    slice(0, 2), slice(2, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 14),
+)  # fmt: skip
+GEOMETRY_CHANNELS, TEXTURE_CHANNELS = 3, 11
+DELTA_CHANNELS = GEOMETRY_CHANNELS + TEXTURE_CHANNELS
+COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
+
 TYPICAL_DISTANCE = 16.0  # of a cell to the rim
 TYPICAL_MISMATCH = 0.1
 WIDTHS = (48, 80, 128, 256, 256)  # channels from the finest grid to the coarsest
@@ -36,7 +53,67 @@ STRIDE = 2 ** (len(WIDTHS) - 1)
 STEM_GAIN = 3.0  # the features are of order 0.3
 SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
 
-Grids = TypeVar("Grids", ViewFeatures, Seeds, Rim)
+
+@dataclasses.dataclass(frozen=True)
+class Rim:
+    """For each masked cell, what its line meets; elsewhere the cell itself."""
+
+    rgb: Tensor  # [h, w, 3] sRGB at the far rim, the farther off the more of it
+    mirrored: Tensor  # [h, w, 3] sRGB as far beyond the rim as the cell is before it, if that is the same surface
+    distance: Tensor  # [h, w] cells to the rim; 0 elsewhere
+    exemplar: Tensor  # [h, w, 3] sRGB of patches elsewhere in the view that match; their tone is the seeds'
+    mismatch: Tensor  # [h, w] patch distance: root of their mean squared difference; 0 elsewhere
+    beyond: Tensor  # [h, w] bool: masked cells whose points lie outside of the photo's frame
+
+
+def find_rim(features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera: Camera) -> tuple[Rim, Patches]:
+    """Walk from each masked cell to both sides along its epipolar line, and take the farther surface.
+
+    What moves in front of what, moves along the lines through the epipole, where the view sees the
+    photo's eye. So that line leads from a hole to the surface that continues behind, and structure
+    at the rim continues along it more often than not, coarse structure farther than fine. Where a line meets
+    nothing, or something much nearer than the seed, the seeds stay.
+
+    Also returns patches of the view that match its masked cells: by the seeds' colours behind an object, by what is
+    mirrored beyond the photo's border if that is as far away. There the seeds mix all that reaches the border,
+    which looks like fog, and fog is what would match it.
+    """
+    uv, rgb, depths = seeds.uv.detach(), seeds.rgb.detach(), seeds.inverse_depth.detach()
+    values = torch.cat([rgb, depths[..., None]], dim=-1)
+    far, near, steps = walk(uv, values, depths, features.mask, camera, photo_camera.position)
+    unmirrored, apart = (near == far).all(-1, keepdim=True), (near[..., 3] / depths).log().abs()
+    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[..., None]  # what stands there does not continue behind
+    far, near = (torch.where(in_front, rgb, met[..., :3]) for met in (far, near))
+    far = widened(far, features.mask, WIDENING * (steps - CRISP * features.mask.shape[1]).clamp_min(0))
+    near = torch.where(unmirrored, far, near)
+    beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, photo_camera)
+    tone = torch.where(features.mask[..., None], rgb, features.rgb)
+    continues = (beyond & (apart < math.log(ALIKE)))[..., None]
+    patches = match_patches(torch.where(continues, near, tone), features.mask, depths)
+    toned = (patches.rgb - broadly_blurred(patches.rgb - tone, TONE_CELLS)).clamp(0, 1)
+    toned_patches = torch.where(beyond[..., None], toned, patches.rgb)
+    return Rim(far, near, steps, toned_patches, patches.mismatch, beyond), patches
+
+
+def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
+    """Features [1, 21, h, w], centred around zero; depths as log inverse depth over the view's median."""
+    cue_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
+    seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
+    maps = [cue_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
+    grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
+    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere the rim is the cell itself
+    own, near, mirrored, patches = map(color_logit, colors)
+    distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
+    there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
+    far = there.new_zeros(*view.mask.shape, IN_CHANNELS - CUE_CHANNELS)
+    far[view.mask] = there
+    channels = [view.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
+    return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
+
+
+def color_logit(value: Tensor) -> Tensor:
+    """sigmoid⁻¹ of colours or opacities, kept off 0 and 1."""
+    return torch.logit(value.clamp(COLOR_MARGIN, 1 - COLOR_MARGIN / 2))
 
 
 class ResidualBlock(nn.Module):
@@ -98,22 +175,6 @@ class ResidualNet(nn.Module):
         return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
 
 
-def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
-    """Features [1, 21, h, w], centred around zero; depths as log inverse depth over the view's median."""
-    cue_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
-    seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
-    maps = [cue_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
-    grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
-    *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere the rim is the cell itself
-    own, near, mirrored, patches = map(color_logit, colors)
-    distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
-    there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
-    far = there.new_zeros(*view.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-    far[view.mask] = there
-    channels = [view.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
-    return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
-
-
 @torch.no_grad()
 def predict_deltas(
     network: nn.Module,
@@ -124,7 +185,7 @@ def predict_deltas(
     *,
     dense: bool = False,
 ) -> Tensor:
-    """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; other cells are undefined.
+    """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; 0 elsewhere.
 
     The network looks only around the masked cells, see `spackle.residual.crops`.
 
@@ -138,20 +199,14 @@ def predict_deltas(
     dtype = pick_dtype(precision, device)
     chosen = torch.ones_like(view.mask) if dense else view.mask
     field = view.alpha.new_zeros(*view.mask.shape, DELTA_CHANNELS)
+    features = network_input(view, seeds, rim)
     # Around all crops: autocast converts the weights once.
     with own_arithmetic(device), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
         for inner, outer in crops_around(chosen, STRIDE):
-            where, inside = outer.slices, inner.moved(-outer.top, -outer.left).slices
-            features = network_input(_part(view, where), _part(seeds, where), _part(rim, where)).to(device)
-            deltas = network(features)[0].permute(1, 2, 0)[inside]
+            part = features[(..., *outer.slices)].contiguous(memory_format=torch.channels_last).to(device)
+            deltas = network(part)[0].permute(1, 2, 0)[inner.moved(-outer.top, -outer.left).slices]
             field[inner.slices] = torch.where(chosen[inner.slices][..., None], deltas.float().cpu(), 0)
     return field
-
-
-def _part(grids: Grids, where: tuple[slice, slice]) -> Grids:
-    """The same of some rows and columns."""
-    parts: dict[str, Any] = {name: field[where] for name, field in vars(grids).items() if isinstance(field, Tensor)}
-    return dataclasses.replace(grids, **parts)
 
 
 def _head(width: int, channels: int) -> nn.Sequential:

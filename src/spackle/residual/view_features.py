@@ -1,4 +1,7 @@
-"""What a rendered view shows, cell by cell: the input of f_res (paper, section 3.3). One cell has 2×2 pixels."""
+"""What a rendered view shows: its mask (paper, eq. 4), the share of its holes (eqs. 10 and 11), the input of f_res.
+
+The input is a grid with one cell for each 2×2 pixels (section 3.3).
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,24 @@ from spackle.camera import Camera
 from spackle.device import run_chunks
 from spackle.render.blend import decode_srgb, encode_srgb
 from spackle.render.protocol import Rendering
-from spackle.residual.mask import MASK_THRESHOLD
 
+MASK_THRESHOLD = 0.95  # τ_α: a pixel with less opacity is a hole (eq. 4)
 CELL = 2  # pixels along a cell's side
 CHANNELS = 3
 CLOSEST, FAINTEST = np.float32(1e-6), np.float32(1e-6)  # depth and summed opacity that are divided by, at least
 GRAIN = 16  # rows of cells that a thread takes at a time
 PROCESSOR = torch.device("cpu")
+
+
+def hole_mask(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> Tensor:
+    """M_v(p) = 1[A_v(p) < τ_α] (eq. 4): [H, W] bool, true where nothing was seen."""
+    return alpha < threshold
+
+
+def hole_area_ratio(alpha: Tensor, threshold: float = MASK_THRESHOLD) -> float:
+    """HAR = 1 − coverage (eqs. 10 and 11): the share of hole pixels."""
+    hole = hole_mask(alpha, threshold)
+    return int(np.count_nonzero(hole.cpu().numpy())) / hole.numel()  # of what counts bits, numpy is the fastest by far
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """One scene for a whole path, or one view: the residual's cells behind guards, with texture and a second pass.
 
-Base Gaussians are only read. The renderer draws and the network computes on the renderer's device; everything else
-happens on the processor. The images of a view travel there once, and its new Gaussians back once.
+Base Gaussians are only read. The renderer draws and the network computes on the renderer's device, all else happens on
+the processor. The images of a view travel there once, and its new Gaussians back once.
 """
 
 from __future__ import annotations
@@ -17,20 +17,19 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.device import Precision
+from spackle.fill import far_fill
+from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, place_of, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual.base_values import BEHIND, Seeds
-from spackle.residual.complete import CompletedCells, complete_cells
-from spackle.residual.compose import compose
-from spackle.residual.mask import MASK_THRESHOLD, hole_area_ratio
-from spackle.residual.network import ResidualNet
-from spackle.residual.rim import find_rim
-from spackle.residual.view_features import CELL, PROCESSOR, ViewFeatures
+from spackle.residual.base_values import BEHIND, BLOB_CELLS, Seeds, make_seeds, placed_behind
+from spackle.residual.complete import compose
+from spackle.residual.network import ResidualNet, find_rim, predict_deltas
+from spackle.residual.view_features import CELL, MASK_THRESHOLD, PROCESSOR, ViewFeatures, hole_area_ratio
 from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
-from spackle.scene_fill.rim_underlay import rim_underlay
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
-from spackle.scene_fill.view_order import QUIET_HAR, CheckedFrames, farthest_first, skipped_gap
+from spackle.scene_fill.view_order import QUIET_HAR, farthest_first, mark_checked, skipped_gap
+from spackle.surface import surface_slope
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
 CLOSED_HAR = 1e-4  # fewer holes than this need no second look
@@ -40,6 +39,9 @@ PAINTED_VIEWS = 2  # of a scene that get the chosen texture, the exemplar's afte
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
 FINE_SPREAD_PX = 0.5  # standard deviation of one blob a pixel, which a wide one for its cell backs
+REACH_CELLS = 6  # how far beneath a rim an underlay goes
+COARSE = 3  # an underlay has one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
+EVERY = (slice(None, None, COARSE),) * 2  # the cells that have one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,11 +108,9 @@ def fill_view(
         rendering: the base from this view, where that is at hand.
     """
     guards = [context.photo_guard()] if guards is None else guards
-    stage = _Stage(context.placed)
-    aux, _, view = _fill(
-        context.placed, stage, stage.look(camera, rendering), camera, guards, CLOSED_HAR, beneath=False
-    )
-    device = context.base.means.device
+    stage, device = _Stage(context.placed), context.base.means.device
+    view = stage.look(camera, rendering)
+    aux, _, view = _fill(context.placed, stage, view, camera, guards, CLOSED_HAR, beneath=False)
     return FilledView(Gaussians.cat(aux).to(device), view.to(device))
 
 
@@ -143,17 +143,17 @@ def fill_scene(
     for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
         view = stage.look(cameras[index])
         guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
-    checked, pictures, filled = CheckedFrames(len(cameras)), dict[int, Tensor](), 0
+    checked, pictures, filled = [False] * len(cameras), dict[int, Tensor](), 0
     aux = [Gaussians.empty()]
     waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
     for count, index in enumerate(order):
         camera = cameras[index]
-        if exact or index not in checked:
+        if exact or not checked[index]:
             view = stage.look(camera) if count else view
             holes = hole_area_ratio(view.alpha, threshold)
             # No frame is skipped where all are looked at.
             gap = float(holes == 0) if exact else skipped_gap(holes, view.alpha, threshold)
-            if gap:
+            if gap > 0:
                 pictures[index] = to_bytes(view.rgb)
             else:
                 others = [guard for of, guard in guards.items() if of != index]
@@ -172,7 +172,7 @@ def fill_scene(
                     stage.add(*hidden)
                     aux += hidden
                     waiting.clear()
-            checked.add(index, gap)
+            mark_checked(checked, index, gap)
         if progress:
             progress(count + 1, len(order))
     if waiting:
@@ -198,8 +198,7 @@ def _fill(
         features = ViewFeatures.of(view, context.threshold)
         if not bool(features.mask.any()):
             break
-        cells = complete_cells(features, camera, context.photo_camera, means.network, context.precision)
-        new, underlay = _propose(means, view, features, cells, camera, guards)
+        new, underlay = _propose(means, view, features, camera, guards)
         if beneath:
             rims.append(rim_underlay(features.mask, underlay, camera))
         if not len(new):
@@ -215,7 +214,6 @@ def _propose(
     context: FillContext,
     view: Rendering,
     features: ViewFeatures,
-    completed: CompletedCells,
     camera: Camera,
     guards: Sequence[OcclusionGuard],
 ) -> tuple[Gaussians, Seeds]:
@@ -223,30 +221,33 @@ def _propose(
 
     Also returns the seeds that extend beneath the rims.
     """
-    mask, cells, seeds = features.mask, completed.aux, completed.seeds
-    picture, rim = None, completed.rim
+    mask, seeds = features.mask, make_seeds(features, camera, context.photo_camera)
+    chosen, eye, deltas, picture, beyond, parts = seeds.select(mask), camera.position, None, None, None, []
+    if context.network is not None or context.texture is not None:
+        rim, patches = find_rim(features, seeds, camera, context.photo_camera)
+        beyond = rim.beyond[mask]
+    if context.network is not None:
+        deltas = predict_deltas(context.network, features, seeds, rim, context.precision)[mask]
+    cells = compose(chosen, deltas, camera)
     if context.texture is not None:
-        rim = rim or find_rim(features, seeds, camera, context.photo_camera)
         structure = features.rgb.clone()
         structure[mask] = linear_to_srgb(cells.colors)
-        picture = context.texture(HoleView(view, features, seeds, *rim, structure))
-    eye, depths = camera.position, camera.to_camera(cells.means)[:, 2]
-    factors, parts = free_factors(cells, eye, guards), []
+        picture = context.texture(HoleView(view, features, seeds, rim, patches, structure))
+    depths, factors = camera.to_camera(cells.means)[:, 2], free_factors(cells, eye, guards)
     factors = torch.where(factors > 0, without_pits(depths * factors, mask) / depths, 0)
     if picture is not None:
         wanted, blobs = (in_cells(image)[mask] for image in (picture, sharpened(picture)))
         rough = (wanted - wanted.mean((1, 2), keepdim=True)).abs().amax((1, 2, 3)) > FLAT
         index = rough.nonzero()[:, 0]
-        deltas = None if completed.deltas is None else completed.deltas[index]
-        pixels = _pixels(seeds.select(mask).select(index), deltas, camera, blobs[index])
+        pixels = _pixels(chosen.select(index), None if deltas is None else deltas[index], camera, blobs[index])
         parts.append(moved_away(pixels, eye, factors[index].repeat_interleave(CELL**2)))
         # As a lifted photo has them: behind the pixels' Gaussians one for each cell.
         cells = dataclasses.replace(cells, colors=srgb_to_linear(wanted.clamp(0, 1)).mean((1, 2)))
         factors = factors / (1 - BEHIND)
     parts.append(moved_away(cells, eye, factors))
     inverse_depth = seeds.inverse_depth.clone()
-    if rim is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
-        moved = rim[0].beyond[mask] & (factors > 0)
+    if beyond is not None:  # beyond the photo's border nothing beneath the rim covers what was moved away
+        moved = beyond & (factors > 0)
         inverse_depth[mask] = torch.where(moved, 1 / (depths * factors), inverse_depth[mask])
     return Gaussians.cat(parts), dataclasses.replace(seeds, inverse_depth=inverse_depth)
 
@@ -254,17 +255,37 @@ def _propose(
 def _pixels(seeds: Seeds, deltas: Tensor | None, camera: Camera, colors: Tensor) -> Gaussians:
     """Gaussians [4n] for the pixels of n cells: flat seeds [n], deltas [n, 14], or None, and sRGB [n, 2, 2, 3]."""
     offsets = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]])
+    fields = (seeds.inverse_depth, seeds.slope, seeds.rgb, *([] if deltas is None else [deltas]))
+    inverse_depth, slope, rgb, *repeated = (field.repeat_interleave(len(offsets), 0) for field in fields)
     rise = (seeds.slope[:, None] * offsets).sum(-1).flatten()
-    inverse_depth, slope, rgb = (
-        field.repeat_interleave(len(offsets), 0) for field in (seeds.inverse_depth, seeds.slope, seeds.rgb)
-    )
-    uv, inverse_depth = (
-        (seeds.uv[:, None] + offsets).flatten(0, 1),
-        (inverse_depth + rise).clamp_min(0.5 * inverse_depth),
-    )
-    repeated = None if deltas is None else deltas.repeat_interleave(len(offsets), 0)
-    pixels = compose(Seeds(uv, inverse_depth, slope, rgb, seeds.unit), repeated, camera, FINE_SPREAD_PX)
+    inverse_depth = (inverse_depth + rise).clamp_min(0.5 * inverse_depth)
+    fine = Seeds((seeds.uv[:, None] + offsets).flatten(0, 1), inverse_depth, slope, rgb, seeds.unit)
+    pixels = compose(fine, repeated[0] if repeated else None, camera, FINE_SPREAD_PX)
     return dataclasses.replace(pixels, colors=srgb_to_linear(colors.flatten(0, 2).clamp(0, 1)))
+
+
+def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
+    """Gaussians that extend the holes' seeds beneath the surfaces around the holes, behind all that is seen.
+
+    From another view the rim of a hole moves, and a slit opens between what was seen and what filled the hole. This
+    closes most such slits before they open: fewer views of a path are left to complete, and they show the same.
+
+    Args:
+        mask: [h, w] bool: the cells of the view's holes.
+        seeds: of all cells.
+        camera: the view.
+    """
+    rim = (greatest_around(mask, REACH_CELLS) & ~mask)[EVERY]
+    if not bool(rim.any()) or bool(rim.all()):
+        return Gaussians.empty()
+    coarse, rgb = far_fill(seeds.inverse_depth[EVERY], seeds.rgb[EVERY].permute(2, 0, 1), ~rim)
+    # At the rim, behind all that is seen or filled as far around as a blob reaches.
+    depth, chosen = seeds.inverse_depth.clone(), mask.new_zeros(mask.shape)
+    depth[EVERY], chosen[EVERY] = coarse, rim
+    placed = placed_behind(depth, chosen, seeds.inverse_depth, COARSE * BLOB_CELLS)[EVERY]
+    slope = surface_slope(placed) / (COARSE * CELL)
+    beneath = compose(Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim), None, camera)
+    return dataclasses.replace(beneath, scales=COARSE * beneath.scales)
 
 
 def _behind_others(

@@ -19,8 +19,7 @@ from spackle.device import run_chunks
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
-from spackle.residual.mask import MASK_THRESHOLD
-from spackle.residual.view_features import PROCESSOR
+from spackle.residual.view_features import MASK_THRESHOLD, PROCESSOR
 
 WINDOW_PX = 4  # radius of the guard's window: most aux Gaussians reach no farther than this
 REACH = 3.0  # a Gaussian is seen this many standard deviations from its centre
@@ -74,7 +73,21 @@ def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) 
     """
     if not len(aux) or not guards:
         return torch.ones_like(aux.opacities)
-    return _factors(aux, beside(eye, aux.means), guards).to(aux.means)
+    rays = (aux.means - beside(eye, aux.means)).detach().cpu().double().numpy()
+    quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
+    lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
+    for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
+        lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        lens[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
+    depths = np.concatenate([guard.depth.numpy().ravel() for guard in guards])
+    sizes = np.array([guard.depth.shape for guard in guards])
+    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+    place, factors = beside(eye, aux.means).cpu().double().numpy(), np.empty(len(rays))
+    views = (lenses, depths, sizes, starts)
+    run_chunks(
+        lambda first, last: _free_factors(first, last, place, rays, quats, scales, *views, factors), len(rays), GRAIN
+    )
+    return torch.from_numpy(factors).to(aux.means)
 
 
 def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
@@ -88,25 +101,6 @@ def without_pits(depths: Tensor, cells: Tensor) -> Tensor:
     grid[cells] = depths
     farthest = greatest_around(grid, reach)
     return -greatest_around(torch.where(cells, -farthest, -torch.inf), reach)[cells]
-
-
-def _factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """[N] float64 by which Gaussians move away from the eye; 0 for those that find no place."""
-    rays = (aux.means - eye).detach().cpu().double().numpy()
-    quats, scales = (shape.detach().cpu().double().contiguous().numpy() for shape in (aux.quats, aux.scales))
-    lenses = np.empty((len(guards), 16))  # fx, fy, cx, cy and the 3×4 extrinsics of each view
-    for lens, camera in zip(lenses, [guard.camera for guard in guards], strict=True):
-        lens[:4] = camera.K.detach().cpu().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
-        lens[4:] = camera.world_to_camera.detach().cpu().numpy()[:3].ravel()
-    depths = np.concatenate([guard.depth.detach().cpu().float().numpy().ravel() for guard in guards])
-    sizes = np.array([[guard.camera.height, guard.camera.width] for guard in guards])
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
-    place, factors = eye.cpu().double().numpy(), np.empty(len(rays))
-    shown = (lenses, depths, sizes, starts)
-    run_chunks(
-        lambda start, stop: _free_factors(start, stop, place, rays, quats, scales, *shown, factors), len(rays), GRAIN
-    )
-    return torch.from_numpy(factors)
 
 
 @kernel

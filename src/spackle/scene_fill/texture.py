@@ -1,7 +1,7 @@
-"""Colours of what fills a hole: structure is the residual's, texture comes from a picture whose hole is painted.
+"""Colours of what fills a hole: structure is the residual's, texture comes from patches or from an inpainter.
 
-The paper has none of this: its network learns from an inpainter's pictures. A network that learns from true views stays
-smooth where the truth is ambiguous.
+The paper's network learns from an inpainter's pictures; one that learns from true views stays smooth where the truth is
+ambiguous.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import blurred, broadly_blurred, nearest_known
+from spackle.filters import blurred, broadly_blurred, distance_to, nearest_known
 from spackle.inpaint.protocol import Inpainter, known_inverse_depth
 from spackle.patches import Patches
 from spackle.render.protocol import Rendering
 from spackle.residual.base_values import Seeds
-from spackle.residual.mask import hole_mask
-from spackle.residual.rim import Rim
-from spackle.residual.view_features import CELL, ViewFeatures
+from spackle.residual.network import Rim
+from spackle.residual.view_features import CELL, ViewFeatures, hole_mask
 
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
 TEXTURE_FADING = 0.5  # mismatch at which a third of the texture is left
@@ -55,9 +54,9 @@ Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's
 
 
 def exemplar_texture(view: HoleView) -> Tensor:
-    """High frequencies of the view itself over the residual's structure; beyond its border the photo is extended.
+    """High frequencies of the view itself over the residual's structure.
 
-    There the residual knows least, and its structure is fog: patches get a share, but for what is broad in them.
+    Beyond the photo's border that structure is fog: patches get a share, but for what is broad in them.
     """
     features, rim, patches = view.features, view.rim, view.patches
     pixels = in_cells(view.rendering.rgb)
@@ -151,11 +150,10 @@ def extended(view: HoleView) -> Tensor:
     Behind an object the nearest cell is the object's, and nothing is extended.
     """
     features = view.features
-    near = torch.from_numpy(nearest_known(features.mask.numpy())).long()
-    cells = torch.stack(torch.meshgrid(*(torch.arange(size) for size in features.mask.shape), indexing="ij"))
-    row, column = (place.clamp_min(0) for place in near)
+    near = nearest_known(features.mask.numpy())
+    row, column = torch.from_numpy(near).long().clamp_min(0)
     apart = (view.seeds.inverse_depth / features.inverse_depth[row, column].clamp_min(1e-9)).log()
-    fading = torch.exp((1 - torch.hypot(*(near - cells).float())) / EXTENDED_CELLS - (apart / SAME_DEPTH).square())
+    fading = torch.exp((1 - distance_to(near)) / EXTENDED_CELLS - (apart / SAME_DEPTH).square())
     return torch.lerp(view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None])
 
 
@@ -172,11 +170,11 @@ def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
 
 def in_cells(picture: Tensor) -> Tensor:
     """The pixels of each cell, [h, w, 2, 2, c] of [H, W, c]; an odd last row or column is repeated."""
-    below, beside = (size % CELL for size in picture.shape[:2])
-    whole = torch.cat([picture, picture[-1:]]) if below else picture
-    whole = torch.cat([whole, whole[:, -1:]], dim=1) if beside else whole
-    rows, columns = (size // CELL for size in whole.shape[:2])
-    return whole.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
+    for dim in (0, 1):
+        if picture.shape[dim] % CELL:
+            picture = torch.cat([picture, picture.narrow(dim, -1, 1)], dim=dim)
+    rows, columns = (size // CELL for size in picture.shape[:2])
+    return picture.reshape(rows, CELL, columns, CELL, -1).transpose(1, 2)
 
 
 def from_cells(blocks: Tensor) -> Tensor:

@@ -25,10 +25,9 @@ from spackle.formats.png import thumbnail
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer, place_of, render_batch
 from spackle.render.protocol import Rendering
-from spackle.residual.compose import compose
-from spackle.residual.mask import hole_area_ratio
+from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, load_residual, network_input
-from spackle.residual.view_features import ViewFeatures
+from spackle.residual.view_features import ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
 from spackle.training.samples import Sample, digest_of_samples, load_sample, make_samples

@@ -30,9 +30,8 @@ from spackle.render.cpu import project, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import TILE, Rendering
 from spackle.residual.base_values import Seeds, make_seeds
-from spackle.residual.mask import hole_mask
-from spackle.residual.rim import Rim, find_rim
-from spackle.residual.view_features import CELL, ViewFeatures
+from spackle.residual.network import Rim, find_rim
+from spackle.residual.view_features import CELL, ViewFeatures, hole_mask
 from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
 

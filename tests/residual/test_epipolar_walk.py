@@ -1,0 +1,106 @@
+"""What the network sees at a hole's far rim: by hand, and against a walk written plainly."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from spackle.camera import Camera
+from spackle.residual import Seeds, ViewFeatures
+from spackle.residual.epipolar_walk import SAME_DEPTH, WIDENING
+from spackle.residual.network import CRISP, Rim, find_rim
+from spackle.residual.view_features import cell_centers
+
+HEIGHT, WIDTH = 12, 20  # cells
+CAMERA = Camera.from_focal(40.0, 2 * WIDTH, 2 * HEIGHT)
+SIDEWAYS = (0.3, 0.0, 0.0)
+# A colour that tells the column.
+RAMP = (torch.arange(WIDTH).float() / 100).expand(HEIGHT, WIDTH)[..., None].repeat(1, 1, 3)
+
+
+def moved(*eye: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
+    """The camera with its eye elsewhere, looking the same way."""
+    matrix = torch.eye(4)
+    matrix[:3, 3] = -torch.tensor(eye)
+    return dataclasses.replace(CAMERA, world_to_camera=matrix, width=2 * width, height=2 * height)
+
+
+def rim_of(mask: Tensor, inverse_depth: Tensor, rgb: Tensor, *eye: float) -> Rim:
+    camera = moved(*eye, width=mask.shape[1], height=mask.shape[0])
+    features = ViewFeatures(rgb, inverse_depth, (~mask).float(), mask)
+    seeds = Seeds(cell_centers(camera), inverse_depth, torch.zeros(*mask.shape, 2), rgb)
+    return find_rim(features, seeds, camera, CAMERA)[0]
+
+
+def row_of(first: int, last: int, depth: Tensor) -> tuple[list[int], list[int], list[int]]:
+    """Columns that the hole of columns first..last sees at its rim, those mirrored there, and the distances."""
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, first : last + 1] = True
+    rim = rim_of(mask, depth.expand(HEIGHT, WIDTH).contiguous(), RAMP, *SIDEWAYS)
+    assert torch.equal(rim.rgb[~mask], RAMP[~mask])
+    assert not rim.distance[~mask].any()
+    rgb, mirrored = (torch.round(100 * colors[5, mask[5], 0]).int().tolist() for colors in (rim.rgb, rim.mirrored))
+    return rgb, mirrored, rim.distance[5, mask[5]].int().tolist()
+
+
+def test_after_a_sideways_move_a_row_extends_its_farther_side() -> None:
+    right, ones = torch.arange(WIDTH) >= 8, torch.ones(WIDTH)
+    assert row_of(8, 11, torch.where(right, 0.5, 0.1)) == ([7] * 4, [6, 5, 4, 3], [1, 2, 3, 4])
+    assert row_of(8, 11, torch.where(right, 0.5, 1.0)) == ([12] * 4, [16, 15, 14, 13], [4, 3, 2, 1])
+    assert row_of(15, 19, ones) == ([14] * 5, [13, 12, 11, 10, 9], [1, 2, 3, 4, 5])  # one rim
+    assert row_of(0, 19, ones) == (list(range(20)), list(range(20)), [0] * 20)  # none: the seeds stay
+    _, mirrored, _ = row_of(8, 11, torch.where(torch.arange(WIDTH) < 6, 0.2 * SAME_DEPTH * 1.01, 0.2))
+    assert mirrored in ([6, 7, 7, 7], [16, 15, 14, 13])  # another surface is not mirrored; both sides are as far
+
+
+def test_a_speck_at_the_border_fades_soon() -> None:
+    rgb, mask = torch.full((64, 128, 3), 0.3), torch.zeros(64, 128, dtype=torch.bool)
+    rgb[31:33, :41] = torch.tensor([0.9, 0.1, 0.1])
+    mask[:, 41:] = True
+    rim = rim_of(mask, torch.ones(64, 128), rgb, *SIDEWAYS)
+    for found in (rim.rgb, rim.mirrored[:, 82:]):  # what is farther than the photo is wide is not mirrored
+        assert float((found[..., 0] - 0.3)[:, -25:].abs().max()) < 0.1  # of 0.6
+    assert float(rim.rgb[31:33, 41:45, 0].min()) > 0.6
+    assert torch.allclose(rim.rgb[:8, 41:], torch.tensor(0.3), atol=0.02)
+
+
+def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Colour and distance, cell by cell, the epipole found from two points of one line of sight."""
+    color, distance = rgb.clone(), torch.zeros(HEIGHT, WIDTH)
+    centers = cell_centers(camera)
+    for y, x in mask.nonzero().tolist():
+        here = camera.unproject(centers[y, x].double(), torch.tensor(3.0, dtype=torch.float64))
+        other, _ = camera.project(here + 0.01 * (here - CAMERA.position.double()))  # the photo sees both at one place
+        line = other - centers[y, x]
+        dx, dy = (line / line.norm()).tolist()
+        best = math.inf
+        for sign in (1, -1):
+            for k in range(1, HEIGHT + WIDTH):
+                v, u = math.floor(y + sign * k * dy + 0.5), math.floor(x + sign * k * dx + 0.5)
+                if not (0 <= v < HEIGHT and 0 <= u < WIDTH):
+                    break
+                if not mask[v, u]:
+                    if float(depth[v, u]) < best:
+                        best = float(depth[v, u])
+                        color[y, x], distance[y, x] = rgb[v, u], k
+                    break
+        if 1.4 * float(depth[y, x]) < best < math.inf:  # what stands in front does not continue behind
+            color[y, x] = rgb[y, x]
+    return color, distance
+
+
+@pytest.mark.parametrize("eye", [SIDEWAYS, (-0.2, 0.31, 0.0), (0.1, -0.05, 0.6), (0.013, 0.007, -0.5)])
+def test_any_move_agrees_with_a_plain_walk(eye: tuple[float, float, float]) -> None:
+    generator = torch.Generator().manual_seed(3)
+    mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6
+    depth = 0.1 + torch.rand(HEIGHT, WIDTH, generator=generator)
+    rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
+    rim = rim_of(mask, depth, rgb, *eye)
+    color, distance = plain_rim(mask, depth, rgb, moved(*eye))
+    # A line through the corner of a cell may round to either side.
+    same = (rim.distance == distance) & ((rim.rgb == color).all(-1) | (distance > CRISP * WIDTH + 1 / WIDENING))
+    assert float(same[mask].float().mean()) > 0.97
