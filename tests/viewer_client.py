@@ -19,13 +19,13 @@ from photos import picture
 from PIL import Image
 
 from spackle.viewer.guard import Limits
+from spackle.viewer.handler import Tell
 from spackle.viewer.page import PageScene
 from spackle.viewer.server import Complete, ViewerServer
-from spackle.viewer.work import Tell
 
 Where = ViewerServer | str  # the latter: the page's address
 PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}
-QUICK = Limits(request=0.6, pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)
+QUICK = Limits(pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)
 
 
 def saved(kind: str) -> bytes:
@@ -97,10 +97,10 @@ def answer_of(connection: socket.socket) -> bytes:
 
 
 def raw(server: ViewerServer, data: bytes) -> tuple[int, bytes]:
-    """The status and the body that the server has for these bytes, however wrong they are; it must hang up."""
+    """The status and the body that the server has for these bytes, however wrong; 0 where it just hangs up."""
     with dial(server, data) as connection:
         head, _, body = answer_of(connection).partition(b"\r\n\r\n")
-        return int(head.split()[1]), body
+        return int(head.split()[1]) if head else 0, body
 
 
 def request(target: str, *headers: str, method: str = "GET", host: str = "localhost") -> bytes:

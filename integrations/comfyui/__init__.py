@@ -20,7 +20,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
 from spackle.gaussians import Gaussians
-from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.image import focal_length
 from spackle.views import PATH_FRAMES
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")
@@ -69,10 +69,8 @@ class PredictScene:
         """InputError for an image that the base cannot use."""
         rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
         height, width = rgb.shape[:2]
-        focal = film_to_pixels(DEFAULT_FOCAL_MM, width, height)
-        if fov:
-            focal = width / 2 / float(torch.tensor(fov / 2).deg2rad().tan())
-        photo = Photo(rgb, focal, "--fov" if fov else "default 30 mm", Path("image"))
+        lens = focal_length("image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
+        photo = Photo(rgb, *lens, Path("image"))
         if depth is not None:
             inverse = depth[0].detach().float().cpu().mean(dim=-1).clamp(min=FARTHEST)
             valid = torch.ones_like(inverse, dtype=torch.bool)

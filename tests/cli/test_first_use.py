@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 import time
@@ -11,10 +10,8 @@ from pathlib import Path
 import pytest
 
 from spackle._numba import is_compiled
-from spackle.cli import first_use
-from spackle.cli.first_use import compiled_ahead
+from spackle.cli import photos
 from spackle.render import get_renderer
-from spackle.render.blend import blend_tiles
 
 KERNELS_OF_A_COMPLETION = """
 import gc
@@ -24,7 +21,7 @@ from numba.core.dispatcher import Dispatcher
 
 sys.path.insert(0, sys.argv[1])
 from scenes import box_before_wall, shifted
-from spackle.cli.first_use import compile_kernels
+from spackle.cli.photos import compile_kernels
 from spackle.render import get_renderer
 from spackle.scene_fill import FillContext, fill_scene
 
@@ -51,7 +48,7 @@ def test_what_a_completion_needs_is_compiled_ahead() -> None:
     assert not missing
 
 
-def test_the_second_process_ends_with_the_first_and_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_process_works_and_ends_with_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     started: list[subprocess.Popen[bytes]] = []
 
@@ -60,15 +57,17 @@ def test_the_second_process_ends_with_the_first_and_is_announced(monkeypatch: py
             super().__init__(*words, **options)  # type: ignore[call-overload]
             started.append(self)
 
-    monkeypatch.setattr(first_use.subprocess, "Popen", Process)
-    with compiled_ahead(get_renderer(), said.append):
-        assert (len(started), len(said)) == (not is_compiled(blend_tiles), not is_compiled(blend_tiles))
-    monkeypatch.setattr(first_use, "is_compiled", lambda kernel: False)
-    said.clear(), started.clear()
-    with compiled_ahead(get_renderer(), said.append):
-        assert len(started) == len(said) == 1
-        assert started[0].poll() is None
-    assert started[0].returncode is not None
+    monkeypatch.setattr(photos.subprocess, "Popen", Process)
+    for compiled, ends in ((True, False), (False, False), (False, True)):
+        monkeypatch.setattr(photos, "is_compiled", lambda kernel, compiled=compiled: compiled)
+        said.clear(), started.clear()
+        with photos.compiled_ahead(get_renderer(), said.append):
+            assert len(started) == len(said) == (not compiled)
+            if ends:
+                assert started[0].wait(timeout=300) == 0
+            elif started:
+                assert started[0].poll() is None
+        assert all(process.returncode is not None for process in started)
 
 
 def test_a_kernel_is_compiled_once_its_code_lies_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +75,8 @@ def test_a_kernel_is_compiled_once_its_code_lies_on_disk(tmp_path: Path, monkeyp
     source = f"from spackle._numba import kernel\n\n@kernel\ndef since(x):\n    return x - {now}\n"
     (tmp_path / "own_kernel.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    since = importlib.import_module("own_kernel").since
+    from own_kernel import since
+
     assert not is_compiled(since)
     assert since(now) == 0
     assert is_compiled(since)

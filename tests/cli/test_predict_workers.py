@@ -109,17 +109,16 @@ def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     assert list(content(out)) == list(content(place / "alone"))
 
 
-def test_a_single_photo_needs_no_workers_and_a_clip_takes_none_nor_texture(
-    tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run]
-) -> None:
-    for option in ("--workers", "--threads"):
-        refuses(run("predict", pair[0], "-o", tmp_path / "out", option, 0), option, "between 1 and")
-    for words in (("--workers", 2), ("--ray", "auto"), ("--fill", "lama"), ("--mode", "view")):
-        clip = write_clip(tmp_path / "clip.mp4", moving())
-        refuses(run("predict", clip, "-o", tmp_path / "out", *words), f"{words[0]} {words[1]}: not for a clip")
-    assert not (tmp_path / "out").exists()
+def test_a_single_photo_needs_no_workers(tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run]) -> None:
     predicted(*pair, tmp_path / "out", "--workers", 4)
     assert (tmp_path / "out" / "photo" / "scene.ply").read_bytes() == (plain[0] / "scene.ply").read_bytes()
+
+
+def test_a_clip_takes_no_workers_and_no_texture(tmp_path: Path) -> None:
+    clip = write_clip(tmp_path / "clip.mp4", moving())
+    for option in ("--workers 2", "--ray auto", "--fill lama", "--path p.json"):
+        refuses(run("predict", clip, "-o", tmp_path / "out", *option.split()), f"{option}: not for a clip")
+    assert not (tmp_path / "out").exists()
 
 
 def test_workers_on_ray_give_the_same_files_where_all_nodes_see_them(

@@ -29,7 +29,7 @@ from rich.console import Console
 from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
 from spackle.camera import Camera
-from spackle.cli.export_scene import PAGE, export_scene
+from spackle.cli.saved_scene import PAGE, export_scene
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import PlyFile, load_ply, save_ply

@@ -22,7 +22,7 @@ from viewer_client import ask, events, send
 
 import spackle
 from spackle.bases.settings import ROUGH, BaseSettings
-from spackle.cli.view_page import Teller, ViewOptions, complete_for_page
+from spackle.cli.view_page import Teller, Uploads, complete_for_page
 from spackle.formats import save_ply
 from spackle.image import film_to_pixels, load_photo
 from spackle.progress import Reporter
@@ -145,43 +145,44 @@ def test_a_photo_is_completed_as_predict_completes_it(
 
 def test_the_page_says_that_lite_is_rough_and_stays_near(tmp_path: Path) -> None:
     photo = load_photo(write_pair(tmp_path)[0])
-    completer = ViewOptions(settings := BaseSettings("lite")).open(settings)
+    completer = Uploads(settings := BaseSettings("lite"), None, False, Reporter()).open(settings)
     description: Any = complete_for_page(photo, "p", completer, Teller(Reporter(), lambda event: None)).description
     assert (description["note"], description["orbit"]["free"]) == (ROUGH, 0.15)
 
 
+@pytest.fixture
+def closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No page may open."""
+    monkeypatch.setattr("spackle.cli.view_page.announce", lambda *_, **__: pytest.fail("there is a page"))
+
+
+@pytest.mark.usefixtures("closed")
 @pytest.mark.parametrize(
     ("name", "content", "why"),
     [
         ("text.txt", b"hello", "not an image"),
         ("written.spz", b"anything", "scene.ply"),  # a format that is written, not read
         ("scene.jpg", b"ply\nformat ascii 1.0\nend_header\n", "not a Gaussian scene"),
-        ("missing.jpg", None, ""),
+        ("missing.jpg", None, "no such photo or scene"),
         ("behind.ply", None, "in front of the photo's camera"),
     ],
 )
-def test_files_that_are_neither_scene_nor_photo(
-    tmp_path: Path, name: str, content: bytes | None, why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("spackle.cli.view_page.announce", lambda *_, **__: pytest.fail("there is a page"))
+def test_files_that_are_neither_scene_nor_photo(tmp_path: Path, name: str, content: bytes | None, why: str) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     elif name == "behind.ply":
-        behind = box_before_wall().base().transform(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])))
-        save_ply(behind, tmp_path / name)
+        save_ply(box_before_wall().base().transform(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))), tmp_path / name)
     refuses(run("view", tmp_path / name), name, why)
 
 
-@pytest.mark.parametrize("kind", ["scene", "photo"])
-def test_bad_options(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("spackle.cli.view_page.announce", lambda *_, **__: pytest.fail("there is a page"))
-    target = write_photo(tmp_path / "photo.png")
-    if kind == "scene":
-        target = tmp_path / "scene.ply"
-        save_ply(box_before_wall().base(), target)
+@pytest.mark.usefixtures("closed")
+@pytest.mark.parametrize("target", ["photo.png", "scene.ply"])
+def test_bad_options(tmp_path: Path, target: str) -> None:
+    write_photo(tmp_path / "photo.png")
+    save_ply(box_before_wall().base(), tmp_path / "scene.ply")
     bad = {"--base": "shrap", "--disparity": "7", "--fov": "200", "--depth": "none.npy", "--port": "70000"}
     for option, value in {**bad, "--host": "no.such.host.invalid"}.items():
-        refuses(run("view", target, option, value), value if option == "--depth" else option)
+        refuses(run("view", tmp_path / target, option, value), value if option == "--depth" else option)
 
 
 def test_it_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:

@@ -98,16 +98,6 @@ def test_a_layer_is_read_back_as_precisely_as_it_says() -> None:
     assert encode_layer(dataclasses.replace(wanted, scales=scales))[2] < 0.11
 
 
-@pytest.mark.parametrize("kind", TRAJECTORIES)
-@pytest.mark.parametrize("disparity", [0.0, 0.3, 0.8])
-def test_the_description_holds_the_paths_of_the_trajectories(kind: TrajectoryKind, disparity: float) -> None:
-    description: dict[str, Any] = page_of_box().description
-    still, moving = (np.array(description["paths"][kind][part]) for part in ("still", "moving"))
-    camera = box().camera.to(dtype=torch.float64)
-    cameras = trajectory(kind, camera, disparity, DepthRange.of(box().base), len(still))
-    np.testing.assert_allclose(still + disparity * moving, [view.position.tolist() for view in cameras], atol=1e-7)
-
-
 def test_the_description_is_plain_json_and_counts_its_layers() -> None:
     description: dict[str, Any] = json.loads(json.dumps(page_of_box().description, allow_nan=False))
     assert description["name"] == "Box"

@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from spackle.cli import dataset, evaluate, predict, render, train, weights
+from spackle.cli import commands, dataset, evaluate, train, weights
 from spackle.cli.options import INTERRUPTED
 from spackle.errors import InputError, one_line
 
@@ -61,15 +61,19 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # its panels leave a third of the width to the words
-    context_settings={"help_option_names": ["-h", "--help"]},
+    # Names of options and of their choices may be typed with underscores.
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "token_normalize_func": lambda name: name.replace("_", "-"),
+    },
 )
 
 
-app.command(short_help="Photos, or a clip, to completed scenes and videos")(predict.predict)
-app.command(short_help="Look at a scene, or at a photo that becomes one")(render.view)
-app.command(short_help="A saved scene to a video")(render.render)
-app.command(short_help="A scene for other viewers, or as one page to send")(render.export)
-app.command(short_help="The Middlebury Motorcycle, against its true second photo")(predict.demo)
+app.command(short_help="Photos, or a clip, to completed scenes and videos")(commands.predict)
+app.command(short_help="Look at a scene, or at a photo that becomes one")(commands.view)
+app.command(short_help="A saved scene to a video")(commands.render)
+app.command(short_help="A scene for other viewers, or as one page to send")(commands.export)
+app.command(short_help="The Middlebury Motorcycle, against its true second photo")(commands.demo)
 app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 app.command(short_help="Train the residual or SHARP's decoder")(train.train)
 app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure on a dataset, in the paper's protocols")(

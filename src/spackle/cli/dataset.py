@@ -11,9 +11,9 @@ from spackle.cli.options import (
     INTERRUPTED,
     DeviceOption,
     PrecisionOption,
+    TrajectoryName,
     VerboseOption,
     given_input,
-    trajectory_option,
 )
 
 dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
@@ -49,7 +49,9 @@ def dataset_build(
     checkpoint: Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")] = None,
     precision: PrecisionOption = "auto",
     views: Annotated[int, typer.Option(min=2, max=100, help="Views of a photo, its own among them.")] = 20,
-    trajectory: Annotated[str | None, trajectory_option("Camera path; default: drawn for each photo.")] = None,
+    trajectory: Annotated[
+        TrajectoryName | None, typer.Option(help="Camera path; default: drawn for each photo.")
+    ] = None,
     disparity: Annotated[
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),
@@ -84,7 +86,7 @@ def dataset_build(
         sample=sample,
         seed=seed,
         views=views,
-        trajectory=trajectory,  # type: ignore[arg-type]  # a kind, by its parser
+        trajectory=trajectory,
         disparity=disparity,
         inpainter=inpainter,
         inpainter_weights=inpainter_weights,

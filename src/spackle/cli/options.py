@@ -13,17 +13,17 @@ from typer.core import TyperOption
 from spackle.errors import InputError, check_name
 
 if TYPE_CHECKING:  # torch takes seconds to load
-    from spackle.camera_path import TrajectoryKind
     from spackle.views import PathOptions
 
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
-SPELLINGS = ["swipe", "shake", "rotate", "rotate-forward"]  # of trajectories
 
-DeviceName = Literal["auto", "cpu", "cuda"]
+# As `TrajectoryKind` has it; names are normalised, so that rotate_forward is taken, too.
+TrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 InputOption = Annotated[Path | None, typer.Option("-i", "--input", hidden=True)]  # as the argument was given once
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
-DeviceOption = Annotated[DeviceName, typer.Option(help="Where to compute.")]
+DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
+FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 KeepFrameOption = Annotated[
     bool, typer.Option("--keep-frame", help="Leave a scan's margin or letterbox bars around a photo on it.")
 ]
@@ -85,27 +85,11 @@ def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
     return speed
 
 
-def trajectory_named(text: str) -> str:
-    """A trajectory by its name, with hyphens; BadParameter for an unknown one."""
-    if text.replace("_", "-") not in SPELLINGS:
-        raise typer.BadParameter(f"{text!r} is not one of {', '.join(map(repr, SPELLINGS))}.")
-    return text.replace("_", "-")
-
-
-def trajectory_option(words: str, default: str | None = None) -> Any:
-    """The option --trajectory; `default` is what the help shows."""
-    return typer.Option(
-        help=words,
-        show_default=default or False,
-        parser=trajectory_named,
-        metavar=f"[{'|'.join(SPELLINGS)}]",
-        autocompletion=lambda: SPELLINGS,
-    )
-
-
 def path_options(
     *,
-    trajectory: Annotated[str | None, trajectory_option("Camera path of the video.", "rotate-forward")] = None,
+    trajectory: Annotated[
+        TrajectoryName | None, typer.Option(help="Camera path of the video.", show_default="rotate-forward")
+    ] = None,
     disparity: Annotated[
         float | None,
         typer.Option(
@@ -134,9 +118,9 @@ def path_options(
         int | None,
         typer.Option(
             metavar="N",
+            hidden=True,
             help="Show the video N times; 0: for ever.",
             show_default="0 for gif and webp, else 1",
-            hidden=True,
         ),
     ] = None,
     size: Annotated[
@@ -153,14 +137,14 @@ def path_options(
     ipd: Annotated[
         float | None,
         typer.Option(
-            hidden=True, metavar="METRES", help="Distance of the two eyes.", show_default="as suits the scene's depth"
+            metavar="METRES", hidden=True, help="Distance of the two eyes.", show_default="as suits the scene's depth"
         ),
     ] = None,
     convergence: Annotated[
         float | None,
         typer.Option(
-            hidden=True,
             metavar="METRES",
+            hidden=True,
             help="Depth at which the screen stands.",
             show_default="what the path looks at",
         ),
@@ -181,26 +165,27 @@ def path_options(
     for option, value in given.items():
         if value is not None and (path is not None or cameras is not None):
             raise InputError(f"{says}: leave {option} {value} out")
-    kind: TrajectoryKind = trajectory or "rotate-forward"  # type: ignore[assignment]  # one of them, by its parser
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, show, stereo, ipd, convergence)
-    return PathOptions(kind, disparity, cameras, path, frames, video)
+    return PathOptions(trajectory or "rotate-forward", disparity, cameras, path, frames, video)
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the options of `path_options` as its one parameter `path`, and --help-all."""
-    own = inspect.signature(command, eval_str=True, locals={"PathOptions": object}).parameters
-    shared = inspect.signature(path_options, eval_str=True, locals={"PathOptions": object}).parameters
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in own.items():
-        found = shared.values() if name == "path" else [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
-        parameters += found
+    own, shared = (
+        inspect.signature(function, eval_str=True, locals={"PathOptions": object}).parameters
+        for function in (command, path_options)
+    )
     kind = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        parameter
+        for name, mine in own.items()
+        for parameter in (shared.values() if name == "path" else [mine.replace(kind=kind)])
+    ]
     parameters.append(inspect.Parameter("help_all", kind, default=False, annotation=HelpAllOption))
 
-    def expanded(**values: Any) -> None:
+    def expanded(*, help_all: bool, **values: Any) -> None:
         path = path_options(**{name: values.pop(name) for name in shared})
-        del values["help_all"]
         command(**values, path=path)
 
     expanded.__name__, expanded.__doc__ = command.__name__, command.__doc__

@@ -13,22 +13,22 @@ import torch
 from torch import Tensor
 
 import spackle
-from spackle.bases.depth_map import DepthMap, calibrations_beside, find_depth
+from spackle.bases.open import ResolvedBase
+from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.errors import InputError
-from spackle.files import fingerprint, write_json
-from spackle.folders import digest_of, file_records, results_folder, whole_set
+from spackle.files import write_json
+from spackle.folders import file_records, results_folder, whole_set
 from spackle.formats import save_gray_png, save_ply, save_png, save_video
-from spackle.image import load_photo
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, load_photo
 from spackle.pipeline import CompletedPhoto, Options, Pipeline
 from spackle.progress import Reporter, Step
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.views import video_problem
-from spackle.weights import installed
 
 REPORT = "report.json"
-Holes = list[dict[str, float | str]]  # of each measured view: its name, and its HAR before and after
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,17 +53,13 @@ class PredictOptions:
     def open(self) -> Pipeline:
         """What all photos share; InputError for an option that cannot be used, whatever the photo."""
         pipeline, path = Pipeline.open(self.scene), self.scene.path
-        for option, value in {
-            "--format": path.video.format,
-            "--fps": path.video.fps,
-            "--loop": path.video.loop,
-        }.items():
-            if value is not None and not self.render:
-                raise InputError(
-                    f"{option} {value}: is for the video, and --no-render writes none: leave one of them out"
-                )
-        views = pipeline.given_views
-        if self.render and views and (problem := video_problem(views)):
+        if not self.render:
+            for option in ("format", "fps", "loop"):
+                if (value := getattr(path.video, option)) is not None:
+                    raise InputError(
+                        f"--{option} {value}: is for the video, and --no-render writes none: leave one of them out"
+                    )
+        elif pipeline.given_views and (problem := video_problem(pipeline.given_views)):
             raise InputError(f"{path.cameras}: {problem}, so they make no video: add --no-render for pictures only")
         return pipeline
 
@@ -79,9 +75,10 @@ def predict_photo(
     with reporter.stage("load"):
         photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
     with contextlib.ExitStack() as folders:
-        pictures = _picture_files(len(pipeline.given_views or []))
         folders.enter_context(results_folder(folder, options.files, alone=True))
-        if pictures:
+        stills = range(len(pipeline.given_views or []))
+        if stills:
+            pictures = [f"{index:04d}{kind}.png" for index in stills for kind in ("", "_base", "_mask")]
             folders.enter_context(results_folder(folder / "views", pictures))
         done = pipeline.complete(photo, reporter)
         _warn_of_rougher(done, folder, options.scene.base, reporter)
@@ -95,20 +92,36 @@ def predict_photo(
             video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video") as step:
                 save_views(done, new / options.files[-1], pipeline.renderer, step)
-        if pictures:
+        if stills:
             (new / "views").mkdir()
             with reporter.stage("views") as step:
                 _save_pictures(done, new / "views", pipeline.renderer, step)
         with reporter.stage("measure"):
             holes = _measure_holes(done, pipeline.renderer)
-        report = _report(done, pipeline, holes, video, request, reporter.seconds)
+        report = {
+            **shared_report(photo, done.prediction, done.choice, pipeline, reporter),
+            "merged": len(scene.gaussians),
+            "mode": options.scene.fill.mode,
+            "disparity": scene.disparity,
+            "video": video,
+            "hole_area_ratio": holes,
+            "request": request if done.choice.lasting else None,  # None: the next run does it again
+        }
+        size = {"width": scene.camera.width, "height": scene.camera.height}
+        frame = {} if photo.frame is None else {"frame_cut_off": dataclasses.asdict(photo.frame)}
+        report["photo"] = {"file": path.name, **size, **frame}
+        report["base"] |= done.prediction.notes
+        report["residual"]["fill"] = options.scene.fill.texture
+        report["aux"] = {"gaussians": len(scene.aux), "share": len(scene.aux) / len(scene.base)}
+        if done.saved_view is not None:
+            report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
         report["files"] = file_records(new, sorted(file for file in new.rglob("*") if file.is_file()))
         write_json(report, new / REPORT)
-    before, after = (sum(float(view[key]) for view in holes) / len(holes) for key in ("before", "after"))
-    aux = report["aux"]
+    before, after = (sum(view[key] for view in holes) / len(holes) for key in ("before", "after"))
     reporter.log(
-        f"{path.name}: {aux['gaussians']:,} aux Gaussians ({aux['share']:.1%}, {report['residual']['weights']}), "
-        f"holes {before:.2%} -> {after:.3%}, {report['seconds']['total']:.1f} s -> {folder}"
+        f"{path.name}: {len(scene.aux):,} aux Gaussians ({report['aux']['share']:.1%}, "
+        f"{report['residual']['weights']}), holes {before:.2%} -> {after:.3%}, "
+        f"{report['seconds']['total']:.1f} s -> {folder}"
     )
     reporter.result({"folder": folder, **report})
 
@@ -130,11 +143,6 @@ def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Step)
     save_video(frames(), path, video.rate, video.loop)
 
 
-def _picture_files(count: int) -> list[str]:
-    """What `_save_pictures` writes for so many views."""
-    return [f"{index:04d}{kind}.png" for index in range(count) for kind in ("", "_base", "_mask")]
-
-
 @torch.no_grad()
 def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step: Step) -> None:
     """Each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
@@ -147,94 +155,38 @@ def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step:
 
 
 @torch.no_grad()
-def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> Holes:
-    """HAR of the measured views (eq. 11), before and after completion."""
-    rows: Holes = []
-    for name, index in done.views.measured.items():
-        before, after = (
-            hole_area_ratio(renderer.render(parts, done.views.cameras[index]).alpha)
-            for parts in (done.scene.base, done.scene.of_view(index))
-        )
-        rows.append({"view": name, "before": before, "after": after})
-    return rows
+def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, Any]]:
+    """HAR (eq. 11) of each measured view, before and after completion."""
+
+    def har(gaussians: list[Gaussians], view: int) -> float:
+        return hole_area_ratio(renderer.render(gaussians, done.views.cameras[view]).alpha)
+
+    return [
+        {"view": name, "before": har([done.scene.base], index), "after": har(done.scene.of_view(index), index)}
+        for name, index in done.views.measured.items()
+    ]
 
 
-def shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
-    """A digest of what all photos share: version, options, and what their files hold; InputError for a missing file."""
-    base, path, fill = options.scene.base, options.scene.path, options.scene.fill
-    fields: dict[str, Any] = {**dataclasses.asdict(base), **dataclasses.asdict(path), **options.lens}
-    for name in ("windows", "compiled"):  # they change last bits alone
-        del fields[name]
-    fields |= {
-        "name": base.named if base.folder is None else "hf",  # its files tell, wherever they lie
-        "residual": fill.weights,
-        "fill": fill.texture,
-        "mode": fill.mode,
-        "render": options.render,
-        "keep_frame": options.keep_frame,
-        "spackle": spackle.__version__,
-    }
-    choices = {name: value for name, value in fields.items() if not isinstance(value, Path)}
-    prints = {kind: fingerprint(file, kind) for kind, file in shared_files(options.scene).items()}
-    return digest_of([choices, pipeline.base.fingerprints, prints])
-
-
-def shared_files(options: Options) -> dict[str, Path]:
-    """The files that all photos share besides the base's, by what they are."""
-    path, fill = options.path, options.fill
-    files = {"calibration": options.base.calib, "camera file": path.cameras, "path file": path.path}
-    files |= {"weights": fill.file, "LaMa": installed("lama") if fill.texture == "lama" else None}
-    return {kind: file for kind, file in files.items() if file is not None}
-
-
-def request_of(photo: Path, depth: Path | DepthMap | None, shared: str) -> str:
-    """A digest of all that the result of one photo depends on; InputError if the photo or its depth map is missing."""
-    files = [fingerprint(photo, "photo")]
-    if isinstance(depth, Path):
-        depth = find_depth(depth, photo)
-        files.append(fingerprint(depth, "depth map"))
-        files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
-    return digest_of([shared, *files])
-
-
-def _report(
-    done: CompletedPhoto,
-    pipeline: Pipeline,
-    holes: Holes,
-    video: dict[str, object] | None,
-    request: str,
-    seconds: Mapping[str, float],
+def shared_report(
+    photo: Photo, prediction: BasePrediction, choice: ResolvedBase, pipeline: Pipeline, reporter: Reporter
 ) -> dict[str, Any]:
-    """Counts, holes, times and sources of one photo, ready for JSON."""
-    photo, prediction, choice, options = done.photo, done.prediction, done.choice, pipeline.options
-    base, aux, weights = len(done.scene.base), len(done.scene.aux), options.fill.weights
-    given = options.path.cameras or options.path.path
+    """What the reports of a photo and of a clip both hold, ready for JSON."""
+    path, weights = pipeline.options.path, pipeline.options.fill.weights
+    given = path.cameras or path.path
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
-        "photo": {"file": photo.path.name, "width": prediction.camera.width, "height": prediction.camera.height},
         "focal_px": round(prediction.camera.focal[0], 3),
         "focal_source": prediction.lens_source or photo.focal_source,
-        "base": {"name": choice.base, "chosen": choice.why, "gaussians": base, **prediction.notes},
-        "residual": {"weights": weights, "fill": options.fill.texture},
-        "aux": {"gaussians": aux, "share": aux / base},
-        "merged": base + aux,
-        "mode": options.fill.mode,
-        "views": given.name if given else options.path.trajectory,
-        "disparity": done.scene.disparity,
+        "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
+        "residual": {"weights": weights},
+        "views": given.name if given else path.trajectory,
         "disparity_source": None if given else pipeline.disparity_source(choice),
-        "video": video,
-        "hole_area_ratio": holes,
-        "request": request if choice.lasting else None,  # None: the next run does it again
-        "seconds": {**seconds, "total": round(sum(seconds.values()), 3)},
+        "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
     }
-    if photo.frame is not None:
-        report["photo"]["frame_cut_off"] = dataclasses.asdict(photo.frame)
     if choice.failures:
         report["base"]["passed_over"] = list(choice.failures)
     if weights == "seeds":
         report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
-    if done.saved_view is not None:
-        report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
     return report
 
 

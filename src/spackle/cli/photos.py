@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import subprocess
+import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+
 import spackle
+from spackle._numba import is_compiled
+from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
+from spackle.camera import Camera
 from spackle.cli.clip import clip_options, predict_clip
-from spackle.cli.first_use import compiled_ahead
-from spackle.cli.photo import (
-    REPORT,
-    PredictOptions,
-    earlier_report,
-    predict_photo,
-    request_of,
-    shared_digest,
-    shared_files,
-)
+from spackle.cli.photo import REPORT, PredictOptions, earlier_report, predict_photo
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
-from spackle.files import check_file, files_in
-from spackle.folders import as_recorded, check_mark, mark, results_folder
+from spackle.files import check_file, files_in, fingerprint
+from spackle.folders import as_recorded, check_mark, digest_of, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
-from spackle.pipeline import Pipeline
+from spackle.patches import match_patches
+from spackle.pipeline import Options, Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop
-from spackle.weights import weights_digest
+from spackle.render import Renderer, get_renderer, place_of
+from spackle.render.blend import blend_tiles
+from spackle.scene_fill import FillContext, OcclusionGuard, fill_scene
+from spackle.scene_fill.occlusion_guard import free_factors
+from spackle.surface import surface_gaussians
+from spackle.weights import installed, weights_digest
 from spackle.workers import Workers, at_work, cluster, threads_of_torch
 
 THREADS_ON_RAY = 2  # of a worker
+SIDE = 64  # pixels of the picture that the second process of a first use completes
 
 
 class NamedPhoto(NamedTuple):
@@ -50,7 +56,7 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
     InputError for an option, a clip or a single photo that cannot be used.
     """
     found = find_photos(photos)
-    workers = workers_for(options, len(found))
+    workers = _workers_for(options, len(found))
     if is_clip(photos):
         pipeline = Pipeline.open(clip_options(options))
         check_file(photos, "clip")
@@ -58,26 +64,43 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
             predict_clip(photos, output / found[0].name, pipeline, options.lens, reporter)
         return 0
     pipeline = options.open()
-    if not os.path.isdir(photos):
+    if single := not os.path.isdir(photos):
         check_file(photos, "photo")
-    predictor = Predictor(photos, output, options, shared_digest(options, pipeline), pipeline)
+    shared = _shared_digest(options, pipeline)
     with (
         cluster(workers) as ray,
-        results_folder(output, alone=os.path.isdir(photos) or ray is not None),
+        results_folder(output, alone=not single or ray is not None),
         compiled_ahead(pipeline.renderer, reporter.log),
     ):
+        predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
         left = predictor.left(found, reporter)
         if workers.count == 1 and ray is None:
             with threads_of_torch(workers.threads):
                 failed = sum(not predictor.predict(photo, reporter) for photo in left)
         else:
-            failed = _predict_by_workers(ray, workers, predictor, list(left), len(found), reporter)
+            word = None if ray is None else mark(output)
+            open_predictor = partial(Predictor.open, output, options, shared, single, reporter.verbose, word)
+            failed = _predict_by_workers(ray, workers, open_predictor, list(left), len(found), reporter)
     if failed:
         reporter.log(f"{failed} of {len(found)} photos failed")
     return failed
 
 
-def workers_for(options: PredictOptions, photos: int) -> Workers:
+def find_photos(path: Path) -> list[NamedPhoto]:
+    """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
+    if not os.path.isdir(path):
+        return [NamedPhoto(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
+    photos = files_in(path, PHOTO_SUFFIXES)
+    if not photos:
+        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
+    stems = Counter(photo.stem.casefold() for photo in photos)
+    names = {photo.name.casefold() for photo in photos}
+    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
+    return [NamedPhoto(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
+
+
+def _workers_for(options: PredictOptions, photos: int) -> Workers:
     """No more than photos, and together as many threads as torch has here; InputError for a number that cannot be."""
     Workers(options.workers, 1 if options.threads is None else options.threads).check()
     count = min(options.workers, photos)
@@ -86,7 +109,12 @@ def workers_for(options: PredictOptions, photos: int) -> Workers:
 
 
 def _predict_by_workers(
-    ray: Any, workers: Workers, predictor: Predictor, left: Sequence[NamedPhoto], total: int, reporter: Reporter
+    ray: Any,
+    workers: Workers,
+    open_predictor: Callable[[], Predictor],
+    left: Sequence[NamedPhoto],
+    total: int,
+    reporter: Reporter,
 ) -> int:
     """How many photos failed; what is said of each comes when it is done.
 
@@ -94,11 +122,8 @@ def _predict_by_workers(
     """
     if not left:
         return 0
-    word = None if ray is None else mark(predictor.output)
-    here = (predictor.photos, predictor.output, predictor.options, predictor.shared)
-    open_predictor = partial(Predictor.open, *here, verbose=reporter.verbose, word=word)
-    failed, ready = 0, total - len(left)
-    done = ready
+    failed = 0
+    done = ready = total - len(left)
     with (
         asked_to_stop(alone=True) as stop,
         reporter.steps("photos", ready, total) as step,
@@ -127,36 +152,44 @@ class Predicted(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Predictor:
-    """Predicts one photo after the other."""
+    """Predicts one photo after the other; a `PhotoWorker`."""
 
-    photos: Path  # their folder, or the only one
     output: Path
     options: PredictOptions
-    shared: str  # by `shared_digest`, of the main process
+    shared: str  # the main process's digest of what all photos share
+    single: bool  # there is one photo: it is done again, and its error is the command's
     pipeline: Pipeline
-    verbose: bool = False
+    verbose: bool
 
     @staticmethod
     def open(
-        photos: Path, output: Path, options: PredictOptions, shared: str, *, verbose: bool, word: str | None
+        output: Path, options: PredictOptions, shared: str, single: bool, verbose: bool, word: str | None
     ) -> Predictor:
         """For a worker; InputError for another folder than the one that was given the mark `word`."""
         if word is not None:
             check_mark(output, word)
-        return Predictor(photos, output, options, shared, options.open(), verbose)
+        return Predictor(output, options, shared, single, options.open(), verbose)
 
     @property
     def setup(self) -> dict[str, str]:
         """Version, and digests of the files that all photos share."""
-        files = {**shared_files(self.options.scene), **self.options.scene.base.files}
+        files = {**_shared_files(self.options.scene), **self.options.scene.base.files}
         return {"spackle": spackle.__version__, **{kind: weights_digest(file) for kind, file in files.items()}}
 
     def inputs(self, photo: NamedPhoto) -> str:
-        """As `request_of`, also where a file is missing."""
-        try:
-            return request_of(photo.path, self.options.scene.base.depth, self.shared)
-        except InputError:  # `predict` names it
-            return "none"
+        """As `request`, also where a file is missing."""
+        with contextlib.suppress(InputError):  # `predict` names it
+            return self.request(photo)
+        return "none"
+
+    def request(self, photo: NamedPhoto) -> str:
+        """A digest of all that a photo's results depend on; InputError if the photo or its depth map is missing."""
+        files, depth = [fingerprint(photo.path, "photo")], self.options.scene.base.depth
+        if isinstance(depth, Path):
+            depth = find_depth(depth, photo.path)
+            files.append(fingerprint(depth, "depth map"))
+            files += [fingerprint(file, "calibration") for file in calibrations_beside(depth) if file.is_file()]
+        return digest_of([self.shared, *files])
 
     def make(self, photo: NamedPhoto) -> Predicted:
         """As `predict`, for a worker."""
@@ -168,7 +201,7 @@ class Predictor:
         """The photos that are not done yet; logs those that are."""
         for photo in found:
             folder = self.output / photo.name
-            earlier = {} if photo.path == self.photos or self.options.overwrite else earlier_report(folder)
+            earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
             if (
                 earlier
                 and earlier.get("request") == self.inputs(photo)
@@ -183,10 +216,9 @@ class Predictor:
         """Whether a photo's results could be made; logs why not. InputError if that holds for all photos."""
         folder = self.output / photo.name
         try:
-            request = request_of(photo.path, self.options.scene.base.depth, self.shared)
-            predict_photo(photo.path, folder, self.options, self.pipeline, reporter, request)
+            predict_photo(photo.path, folder, self.options, self.pipeline, reporter, self.request(photo))
         except InputError as error:
-            if photo.path == self.photos or isinstance(error, BaseError):  # the only one, or no other can be worked on
+            if self.single or isinstance(error, BaseError):  # no other photo can be worked on
                 raise
             reporter.log(f"error: {error}")
             reporter.result({"folder": folder, "error": str(error)})
@@ -194,15 +226,60 @@ class Predictor:
         return True
 
 
-def find_photos(path: Path) -> list[NamedPhoto]:
-    """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
-    if not os.path.isdir(path):
-        return [NamedPhoto(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
-    photos = files_in(path, PHOTO_SUFFIXES)
-    if not photos:
-        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
-    # a.jpg and a.png must not write over each other, nor over a.jpg.png.
-    stems = Counter(photo.stem.casefold() for photo in photos)
-    names = {photo.name.casefold() for photo in photos}
-    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
-    return [NamedPhoto(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
+def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
+    """A digest of what all photos share: version, options, and what their files hold; InputError for a missing file."""
+    base, path, fill = options.scene.base, options.scene.path, options.scene.fill
+    name = base.named if base.folder is None else "hf"  # its files tell, wherever they lie
+    # Windows and compilation change last bits alone.
+    base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
+    path = dataclasses.replace(path, cameras=None, path=None)
+    choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
+    choices += [options.lens, options.render, options.keep_frame]
+    prints = {kind: fingerprint(file, kind) for kind, file in _shared_files(options.scene).items()}
+    return digest_of([spackle.__version__, choices, pipeline.base.fingerprints, prints])
+
+
+def _shared_files(options: Options) -> dict[str, Path]:
+    """The files that all photos share besides the base's, by what they are."""
+    path, fill = options.path, options.fill
+    files = {"calibration": options.base.calib, "camera file": path.cameras, "path file": path.path}
+    files |= {"weights": fill.file, "LaMa": installed("lama") if fill.texture == "lama" else None}
+    return {kind: file for kind, file in files.items() if file is not None}
+
+
+@contextlib.contextmanager
+def compiled_ahead(renderer: Renderer, log: Callable[[str], None]) -> Iterator[None]:
+    """While the block runs, a second process compiles the kernels that are needed last, unless they are on disk.
+
+    Numba compiles one kernel at a time in a process, so a thread would not help.
+    """
+    if place_of(renderer).type != "cpu" or is_compiled(blend_tiles):
+        yield
+        return
+    log("first use: kernels are compiled for this processor, which takes about half a minute, once")
+    words = [sys.executable, "-c", f"from {__name__} import compile_kernels; compile_kernels()"]
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(words, stdin=quiet, stdout=quiet, stderr=quiet) as helper:
+        try:
+            yield
+        finally:
+            helper.kill()
+
+
+@torch.no_grad()
+def compile_kernels() -> None:
+    """Complete a small view, so that all kernels of this are compiled: first those that the other comes to last."""
+    torch.set_num_threads(1)
+    camera = Camera.from_focal(SIDE, SIDE, SIDE)
+    aside = torch.eye(4)
+    aside[0, 3] = -0.4
+    moved = dataclasses.replace(camera, world_to_camera=aside)
+    depth = torch.full((SIDE, SIDE), 2.0)
+    depth[SIDE // 4 : -SIDE // 4, SIDE // 4 : -SIDE // 4] = 1.0
+    rgb, hole = torch.rand(SIDE, SIDE, 3), depth < 2
+    match_patches(rgb, hole, 1 / depth)
+    shape = camera.pixel_centers().flatten(0, 1), 1 / depth.flatten(), torch.zeros(SIDE**2, 2)
+    base = surface_gaussians(camera, *shape, 0.6, rgb.flatten(0, 1), torch.full((SIDE**2,), 0.9))
+    guard = OcclusionGuard.of(get_renderer("cpu").render(base, camera), camera)
+    free_factors(base, moved.position, [guard])
+    assert len(fill_scene(FillContext(base, camera, get_renderer("cpu")), [moved, camera]).aux)

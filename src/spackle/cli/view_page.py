@@ -9,25 +9,25 @@ import os
 import secrets
 import socket
 import sys
-import tempfile
 import threading
 import time
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.cli.export_scene import page_of
+from spackle.cli.saved_scene import page_of
 from spackle.errors import InputError, check_name
 from spackle.files import check_file
+from spackle.formats.scene_files import SceneFile, encoder_of
 from spackle.image import Photo, load_photo
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, Step, asked_to_stop
 from spackle.scene import Scene
 from spackle.viewer import PageScene, page_files
-from spackle.viewer.server import HOST, ViewerServer
-from spackle.viewer.work import Tell
+from spackle.viewer.handler import Tell
+from spackle.viewer.server import ViewerServer
 from spackle.views import PathOptions
 from spackle.weights import installed
 
@@ -40,23 +40,61 @@ OPEN_TO_ALL = (
 ELSEWHERE = ("192.0.2.1", 9)  # an address of documentation: asking for the way there sends nothing
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewOptions:
-    """The choices of `spackle view`."""
+def view_page(
+    target: Path,
+    uploads: Uploads,
+    lens: Mapping[str, float | None],
+    host: str,
+    port: int,
+    token: bool,
+    browser: bool,
+) -> bool:
+    """Show a scene or a photo until somebody stops it; False where work is left over that cannot be interrupted.
 
-    base: BaseSettings
-    disparity: float | None = None  # how far photos are completed; as the base has it where None
-    focal_px: float | None = None  # of the scene or the photo
-    fov: float | None = None
-    host: str = HOST
-    port: int = 0  # any that is free
-    browser: bool = True  # open one
-    keep_frame: bool = False  # a uniform frame around a photo is part of it
-    token: bool = True  # only who knows the address gets in
+    Args:
+        target: the scene or the photo.
+        uploads: what completes photos; its base's depth and calibration are those of `target`.
+        lens: `focal_px` and `fov` of `target`.
+        host: where to listen.
+        port: 0 takes any that is free.
+        token: only who knows the page's address gets in.
+        browser: open one.
 
-    def open(self, base: BaseSettings) -> Pipeline:
-        """The way of photos through a base; InputError for an option that cannot be used."""
-        return Pipeline.open(Options(base, PathOptions(disparity=self.disparity)))
+    Raises:
+        InputError: a file that is neither, or an option that cannot be used.
+    """
+    reporter, base = uploads.reporter, uploads.first
+    begin: Callable[[ViewerServer], object]
+    if is_scene(target):
+        if base.depth is not None:
+            raise InputError(f"--depth {base.depth}: {target.name} is a scene already: leave the option out")
+        with reporter.stage("load"):
+            scene = Scene.load(target, **lens)
+            begin = functools.partial(ViewerServer.show, scene=with_downloads(page_of(scene, target), scene))
+    else:
+        pipeline = uploads.open(base)
+        with reporter.stage("load"):
+            photo = load_photo(target, keep_frame=uploads.keep_frame, **lens)
+            if base.depth is not None:
+                pipeline.base.load(photo)  # what is wrong with a depth map is known before a page opens
+
+        def complete_first(tell: Tell) -> PageScene:
+            return complete_for_page(photo, target.name, pipeline, Teller(reporter, tell))
+
+        begin = functools.partial(ViewerServer.work, job=complete_first)
+    with asked_to_stop(alone=True) as stopped:
+        secret = secrets.token_urlsafe(16) if token else ""
+        talk = {"log": reporter.detail, "bases": uploads.bases, "token": secret}
+        server = ViewerServer(page_files(), uploads.complete, host=host, port=port, **talk)  # type: ignore[arg-type]
+        try:
+            server.start()
+            begin(server)
+            announce(server, target.name, reporter, browser=browser)
+            while not stopped():
+                time.sleep(0.05)
+        finally:
+            ended = server.close()
+    return ended
 
 
 def is_scene(path: Path) -> bool:
@@ -66,55 +104,6 @@ def is_scene(path: Path) -> bool:
         raise InputError(f"{path}: {path.suffix} files are written, not read: give the scene.ply that it was made of")
     with open(path, "rb") as file:
         return path.suffix.lower() == ".ply" or file.read(3) == b"ply"
-
-
-def view(target: Path, options: ViewOptions, reporter: Reporter) -> bool:
-    """Show a scene or a photo until somebody stops it; False where work is left over that cannot be interrupted.
-
-    InputError for a file that is neither, or an option that cannot be used.
-    """
-    uploads = Uploads(options, reporter)
-    begin = _first(target, options, uploads, reporter)
-    with asked_to_stop(alone=True) as stopped:
-        where = {"host": options.host, "port": options.port}
-        token = secrets.token_urlsafe(16) if options.token else ""
-        talk = {"log": reporter.detail, "bases": uploads.bases, "token": token}
-        server = ViewerServer(page_files(), uploads.complete, **where, **talk)  # type: ignore[arg-type]
-        try:
-            server.start()
-            begin(server)
-            announce(server, target.name, reporter, browser=options.browser)
-            while not stopped():
-                time.sleep(0.05)
-        finally:
-            ended = server.close()
-    return ended
-
-
-def _first(
-    target: Path, options: ViewOptions, uploads: Uploads, reporter: Reporter
-) -> Callable[[ViewerServer], object]:
-    """What the server begins with: a scene that it shows, or a photo that it works on."""
-    depth = options.base.depth
-    if is_scene(target):
-        if depth is not None:
-            raise InputError(f"--depth {depth}: {target.name} is a scene already: leave the option out")
-        with reporter.stage("load"):
-            scene = Scene.load(target, focal_px=options.focal_px, fov=options.fov)
-            page = with_downloads(page_of(scene, target), scene)
-        return lambda server: server.show(page)
-    pipeline = options.open(options.base)
-    if depth is None:
-        uploads.pipeline = pipeline  # it holds the network
-    with reporter.stage("load"):
-        photo = load_photo(target, focal_px=options.focal_px, fov=options.fov, keep_frame=options.keep_frame)
-        if depth is not None:
-            pipeline.base.load(photo)  # what is wrong with a depth map is known before a page opens
-
-    def complete_first(tell: Tell) -> PageScene:
-        return complete_for_page(photo, target.name, pipeline, Teller(reporter, tell))
-
-    return lambda server: server.work(complete_first)
 
 
 def complete_for_page(photo: Photo, name: str, pipeline: Pipeline, teller: Teller) -> PageScene:
@@ -132,27 +121,34 @@ def complete_for_page(photo: Photo, name: str, pipeline: Pipeline, teller: Telle
 def with_downloads(page: PageScene, scene: Scene) -> PageScene:
     """The page's scene, and the files that it can be saved as."""
 
-    def made(suffix: str) -> bytes:
-        with tempfile.TemporaryDirectory(prefix="spackle-view-") as folder:
-            file = Path(folder) / f"scene{suffix}"
-            scene.export(file)
-            return file.read_bytes()
+    def encoded(suffix: str) -> bytes:
+        name = Path(f"scene{suffix}")
+        return encoder_of(name)(SceneFile(name, scene.gaussians, scene.camera, len(scene.base), scene.disparity))
 
-    return dataclasses.replace(page, downloads={suffix: functools.partial(made, suffix) for suffix in DOWNLOADS})
+    return dataclasses.replace(page, downloads={suffix: functools.partial(encoded, suffix) for suffix in DOWNLOADS})
 
 
 class Uploads:
     """Completes photos that the page sends; the first photo's depth, calibration and lens do not apply to them."""
 
-    def __init__(self, options: ViewOptions, reporter: Reporter) -> None:
+    def __init__(self, base: BaseSettings, disparity: float | None, keep_frame: bool, reporter: Reporter) -> None:
         """InputError: an option that cannot be used."""
-        base = options.base
+        self.first, self.keep_frame, self.reporter = base, keep_frame, reporter
         name = AUTO if base.name == "rgbd" else base.name
-        self._options, self._reporter = options, reporter
         self._base = dataclasses.replace(base, name=name, depth=None, calib=None)
         self._base.check()
-        PathOptions(disparity=options.disparity).check()
-        self.pipeline: Pipeline | None = None
+        self._path = PathOptions(disparity=disparity)
+        self._path.check()
+        self._opened: tuple[BaseSettings, Pipeline] | None = None  # the command's own base, which holds its network
+
+    def open(self, settings: BaseSettings) -> Pipeline:
+        """The way of photos through a base; InputError for an option that cannot be used."""
+        if self._opened is not None and self._opened[0] == settings:
+            return self._opened[1]
+        pipeline = Pipeline.open(Options(settings, self._path))
+        if settings == self._base:
+            self._opened = settings, pipeline
+        return pipeline
 
     @property
     def bases(self) -> list[str]:
@@ -167,34 +163,24 @@ class Uploads:
 
         InputError for a choice that was not offered.
         """
-        teller = Teller(self._reporter, tell, path, name)
-        settings = self._chosen(base, depth)
-        if settings is not self._base:
-            pipeline = self._options.open(settings)
-        else:
-            pipeline = self.pipeline = self.pipeline or self._options.open(settings)
+        teller = Teller(self.reporter, tell, path, name)
+        settings = self._base
+        if depth is not None:
+            settings = dataclasses.replace(settings, name=AUTO, depth=depth, checkpoint=None)
+        elif base not in ("", settings.name):
+            check_name("base", base, self.bases)
+            settings = dataclasses.replace(settings, name=base, checkpoint=None)
+        pipeline = self.open(settings)
         if disparity:
-            chosen = PathOptions(disparity=_number(disparity))
+            try:
+                chosen = PathOptions(disparity=float(disparity))
+            except ValueError as error:
+                raise InputError(f"disparity {disparity}: give a number from 0 to 2") from error
             chosen.check()
             pipeline = dataclasses.replace(pipeline, options=dataclasses.replace(pipeline.options, path=chosen))
         with teller.stage("load"):
-            photo = load_photo(path, keep_frame=self._options.keep_frame)
+            photo = load_photo(path, keep_frame=self.keep_frame)
         return complete_for_page(photo, name, pipeline, teller)
-
-    def _chosen(self, base: str, depth: Path | None) -> BaseSettings:
-        if depth is not None:
-            return dataclasses.replace(self._base, name=AUTO, depth=depth, checkpoint=None)
-        if base in ("", self._base.name):
-            return self._base
-        check_name("base", base, self.bases)
-        return dataclasses.replace(self._base, name=base, checkpoint=None)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"disparity {text}: give a number from 0 to 2") from error
 
 
 class Teller(Reporter):
@@ -249,9 +235,7 @@ def address_in_network(host: str) -> str:
     """The address by which others reach this machine, listening at `host`."""
     if host not in ("0.0.0.0", "::", ""):
         return host
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect(ELSEWHERE)
-            return str(probe.getsockname()[0])
-    except OSError:  # no network
-        return socket.gethostname()
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(ELSEWHERE)
+        return str(probe.getsockname()[0])
+    return socket.gethostname()  # no network

@@ -31,16 +31,12 @@ DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle pre
 class Limits:
     """Times are in seconds. The server is for a few people: what is refused is far above what a page asks for."""
 
-    request: float = 15  # from one answer to the end of the next request's headers
-    pause: float = 10  # between two pieces of an upload
+    pause: float = 10  # between two pieces of a request, and between two requests of a connection
     upload: float = 300  # all of an upload
-    rate: float = 20_000  # bytes a second of an upload, at least: one that trickles must not keep the place
     send: float = 20  # for a piece of an answer: a client that never reads must not keep a thread
     heartbeat: float = 10  # of a silent event stream; it is how a listener that has gone shows
     stop: float = 0.5  # for work to end by itself once the server is stopped
-    connections: int = 64  # at a time, a thread each; one without a request makes room
-    evict: float = 0.5  # for it to go
-    listeners: int = 16  # of all event streams
+    connections: int = 64  # at a time, a thread each
     upload_bytes: int = 100_000_000
     kept_scenes: int = 2  # what is shown, and what a page may still be loading
     kept_jobs: int = 4
@@ -201,7 +197,7 @@ def split_depth(path: Path, promise: Declared) -> Path | None:
     return depth
 
 
-def receive(stream: BufferedIOBase, path: Path, promise: Declared, limits: Limits = DEFAULT) -> None:
+def receive(stream: BufferedIOBase, path: Path, promise: Declared, limits: Limits) -> None:
     """Write the promised bytes to a file.
 
     Raises:
@@ -217,7 +213,7 @@ def receive(stream: BufferedIOBase, path: Path, promise: Declared, limits: Limit
                     raise RefusedError(HTTPStatus.BAD_REQUEST, f"{promise.name}: only a part of it has come")
                 left -= len(piece)
                 file.write(piece)
-                if time.monotonic() - start > limits.pause + (promise.length - left) / limits.rate:
+                if time.monotonic() - start > limits.upload:
                     raise TimeoutError("the client is too slow")
     except (TimeoutError, ConnectionError):
         raise

@@ -1,0 +1,190 @@
+"""`spackle render` and `spackle export`: a saved scene as a video, and in the formats that other viewers read."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import mimetypes
+import os
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from rich.filesize import decimal
+from torch import Tensor
+
+from spackle.bases.protocol import USUAL_DISPARITY
+from spackle.camera import Camera
+from spackle.camera_path import PathError
+from spackle.errors import InputError
+from spackle.files import check_writable, write_whole
+from spackle.folders import results_folder
+from spackle.formats import save_png, save_video
+from spackle.formats.ply import PlyFile
+from spackle.formats.scene_files import Encoder, SceneFile, encoder_of
+from spackle.formats.spz import LARGEST, spz_grid
+from spackle.formats.video import FORMATS
+from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.progress import Reporter
+from spackle.render import get_renderer
+from spackle.residual import hole_area_ratio
+from spackle.scene import DEFAULT_SIZE, Scene
+from spackle.viewer import PageScene, single_html
+from spackle.views import FrameMaker, PathOptions, cover, video_problem
+
+TOLERATED = 0.01  # holes of a frame that nobody need be told of
+PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}
+
+
+def render_scene(
+    scene: Path, output: Path, path: PathOptions, focal_px: float | None, device: str, reporter: Reporter
+) -> None:
+    """Draw a PLY along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
+
+    `focal_px`, in pixels of the video, replaces the stored lens. InputError for a file or option that cannot be used.
+    """
+    single = output.suffix.lower() in FORMATS
+    if single:
+        path = dataclasses.replace(path, video=path.video.for_file(output))
+    elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
+        raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
+    path.check()
+    if path.cameras is not None and focal_px is not None:
+        raise InputError(f"--focal-px: the views of --cameras {path.cameras} have lenses of their own: leave it out")
+    renderer = get_renderer(device)
+    with reporter.stage("load"):
+        given, keyframes = path.load()
+        loaded = PlyFile(scene).scene()
+        gaussians, stored, reach = loaded.gaussians, loaded.camera, loaded.disparity
+        if given:
+            cameras = given
+        else:
+            camera = _photo_camera(stored, path.video.size, focal_px)
+            try:
+                cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
+            except PathError as error:
+                raise InputError(f"{path.path}: {error}") from error
+            except ValueError as error:
+                raise InputError(f"{scene}: no camera path: {error}: give views with --cameras") from error
+            if stored is None and focal_px is None:
+                reporter.log(
+                    f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
+                    f"{camera.width}×{camera.height} (--focal-px, --size)"
+                )
+        # A path has the video's size already.
+        maker = FrameMaker.of(dataclasses.replace(path.video, size=None), gaussians, cameras, scene)
+    target = output if single else output / f"{scene.stem}{path.video.suffix}"
+    names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
+    problem = video_problem(cameras)
+    if problem and not names:
+        hint = "give a folder with -o for pictures only" if given else "give --size"
+        raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
+    holes: list[float] = []
+    with results_folder(target.parent, [*names, target.name]), reporter.stage("video") as step:
+
+        def frames() -> Iterator[Tensor]:
+            """The frames of the video, each also saved as a picture, where these are wanted."""
+            for index, camera in enumerate(cameras):
+                with torch.no_grad():
+                    views = [renderer.render([gaussians], eye) for eye in maker.eyes(camera)]
+                    frame = maker.frame(views)
+                holes.append(max(hole_area_ratio(view.alpha) for view in views))
+                if names:
+                    save_png(frame, target.parent / names[index])
+                yield frame
+                step(index + 1, len(cameras))
+
+        if problem:
+            for _ in frames():
+                pass
+        else:
+            save_video(frames(), target, path.video.rate, path.video.loop)
+    seconds = reporter.seconds["video"]
+    result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
+    if max(holes) > TOLERATED:
+        mean, far = (
+            sum(holes) / len(holes),
+            "" if reach is None else f": the scene was completed for --disparity {reach:g}",
+        )
+        reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average{far}")
+    if problem:
+        reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
+        reporter.result({"folder": output, **result})
+    else:
+        count = f"{len(gaussians):,} Gaussians, {len(cameras)} frames"
+        reporter.log(f"{scene.name}: {count} in {seconds:.1f} s -> {target}")
+        reporter.result({"file": target, **result})
+
+
+def _photo_camera(stored: Camera | None, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
+    """The stored camera, changed as the options say; else a lens of 30 mm."""
+    width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
+    if focal_px is not None:
+        if not (math.isfinite(focal_px) and focal_px > 0):
+            raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
+        return Camera.from_focal(focal_px, width, height)
+    if stored is not None:
+        return cover(stored, width, height)
+    return Camera.from_focal(film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)
+
+
+def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
+    """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
+
+    Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
+    """
+    encoders = [encoder_of(output, PAGE) for output in outputs]
+    with contextlib.ExitStack() as folders:
+        for output in outputs:
+            folders.enter_context(results_folder(output.parent, [output.name]))
+        targets = [check_writable(output) for output in outputs]
+        for output, target in zip(outputs, targets, strict=True):
+            if targets.count(target) > 1:
+                raise InputError(f"{output}: named twice: give each output once")
+        if os.path.realpath(scene) in map(str, targets):
+            raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
+        file = PlyFile(scene)
+        loaded = file.scene()
+        if rest := sum(name.startswith("f_rest_") for element in file.elements for name, _ in element.fields):
+            reporter.log(
+                f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
+            )
+        for output, encoder in zip(outputs, encoders, strict=True):
+            start = time.perf_counter()
+            try:
+                write_whole(output, encoder(loaded))
+            except InputError as error:
+                raise error if str(output) in str(error) else InputError(f"{output}: {error}") from error
+            _report_file(loaded, output, time.perf_counter() - start, reporter)
+
+
+def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Reporter) -> None:
+    """One line about a file, and one about what its format could not hold."""
+    before, size, count = os.path.getsize(scene.path), os.path.getsize(output), len(scene.gaussians)
+    factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"
+    if 0.95 < size / before < 1.05:
+        factor = "as large as"
+    reporter.log(f"{output}: {count:,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
+    bits, far = spz_grid(scene.gaussians) if output.name.lower().endswith(".spz") else (0, 0)
+    if far:
+        reach = f"{LARGEST / 2**bits:,.0f} m"
+        reporter.log(f"{output}: {far:,} Gaussians beyond {reach} were drawn nearer, as the photo's eye sees them")
+    seconds = round(seconds, 3)
+    reporter.result({"file": output, "gaussians": count, "bytes": size, "seconds": seconds, "drawn_nearer": far})
+
+
+def page_of(scene: Scene, path: Path) -> PageScene:
+    """The scene of a file for the page; InputError, naming the file, if it cannot be seen.
+
+    People call a scene as its folder where every scene's file has the same name.
+    """
+    place = path.absolute()
+    name = place.parent.name if place.name in ("scene.ply", "base.ply") and place.parent.name else place.stem
+    try:
+        return scene.page(name)
+    except InputError as error:
+        raise InputError(f"{path}: {str(error).removeprefix(f'{name}: ')}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be looked at: {error}: give the lens with --fov") from error

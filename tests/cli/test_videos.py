@@ -1,0 +1,166 @@
+"""`spackle render`, and the videos of both commands: paths, stereo, sizes, formats and repetitions."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from command import SHORT, Run, decode, names_in, report_of, run
+from photos import HEIGHT, WIDTH, box, camera_file, damaged_scene
+from PIL import Image
+from scenes import box_before_wall, psnr
+from torch import Tensor
+
+import spackle
+from spackle.camera import Camera
+from spackle.camera_path import TRAJECTORIES, TrajectoryKind
+from spackle.render import CpuRenderer
+from spackle.stereo import Stereo
+from spackle.views import PathOptions, VideoOptions, cover
+
+CPU = CpuRenderer()
+
+
+def frames_of(video: Path) -> list[Tensor]:
+    """[H, W, 3] in 0..1 of any kind of video that FFmpeg reads."""
+    with av.open(str(video)) as container:
+        return [torch.from_numpy(f.to_ndarray(format="rgb24")).float() / 255 for f in container.decode(video=0)]
+
+
+def rendered(scene: Path, output: Path, *options: object) -> Run:
+    """`spackle render` that has to succeed."""
+    result = run("render", scene, "-o", output, *options)
+    assert result.code == 0, result.err
+    return result
+
+
+def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Path, Run]) -> None:
+    assert len(rendered(scene, tmp_path / "new" / "a.mp4", *SHORT).lines) == 1
+    rendered(scene, tmp_path / "folder", *SHORT, "--format", "gif")
+    assert names_in(tmp_path / "folder") == {"scene.gif"}
+    ours, predicted = decode(tmp_path / "new" / "a.mp4"), decode(plain[0] / "video.mp4")
+    assert len(ours) == len(predicted) == 3
+    assert (ours[0].width, ours[0].height, ours[0].format.name) == (WIDTH, HEIGHT, "yuv420p")
+    first = [frames[0].to_ndarray(format="rgb24").astype(float) for frames in (ours, predicted)]
+    assert np.abs(first[0] - first[1]).mean() < 1  # the path starts at the photo's place
+    far = rendered(scene, tmp_path / "far.mp4", "--trajectory", "swipe", "--disparity", 1.5, "--json", *SHORT)
+    assert "the scene was completed for --disparity 0.3" in far.err
+    assert json.loads(far.out)["open"] > 0.01
+
+
+@pytest.mark.parametrize("size", [(128, 96), (128, 64), (31, 31)])
+def test_render_at_another_size_squeezes_nothing(tmp_path: Path, scene: Path, size: tuple[int, int]) -> None:
+    width, height = size
+    rendered(scene, tmp_path / "a.mp4", "--size", f"{width}x{height}", "--disparity", 0, "--frames", 1)
+    (frame,) = frames_of(tmp_path / "a.mp4")
+    assert frame.shape == (height + height % 2, width + width % 2, 3)
+    red = frame[:height, :width, 0] > frame[:height, :width, 2]
+    scale = max(width / WIDTH, height / HEIGHT)
+    for axis in (0, 1):
+        assert int(red.any(dim=axis).sum()) == pytest.approx(scale * box().any(axis=axis).sum(), abs=5)
+
+
+def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> None:
+    bare = damaged_scene(scene, tmp_path / "bare.ply", lambda head: re.sub("comment.*\n", "", head))
+    assert "no camera stored" in rendered(bare, tmp_path, "--size", "64x48", *SHORT).lines[0]
+    assert len(rendered(bare, tmp_path, "--size", "64x48", "--focal-px", 55, *SHORT).lines) == 1
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_a_repeated_video_shows_its_first_view_once(kind: TrajectoryKind) -> None:
+    scene = box_before_wall()
+    for options, looped in ((VideoOptions(), 0), (VideoOptions(loop=2), 1), (VideoOptions(format="gif"), 1)):
+        path = PathOptions(kind, frames=8, video=options).fly(scene.base(), scene.camera, None)
+        assert len(path) == 8
+        assert (float((path[-1].position - path[0].position).norm()) > 1e-5) == bool(looped or kind == "swipe")
+
+
+def test_given_views_become_pictures_and_a_stereo_video(tmp_path: Path, scene: Path) -> None:
+    views = camera_file(tmp_path / "views.json", rights=[0.0, 0.3], sizes=[(64, 48), (32, 24)])
+    assert "no video" in rendered(scene, tmp_path / "out", "--cameras", views).lines[0]
+    assert names_in(tmp_path / "out") == {"0000.png", "0001.png"}
+    camera_file(views, rights=[0.1, -0.2])
+    rendered(scene, tmp_path / "out", "--cameras", views, "--stereo", "sbs", "--ipd", 0.2, "--convergence", 3)
+    assert names_in(tmp_path / "out") == {"scene.mp4", "0000.png", "0001.png"}
+    gaussians = spackle.load_ply(scene)
+    for index, frame in enumerate(frames_of(tmp_path / "out" / "scene.mp4")):
+        seen = []
+        for side in (-1, 1):
+            pose, K = torch.eye(4), torch.tensor([[55.0, 0, 32 + side * 55 * 0.1 / 3], [0, 55, 24], [0, 0, 1]])
+            pose[0, 3] = -([0.1, -0.2][index] + side * 0.1)
+            seen.append(CPU.render(gaussians, Camera(K, pose, 64, 48)).rgb)
+        both = torch.cat(seen, dim=1)
+        with Image.open(tmp_path / "out" / f"{index:04d}.png") as image:
+            picture = torch.from_numpy(np.array(image)).float() / 255
+        torch.testing.assert_close(picture, both, atol=0.003, rtol=0)
+        assert psnr(frame, both) > 28
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "size"),
+    [
+        ("a.gif", (), (64, 48)),
+        ("a.webp", ("--stereo", "anaglyph"), (64, 48)),
+        ("a.webm", ("--stereo", "sbs-half", "--size", "80x40"), (80, 40)),
+        ("a.mp4", ("--show", "depth"), (64, 48)),
+        ("a.mp4", ("--show", "depth", "--stereo", "ou-half", "--loop", 2), (64, 48)),
+    ],
+)
+def test_render_makes_every_kind(
+    tmp_path: Path, scene: Path, name: str, options: tuple[object, ...], size: tuple[int, int]
+) -> None:
+    rendered(scene, tmp_path / name, "--frames", 3, "--fps", 10, *options)
+    if name.endswith(("gif", "webp")):
+        with Image.open(tmp_path / name) as image:
+            assert (image.size, image.n_frames, image.info["loop"]) == (size, 3, 0)  # type: ignore[attr-defined]
+    else:
+        frames = frames_of(tmp_path / name)
+        assert len(frames) == (6 if "--loop" in options else 3)
+        assert frames[0].shape == (size[1], size[0], 3)
+
+
+def test_predict_completes_what_both_eyes_see(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    # A path that stays where it is: all holes are those that the eyes see.
+    common = ("predict", pair[0], "--depth", pair[1], "--frames", 3, "--disparity", 0)
+    assert run(*common, "-o", tmp_path / "one").code == 0
+    wide = ("--stereo", "sbs", "--ipd", 0.8, "--format", "webm", "--fps", 12, "--size", "32x24")
+    assert run(*common, "-o", tmp_path / "two", *wide).code == 0
+    one, two = (report_of(tmp_path / name / "photo") for name in ("one", "two"))
+    assert (one["video"]["file"], one["video"]["stereo"]) == ("video.mp4", None)
+    expected = {"file": "video.webm", "frames": 3, "fps": 12, "plays": 1, "width": 64, "height": 24, "show": "color"}
+    stereo = {"layout": "sbs", "ipd": 0.8, "convergence": pytest.approx(2.0, rel=0.02)}
+    assert two["video"] == {**expected, "stereo": stereo}
+    before = [[view["before"] for view in report["hole_area_ratio"]] for report in (one, two)]
+    assert before[0] == before[1]  # measured at the same views
+    folder = tmp_path / "two" / "photo"
+    frames = frames_of(folder / "video.webm")
+    assert (len(frames), frames[0].shape) == (3, (24, 64, 3))
+    base, merged = (spackle.load_ply(folder / name) for name in ("base.ply", "scene.ply"))
+    camera = spackle.Scene.load(folder / "scene.ply").camera
+    for eye, picture in zip(Stereo("sbs", 0.8, 2.01).eyes(camera), frames[0].split(32, dim=1), strict=True):
+        holes, rest = (float((CPU.render(part, eye).alpha < 0.95).float().mean()) for part in (base, merged))
+        assert rest < 0.01 < 0.1 < holes
+        assert psnr(CPU.render(merged, cover(eye, 32, 24)).rgb, picture) > 25
+
+
+def test_predict_follows_a_path_and_measures_its_keyframes(tmp_path: Path, pair: tuple[Path, Path]) -> None:
+    path, out = tmp_path / "p.json", tmp_path / "out"
+    places = ((0, -0.5), (0.2, 0.0), (0.4, 0.5))
+    keys = [{"time": time, "eye": [right, 0, 0], "target": [0, 0, 4]} for time, right in places]
+    path.write_text(json.dumps({"keyframes": keys}))
+    options = ("--path", path, "--fps", 10, "--format", "gif")
+    assert run("predict", pair[0], "--depth", pair[1], "-o", out, *options).code == 0
+    report = report_of(out / "photo")
+    assert (report["views"], report["disparity"], report["video"]["file"]) == ("p.json", None, "video.gif")
+    assert [row["view"] for row in report["hole_area_ratio"]] == ["keyframe 0", "keyframe 1", "keyframe 2"]
+    assert all(row["after"] < 0.01 for row in report["hole_area_ratio"])
+    assert report["hole_area_ratio"][0]["before"] > 0.01
+    for more, count in (((), 5), (("--frames", 4), 4)):  # as many as the keyframes take, or as are asked for
+        rendered(out / "photo" / "scene.ply", tmp_path / "a.gif", *options[:4], *more)
+        with Image.open(tmp_path / "a.gif") as image:
+            assert image.n_frames == count  # type: ignore[attr-defined]
