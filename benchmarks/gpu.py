@@ -35,9 +35,9 @@ from spackle.files import write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.machine import commit, hardware, versions
-from spackle.render import CpuRenderer, GsplatRenderer
+from spackle.render import CpuRenderer
 from spackle.render.cpu import project, wanted_tiles
-from spackle.render.cuda import Material, load_gsplat
+from spackle.render.cuda import GsplatRenderer, Material, load_gsplat
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
 from spackle.residual import hole_area_ratio

@@ -27,8 +27,7 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
     """RGB [H, W, 3] sRGB of Gaussians, with `eps2d` 0; depth and alpha are drawn, too, as ours are."""
     tensors, view = tuple(t.numpy() for t in scene.tensors), KernelCamera.of(camera, 0.0)
     splats, boxes = np.empty((len(scene), 6), np.float32), np.zeros((len(scene), 4), np.int32)
-    lens = (view.lens, view.pose, (view.width, view.height))
-    run_chunks(lambda a, b: naive_project(a, b, tensors, lens, splats, boxes), len(scene), PROJECT_GRAIN)
+    run_chunks(lambda a, b: naive_project(a, b, tensors, view, splats, boxes), len(scene), PROJECT_GRAIN)
     lap("project")
     order = np.argsort(splats[:, 2], kind="stable")
     lap("sort")
@@ -43,16 +42,16 @@ def naive_render(scene: Gaussians, camera: Camera, lap: Lap = lambda name: None)
 
 
 @numba.njit(nogil=True, cache=True)
-def naive_project(first: int, last: int, scene: Arrays, view: Any, splats: Array, boxes: Array) -> None:
+def naive_project(first: int, last: int, scene: Arrays, view: KernelCamera, splats: Array, boxes: Array) -> None:
     """Centre, depth and inverse covariance [N, 6], and boxes of pixels [N, 4], of Gaussians first..last."""
     means, quats, scales, opacities, _ = scene
-    lens, pose, (width, height) = view
+    lens, pose, width, height, _ = view
     for i in range(first, last):
         x, y, z = pose[:, 0] * means[i, 0] + pose[:, 1] * means[i, 1] + pose[:, 2] * means[i, 2] + pose[:, 3]
         splats[i, 2] = z
         if z < NEAR_PLANE or opacities[i] < ALPHA_MIN:
             continue
-        xx, xy, yy, det = covariance(x / z, y / z, 1 / z, quats[i], scales[i], lens, pose, 0.0)
+        xx, xy, yy, det = covariance(x / z, y / z, 1 / z, quats[i], scales[i], view)
         if det <= 0:
             continue
         u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]

@@ -44,8 +44,7 @@ from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.machine import commit, hardware, load_average, versions
 from spackle.render import CpuRenderer, Renderer, get_renderer
-from spackle.render.binning import list_tiles, sort_by_depth
-from spackle.render.cpu import blend, project, wanted_tiles
+from spackle.render.cpu import blend, list_tiles, project, sort_by_depth, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
 from spackle.residual.network import load_residual

@@ -20,21 +20,14 @@ from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, cuda, get_renderer, render_batch
-from spackle.render.cuda import (
-    VERSIONS,
-    GsplatRenderer,
-    Material,
-    SetStore,
-    check_version,
-    load_gsplat,
-    upper_covariances,
-)
+from spackle.render.cuda import VERSIONS, GsplatRenderer, SetStore, check_version, load_gsplat, upper_covariances
 from spackle.render.protocol import ALPHA_MAX, Rendering
 
 CPU = CpuRenderer()
 SCENE = box_before_wall(width=45, height=35, focal=40)
 BASE = SCENE.base()
 SIDE = shifted(SCENE.camera, 0.4)
+TILES = torch.tensor([[True, False, False], [False, False, True], [False, False, False]])
 FUNCTIONS = ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels")
 
 
@@ -61,20 +54,33 @@ def test_it_draws_what_the_processors_renderer_draws(gpu: GsplatRenderer) -> Non
     for camera in (SCENE.camera, SIDE):
         for eps2d in (0.0, 0.3):
             found = gpu.render(BASE, camera, eps2d=eps2d)
-            assert found.rgb.dtype == torch.float32
-            assert found.rgb.device == BASE.means.device
+            assert (found.rgb.dtype, found.rgb.device) == (torch.float32, BASE.means.device)
             agree(found, CPU.render(BASE, camera, eps2d=eps2d))
+    ones = torch.ones(1, 3)
+    opaque = Gaussians(torch.tensor([[0.0, 0.0, 2.0]]), torch.eye(4)[:1], ones, torch.ones(1), ones)
+    assert float(gpu.render(opaque, SCENE.camera).alpha.max()) == pytest.approx(ALPHA_MAX, abs=1e-5)
 
 
-def test_sets_are_drawn_as_one_none_is_black_and_what_is_not_finite_is_left_out(gpu: GsplatRenderer) -> None:
-    whole = gpu.render(BASE, SIDE)
-    assert same_bits(gpu.render([BASE.select(slice(0, 100)), BASE.select(slice(100, None))], SIDE), whole)
-    nothing = gpu.render([], SIDE)
-    assert nothing.rgb.shape == (35, 45, 3)
-    assert not any(bool(image.any()) for image in nothing.tensors)
+def test_sets_are_drawn_as_one_without_what_is_not_finite(gpu: GsplatRenderer) -> None:
+    whole, empty = gpu.render(BASE, SIDE), Gaussians.empty()
+    assert same_bits(gpu.render([BASE.select(slice(0, 100)), empty, BASE.select(slice(100, None))], SIDE), whole)
     broken = dataclasses.replace(BASE, means=BASE.means.clone())
     broken.means[7, 1] = torch.nan
     assert same_bits(gpu.render(broken, SIDE), gpu.render(BASE.select(torch.arange(len(BASE)) != 7), SIDE))
+
+
+def test_nothing_is_drawn_without_gsplat_which_dies_of_it(gpu: GsplatRenderer) -> None:
+    empty = Gaussians.empty()
+    for options in ({}, {"tiles": TILES}):
+        for sets in ([], empty, [empty, empty]):
+            view = gpu.render(sets, SIDE, **options)
+            assert view.rgb.shape == (35, 45, 3)
+            assert not any(bool(image.any()) for image in view.tensors)
+    with pytest.raises(AssertionError, match="a signal ends the process"):
+        gsplat_stand_in.fully_fused_projection(
+            torch.zeros(0, 3), torch.zeros(0, 6), None, None, torch.eye(4)[None], torch.eye(3)[None], 4, 4,
+            opacities=torch.zeros(0),
+        )  # fmt: skip
 
 
 def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> None:
@@ -83,65 +89,34 @@ def test_gradients_are_those_of_the_processors_renderer(gpu: GsplatRenderer) -> 
     for renderer in (gpu, CPU):
         asking = Gaussians(*(t.clone().requires_grad_() for t in BASE.tensors))
         view = renderer.render(asking, SIDE)
-        ((view.rgb.mean(-1) + 0.1 * view.depth + view.alpha) * weights).sum().backward()
-        found.append([t.grad for t in asking.tensors])
+        loss = ((view.rgb.mean(-1) + 0.1 * view.depth + view.alpha) * weights).sum()
+        found.append(torch.autograd.grad(loss, asking.tensors))
     for one, other in zip(*found, strict=True):
-        assert one is not None
-        assert other is not None
         assert float((one - other).norm() / other.norm()) < 0.02
 
 
 def test_wanted_tiles_are_drawn_and_the_others_stay_bit_for_bit(gpu: GsplatRenderer) -> None:
     whole, under = gpu.render(BASE, SIDE), CPU.render(BASE, SCENE.camera)
-    tiles = torch.zeros(3, 3, dtype=torch.bool)
-    tiles[1, 2] = tiles[0, 0] = True
-    mask = tiles.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
+    mask = TILES.repeat_interleave(16, 0).repeat_interleave(16, 1)[:35, :45]
     black = Rendering(*(torch.zeros_like(image) for image in whole.tensors))
     for onto in (under, None):
-        found = gpu.render(BASE, SIDE, tiles=tiles, onto=onto)
+        found = gpu.render(BASE, SIDE, tiles=TILES, onto=onto)
         for image, drawn, kept in zip(found.tensors, whole.tensors, (onto or black).tensors, strict=True):
             assert torch.equal(image[~mask], kept[~mask])
             torch.testing.assert_close(image[mask], drawn[mask], rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="expected"):
-        gpu.render(BASE, SIDE, tiles=tiles[:2])
-
-
-def test_nothing_is_drawn_without_gsplat_which_dies_of_it(gpu: GsplatRenderer) -> None:
-    empty = Gaussians.empty()
-    assert same_bits(gpu.render([empty, BASE, empty], SIDE), gpu.render(BASE, SIDE))
-    tiles = torch.zeros(3, 3, dtype=torch.bool)
-    tiles[1, 1] = True
-    for options in ({}, {"tiles": tiles}):
-        for sets in ([], empty, [empty, empty]):
-            assert not any(bool(image.any()) for image in gpu.render(sets, SIDE, **options).tensors)
-    with pytest.raises(AssertionError, match="a signal ends the process"):
-        gsplat_stand_in.fully_fused_projection(
-            torch.zeros(0, 3), torch.zeros(0, 6), None, None, torch.eye(4)[None], torch.eye(3)[None], 4, 4,
-            opacities=torch.zeros(0),
-        )  # fmt: skip
-
-
-def test_the_largest_alpha_is_the_processors(gpu: GsplatRenderer) -> None:
-    opaque = Gaussians(
-        torch.tensor([[0.0, 0.0, 2.0]]), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1), torch.ones(1, 3)
-    )
-    assert float(gpu.render(opaque, SCENE.camera).alpha.max()) == pytest.approx(ALPHA_MAX, abs=1e-5)
+        gpu.render(BASE, SIDE, tiles=TILES[:2])
 
 
 def test_views_drawn_together_are_those_drawn_alone_bit_for_bit(gpu: GsplatRenderer) -> None:
-    tiles = torch.zeros(3, 3, dtype=torch.bool)
-    tiles[1, 2] = True
     scenes = [[BASE, BASE.select(slice(0, 50))], [], [Gaussians.empty(), BASE.select(slice(40, None))]]
-    cameras, chosen = [SIDE, SIDE, SCENE.camera], [None, tiles, tiles]
+    cameras, tiles = [SIDE, SIDE, SCENE.camera], [None, TILES, TILES]
     onto = [None, None, CPU.render(BASE, SCENE.camera)]
-    together = gpu.render_batch(scenes, cameras, tiles=chosen, onto=onto)
-    alone = [
-        gpu.render(sets, camera, tiles=tile, onto=under)
-        for sets, camera, tile, under in zip(scenes, cameras, chosen, onto, strict=True)
-    ]
+    together = render_batch(gpu, scenes, cameras, tiles=tiles, onto=onto)
+    views = list(zip(scenes, cameras, tiles, onto, strict=True))
+    alone = [gpu.render(sets, camera, tiles=tile, onto=under) for sets, camera, tile, under in views]
     assert all(map(same_bits, together, alone))
-    one_by_one = render_batch(CPU, scenes, cameras, tiles=chosen, onto=onto)
-    for one, other in zip(together, one_by_one, strict=True):
+    for one, other in zip(together, render_batch(CPU, scenes, cameras, tiles=tiles, onto=onto), strict=True):
         agree(one, other)
     with pytest.raises(ValueError, match="one size"):
         gpu.render_batch([[BASE]] * 2, [SIDE, SIDE.resized(40, 40)])
@@ -189,17 +164,8 @@ def test_only_versions_that_build_and_draw_the_same_are_taken() -> None:
     assert wanted in (Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
 
 
-def test_a_scene_travels_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
-    of = Material.of
-
-    def counted(part: Gaussians, device: torch.device) -> Material:
-        made.append(len(part))
-        return of(part, device)
-
-    monkeypatch.setattr(Material, "of", staticmethod(counted))
+def test_a_scene_travels_once_while_nobody_changes_it() -> None:
     store = SetStore(torch.device("cpu"))
-
     material = store.material
     kept = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
     first = material(kept)
@@ -210,22 +176,13 @@ def test_a_scene_travels_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert material(kept) is not again
     torch.testing.assert_close(material(kept).colors, kept.colors)
     asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in BASE.tensors))
-    made.clear()
     assert material(asking) is not material(asking)  # it changes at every step of a training
-    assert len(made) == 2  # once a step, all the same
     with torch.inference_mode():
         passing = Gaussians(*(tensor.clone() for tensor in BASE.tensors))
         assert material(passing) is not material(passing)
     assert len(store._kept) == 1
     del kept
     assert len(store._kept) == 0
-
-
-def test_a_machine_without_a_gpu_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(InputError, match="--device cuda: PyTorch sees no NVIDIA GPU"):
-        get_renderer("cuda")
-    assert isinstance(get_renderer("auto"), CpuRenderer)
 
 
 class BrokenBuild:
@@ -237,46 +194,56 @@ class BrokenBuild:
             raise self.error
 
 
-def test_a_gsplat_that_cannot_be_used_is_told_in_a_line_and_auto_falls_back(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def modules(version: str, backend: object) -> dict[str, Any]:
+    """What importing gsplat gives."""
+    gsplat, inner, built = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
+    vars(built)["_C"], vars(inner)["_backend"] = backend, built
+    vars(gsplat).update(cuda=inner, __version__=version)
+    return {module.__name__: module for module in (gsplat, inner, built)}
+
+
+UNUSABLE: dict[str, dict[str, Any] | Exception] = {
+    r"needs gsplat: pip install 'spackle-nvs\[cuda\]'": {"gsplat": None},
+    "gsplat 1.6.0 does not build": modules("1.6.0", object()),
+    "no kernels here": modules("1.5.3", None),
+    "cannot be built here: Error building": RuntimeError("Error building extension 'gsplat_cuda': ninja\nmany lines"),
+    "cannot be built here: gsplat_cuda.so": ImportError("gsplat_cuda.so: undefined symbol: _ZN3c10"),
+    "cannot be built here: No module": ModuleNotFoundError("No module named 'jaxtyping'", name="jaxtyping"),
+}
+
+
+@pytest.mark.parametrize("says", UNUSABLE)
+def test_a_gsplat_that_cannot_be_used_is_a_line_and_auto_falls_back(
+    says: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    problem = UNUSABLE[says]
+    if isinstance(problem, Exception):
+        monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+        monkeypatch.setattr(sys, "meta_path", [BrokenBuild(problem), *sys.meta_path])
+    else:
+        for name, module in problem.items():
+            monkeypatch.setitem(sys.modules, name, module)
+    with pytest.raises(InputError, match=f"^--device cuda: .*{says}") as caught:
+        get_renderer("cuda")
+    assert "\n" not in str(caught.value)
+    assert isinstance(get_renderer("auto"), CpuRenderer)
+    assert str(caught.value) in caplog.text
 
-    def refused(says: str) -> None:
-        with pytest.raises(InputError, match=says) as caught:
-            get_renderer("cuda")
-        assert "\n" not in str(caught.value)
-        caplog.clear()
-        assert isinstance(get_renderer("auto"), CpuRenderer)
-        assert str(caught.value) in caplog.text
 
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    refused(r"spackle-nvs\[cuda\]")
-    gsplat, inner, backend = (ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend"))
-    backend._C, gsplat.cuda, inner._backend = None, inner, backend  # type: ignore[attr-defined]
-    gsplat.__version__ = "1.6.0"  # type: ignore[attr-defined]
-    for module in (gsplat, inner, backend):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    refused("gsplat 1.6.0")
-    gsplat.__version__ = "1.5.3"  # type: ignore[attr-defined]
-    refused("no kernels here")
-    backend._C = object()  # type: ignore[attr-defined]
+def test_auto_takes_a_gpu_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for name, module in modules("1.5.3", object()).items():
+        monkeypatch.setitem(sys.modules, name, module)
     assert load_gsplat(torch.device("cuda")).__name__ == "gsplat"
     assert isinstance(get_renderer("auto"), GsplatRenderer)
-    monkeypatch.delitem(sys.modules, "gsplat")
-    for error in (
-        RuntimeError("Error building extension 'gsplat_cuda': ninja\nmany lines"),
-        ImportError("gsplat_cuda.so: undefined symbol: _ZN3c10"),
-        ModuleNotFoundError("No module named 'jaxtyping'", name="jaxtyping"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(sys, "meta_path", [BrokenBuild(error), *sys.meta_path])
-            refused(f"cannot be built here: {str(error).split()[0]}")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="--device cuda: PyTorch sees no NVIDIA GPU"):
+        get_renderer("cuda")
+    assert isinstance(get_renderer("auto"), CpuRenderer)
 
 
-def test_each_step_of_the_gpus_first_minutes_says_why_it_is_skipped_without_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_step_of_the_gpu_benchmark_says_why_it_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = importlib.util.spec_from_file_location("gpu", Path(__file__).parents[2] / "benchmarks" / "gpu.py")
     assert spec is not None
     assert spec.loader is not None

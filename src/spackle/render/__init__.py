@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -10,19 +11,9 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render.cpu import CpuRenderer, touched_tiles
-from spackle.render.cuda import GsplatRenderer
 from spackle.render.protocol import TILE, Renderer, Rendering
 
-__all__ = [
-    "TILE",
-    "CpuRenderer",
-    "GsplatRenderer",
-    "Renderer",
-    "get_renderer",
-    "place_of",
-    "render_batch",
-    "touched_tiles",
-]
+__all__ = ["TILE", "CpuRenderer", "Renderer", "get_renderer", "place_of", "render_batch", "touched_tiles"]
 
 LOG = logging.getLogger("spackle")
 
@@ -33,14 +24,15 @@ def get_renderer(device: str = "auto") -> Renderer:
     Raises:
         InputError: an unknown device, or a renderer that cannot run here.
     """
-    if device == "cuda":
-        return GsplatRenderer()
-    if device not in ("auto", "cpu"):
+    if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: unknown device; use auto, cpu or cuda")
-    if device == "auto" and torch.cuda.is_available():
+    if device == "cuda" or (device == "auto" and torch.cuda.is_available()):
         try:
-            return GsplatRenderer()
+            gpu: Renderer = import_module("spackle.render.cuda").GsplatRenderer()
+            return gpu
         except InputError as error:
+            if device == "cuda":
+                raise
             LOG.warning("rendering on the processor: %s", error)
     return CpuRenderer()
 
@@ -54,8 +46,9 @@ def render_batch(
     onto: Sequence[Rendering | None],
 ) -> list[Rendering]:
     """`Renderer.render` of several views of one size: at once on a GPU, which is waited for once, else one by one."""
-    if isinstance(renderer, GsplatRenderer):
-        return renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
+    if hasattr(renderer, "render_batch"):
+        together: list[Rendering] = renderer.render_batch(scenes, cameras, tiles=tiles, onto=onto)
+        return together
     views = zip(scenes, cameras, tiles, onto, strict=True)
     return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]
 

@@ -6,13 +6,13 @@ branches or calls, so that loops over them run in vector registers.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from spackle._numba import HALF, MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
-from spackle.render.project import ACROSS, BLUE, DEPTH, FALL, GREEN, HALF_HEIGHT, HALF_WIDTH, PEAK, RED, SLOPE, X, Y
+from spackle._numba import MANTISSA, ONE, ZERO, Array, inlined_kernel, kernel
+from spackle.render.project import RECORD, Arrays, Numbers, in_tile
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
 # Constants of the pixels' functions are float32 throughout: a Python float would widen a whole expression to float64.
@@ -103,28 +103,20 @@ LANES = PATCH * PATCH
 STOP = np.float32(TRANSMITTANCE_STOP)
 SLACK = np.float32(1e-3)  # pixels; room for rounding
 SIDE = np.float32(TILE)
-RECORD = BLUE + 1  # floats in a record
 CHECK_EVERY = 16  # Gaussians that are fetched at once, and between two looks at whether the whole tile is full
 
 
+class TileLists(NamedTuple):
+    """Which Gaussians each tile draws, front to back."""
+
+    ids: Array  # [E] int32, the lists one after the other
+    starts: Array  # [T + 1] int64, where each tile's list begins
+
+
 @kernel
-def blend_patch(
-    state: Array,
-    offset: np.uint64,
-    left: np.float32,
-    top: np.float32,
-    x: np.float32,
-    y: np.float32,
-    slope: np.float32,
-    across: np.float32,
-    fall: np.float32,
-    peak: np.float32,
-    red: np.float32,
-    green: np.float32,
-    blue: np.float32,
-    depth: np.float32,
-) -> None:
+def blend_patch(state: Array, offset: np.uint64, left: np.float32, top: np.float32, splat: Numbers) -> None:
     """Draw one Gaussian into the patch whose first pixel is (left, top): this, and its centre, counted in the tile."""
+    x, y, slope, across, fall, peak, depth, red, green, blue = splat
     for lane in range(LANES):
         i = offset + np.uint64(lane)
         dy = np.float32(lane // PATCH) + top - y
@@ -159,23 +151,20 @@ def patches_of(center: np.float32, reach: np.float32) -> tuple[int, int]:
 
 
 @inlined_kernel
-def blend_splat(state: Array, records: Array, index: int, left: int, top: int) -> None:
+def blend_splat(state: Array, record: Array, left: int, top: int) -> None:
     """Draw one Gaussian into the tile whose first pixel is (left, top)."""
-    record = records[index]
-    x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
-    first_row, last_row = patches_of(y, record[HALF_HEIGHT])
-    first_column, last_column = patches_of(x, record[HALF_WIDTH])
+    x, y, slope, across, fall, peak, half_width, half_height, depth, red, green, blue = in_tile(record, left, top)
+    splat = x, y, slope, across, fall, peak, depth, red, green, blue
+    first_row, last_row = patches_of(y, half_height)
+    first_column, last_column = patches_of(x, half_width)
     for row in range(first_row, last_row):
         for column in range(first_column, last_column):
-            blend_patch(
-                state, np.uint64((row * PATCHES + column) * LANES), np.float32(column * PATCH), np.float32(row * PATCH),
-                x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK],
-                record[RED], record[GREEN], record[BLUE], record[DEPTH],
-            )  # fmt: skip
+            offset = np.uint64((row * PATCHES + column) * LANES)
+            blend_patch(state, offset, np.float32(column * PATCH), np.float32(row * PATCH), splat)
 
 
 @inlined_kernel
-def place_of(row: int, column: int) -> int:
+def pixel_index(row: int, column: int) -> int:
     """Where a plane keeps a pixel of the tile."""
     patch = row // PATCH * PATCHES + column // PATCH
     return patch * LANES + row % PATCH * PATCH + column % PATCH
@@ -185,7 +174,7 @@ def place_of(row: int, column: int) -> int:
 def blend_splats(state: Array, records: Array, count: int, left: int, top: int) -> None:
     """Draw the first Gaussians; a function of its own, because only so the constants stay in registers."""
     for index in range(count):
-        blend_splat(state, records, index, left, top)
+        blend_splat(state, records[index], left, top)
 
 
 @kernel
@@ -198,8 +187,9 @@ def is_full(state: Array) -> bool:
 
 
 @kernel
-def store_tile(state: Array, left: int, top: int, rgb: Array, depth: Array, alpha: Array, linear: Array) -> None:
-    """Finish a tile's pixels and write those inside the image; `linear` may be empty."""
+def store_tile(state: Array, left: int, top: int, images: Arrays) -> None:
+    """Finish a tile's pixels and write those inside the image."""
+    rgb, depth, alpha, linear = images
     rows, columns = min(TILE, depth.shape[0] - top), min(TILE, depth.shape[1] - left)
     if len(linear) > 0:
         store_color(state, left, top, rows, columns, linear)
@@ -208,7 +198,7 @@ def store_tile(state: Array, left: int, top: int, rgb: Array, depth: Array, alph
     store_color(state, left, top, rows, columns, rgb)
     for row in range(rows):
         for column in range(columns):
-            i = place_of(row, column)
+            i = pixel_index(row, column)
             opacity = state[i + 5 * PLANE]
             alpha[top + row, left + column] = opacity
             depth[top + row, left + column] = state[i + 4 * PLANE] / opacity if opacity > ZERO else ZERO
@@ -220,27 +210,17 @@ def store_color(state: Array, left: int, top: int, rows: int, columns: int, imag
     for row in range(rows):
         for column in range(columns):
             for channel in range(3):
-                image[top + row, left + column, channel] = state[place_of(row, column) + (1 + channel) * PLANE]
+                image[top + row, left + column, channel] = state[pixel_index(row, column) + (1 + channel) * PLANE]
 
 
 @kernel
-def blend_tiles(
-    first: int,
-    last: int,
-    tiles: Array,
-    columns: int,
-    ids: Array,
-    starts: Array,
-    records: Array,
-    rgb: Array,
-    depth: Array,
-    alpha: Array,
-    linear: Array,
-) -> None:
-    """Draw tiles first..last of the list `tiles` [K] into rgb [H, W, 3], depth and alpha [H, W].
+def blend_tiles(first: int, last: int, tiles: Array, lists: TileLists, records: Array, images: Arrays) -> None:
+    """Draw tiles first..last of the list `tiles` [K] into images: rgb [H, W, 3], depth and alpha [H, W].
 
-    The colour before sRGB goes to `linear` [H, W, 3], unless that is empty.
+    The colour before sRGB goes to the fourth, [H, W, 3], unless that is empty.
     """
+    ids, starts = lists
+    columns = (images[1].shape[1] + TILE - 1) // TILE
     state, near = np.empty(STATE, np.float32), np.empty((CHECK_EVERY, RECORD), np.float32)
     for k in range(first, last):
         tile = tiles[k]
@@ -254,7 +234,7 @@ def blend_tiles(
             blend_splats(state, near, count, left, top)
             if count == CHECK_EVERY and is_full(state):
                 break
-        store_tile(state, left, top, rgb, depth, alpha, linear)
+        store_tile(state, left, top, images)
 
 
 @kernel

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from importlib import import_module
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from spackle._numba import Array
+from spackle._numba import Array, kernel
 from spackle.camera import Camera
 from spackle.device import run_chunks, thread_count
 from spackle.gaussians import Gaussians
-from spackle.render.binning import TileLists, list_tiles, sort_by_depth
-from spackle.render.blend import blend_tiles
-from spackle.render.blend_backward import SUMS, backward_tiles, collect_sums
-from spackle.render.project import KernelCamera, Splats, count_before, project_chunk
-from spackle.render.project_backward import project_backward
-from spackle.render.protocol import Rendering, check_tiles, tile_mask
+from spackle.render.blend import TileLists, blend_tiles
+from spackle.render.project import Arrays, KernelCamera, Splats, count_before, project_chunk
+from spackle.render.protocol import Rendering, check_tiles
 
-FIELDS = 5  # tensors in a set of Gaussians
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
 BLEND_GRAIN = 64  # tiles a thread blends at a time
+DIGIT_BITS = 11  # three digits hold the 31 bits of a positive float; a table of 2048 counts stays in cache
+BUCKETS = 1 << DIGIT_BITS
+MASK = BUCKETS - 1
 
 
 class CpuRenderer:
@@ -44,12 +42,12 @@ class CpuRenderer:
         view = KernelCamera.of(camera, eps2d)
         wanted = wanted_tiles(view, tiles)
         onto = onto if tiles is not None else None
-        inputs = [t for part in sets for t in part.tensors] + (list(onto.tensors) if onto else [])
-        if not (torch.is_grad_enabled() and any(t.requires_grad for t in inputs)):
-            return draw(sets, view, wanted, onto).rendering()
-        under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
-        fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
-        return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
+        inputs = [t for part in sets for t in part.tensors] + list(onto.tensors if onto else ())
+        if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
+            # By its name: who only draws never loads what finds gradients.
+            drawn: Rendering = import_module("spackle.render.gradients").draw(sets, view, wanted, onto)
+            return drawn
+        return draw(sets, view, wanted, onto).rendering()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +58,11 @@ class Drawing:
     wanted: Array  # [rows, columns] bool, the tiles that were drawn
     splats: Splats
     lists: TileLists
-    rgb: Array  # [H, W, 3] float32 sRGB
-    depth: Array  # [H, W] float32
-    alpha: Array  # [H, W] float32
-    linear: Array  # [H, W, 3] float32, the colour before sRGB, or [0, 0, 3] where nobody asks for it
+    images: Arrays  # float32: rgb [H, W, 3] sRGB, depth [H, W], alpha [H, W], and the colour before sRGB or [0, 0, 3]
 
     def rendering(self) -> Rendering:
         """The images as tensors of the same memory."""
-        return Rendering(*(torch.from_numpy(image) for image in (self.rgb, self.depth, self.alpha)))
+        return Rendering(*(torch.from_numpy(image) for image in self.images[:3]))
 
 
 def draw(
@@ -114,121 +109,154 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tup
     before, first = count_before(wanted), 0
     spans: list[tuple[int, int]] = []
     for part in sets:
-        arrays = [as_array(tensor) for tensor in part.tensors]
+        scene = tuple(as_array(tensor) for tensor in part.tensors)
 
-        def chunk(start: int, stop: int, first: int = first, arrays: list[Array] = arrays) -> None:
-            found = project_chunk(
-                start, stop, first, *arrays, view.lens, view.pose, view.width, view.height, view.eps2d, before,
-                splats.records, splats.boxes, splats.keys, splats.ids,
-            )  # fmt: skip
-            spans.append((first + start, found))
+        def chunk(start: int, stop: int, first: int = first, scene: Arrays = scene) -> None:
+            spans.append((first + start, project_chunk(start, stop, first, scene, view, before, splats)))
 
         run_chunks(chunk, len(part), PROJECT_GRAIN)
         first += len(part)
     return splats, np.array(sorted(spans), np.int64).reshape(-1, 2)
 
 
+def sort_by_depth(keys: Array, ids: Array, spans: Array) -> Array:
+    """Order Gaussians front to back; those of equal depth stay in the order in which they came.
+
+    Args:
+        keys: [N] uint32, the bits of positive floats; overwritten.
+        ids: [N] int32; overwritten.
+        spans: [C, 2] int64, the pieces (start, count) of keys and ids that are in use.
+
+    Returns:
+        [M] int32, the ids in order of their keys, M being the sum of the counts.
+    """
+    total = int(spans[:, 1].sum())
+    items, others = (keys, ids), (np.empty(total, np.uint32), np.empty(total, np.int32))
+    for shift in range(0, 32, DIGIT_BITS):
+        _sort_digit(items, spans, shift, others)
+        items, others = others, items
+        spans = even_spans(total, len(spans))
+    return items[1][:total]
+
+
+def _sort_digit(items: Arrays, spans: Array, shift: int, into: Arrays) -> None:
+    """Sort (keys, ids) by the digit at bit `shift` alone, keeping the order of equal ones."""
+    counts = np.zeros((len(spans), BUCKETS), np.int64)
+    run_chunks(lambda a, b: count_digits(a, b, spans, items[0], shift, counts), len(spans), 1)
+    positions = starts_of(counts)
+    run_chunks(lambda a, b: scatter(a, b, spans, items, shift, positions, into), len(spans), 1)
+
+
+def even_spans(total: int, parts: int) -> Array:
+    """Cut 0..total into equal pieces (start, count), [parts, 2] int64."""
+    edges = np.linspace(0, total, parts + 1).astype(np.int64)
+    return np.stack([edges[:-1], np.diff(edges)], axis=1)
+
+
+def starts_of(counts: Array) -> Array:
+    """Where each piece's items of each bucket begin: buckets in order, and pieces in order within one.
+
+    Args:
+        counts: [C, B] items of bucket b in piece c.
+    """
+    flat = counts.T.reshape(-1)
+    return np.ascontiguousarray((np.cumsum(flat) - flat).reshape(counts.shape[::-1]).T)
+
+
+@kernel
+def count_digits(first: int, last: int, spans: Array, keys: Array, shift: int, counts: Array) -> None:
+    """Count the digits of the keys of pieces first..last."""
+    for piece in range(first, last):
+        row = counts[piece]
+        for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            row[(keys[i] >> np.uint32(shift)) & np.uint32(MASK)] += 1
+
+
+@kernel
+def scatter(first: int, last: int, spans: Array, items: Arrays, shift: int, positions: Array, into: Arrays) -> None:
+    """Move the (keys, ids) of pieces first..last to their places."""
+    (keys, ids), (sorted_keys, sorted_ids) = items, into
+    for piece in range(first, last):
+        row = positions[piece]
+        for i in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            digit = (keys[i] >> np.uint32(shift)) & np.uint32(MASK)
+            place = row[digit]
+            row[digit] = place + 1
+            sorted_keys[place] = keys[i]
+            sorted_ids[place] = ids[i]
+
+
+def list_tiles(order: Array, boxes: Array, wanted: Array) -> TileLists:
+    """Deal the sorted Gaussians out to the tiles.
+
+    Args:
+        order: [M] int32, visible Gaussians front to back.
+        boxes: [N, 4] uint16, the tiles each one touches.
+        wanted: [rows, columns] bool, the tiles to make lists for; the others' lists stay empty.
+    """
+    parts = thread_count()
+    spans = even_spans(len(order), parts)
+    counts = np.zeros((parts, wanted.size), np.int64)
+    sorted_boxes = np.empty((len(order), 4), np.uint16)
+    run_chunks(lambda a, b: count_entries(a, b, spans, order, boxes, wanted, sorted_boxes, counts), parts, 1)
+    starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
+    positions = starts_of(counts)
+    ids = np.empty(starts[-1], np.int32)
+    run_chunks(lambda a, b: write_entries(a, b, spans, order, sorted_boxes, wanted, positions, ids), parts, 1)
+    return TileLists(ids, starts)
+
+
+@kernel
+def count_entries(
+    first: int, last: int, spans: Array, order: Array, boxes: Array, wanted: Array, sorted_boxes: Array, counts: Array
+) -> None:
+    """Count the entries that pieces first..last of the order bring to each tile, and sort the boxes on the way."""
+    columns, flat = wanted.shape[1], wanted.reshape(-1)
+    for piece in range(first, last):
+        row_counts = counts[piece]
+        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            k = np.uint64(place)  # unsigned numbers need no look at whether they count from an array's end
+            i = np.uint64(order[k])
+            left, right, top, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+            sorted_boxes[k, 0], sorted_boxes[k, 1], sorted_boxes[k, 2], sorted_boxes[k, 3] = left, right, top, bottom
+            # Read back on purpose: of bounds that it cannot keep in registers the compiler makes plain loops, and
+            # vectors for two tiles cost more.
+            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
+                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+                    tile = np.uint64(row * columns + column)
+                    if flat[tile]:
+                        row_counts[tile] += 1
+
+
+@kernel
+def write_entries(
+    first: int, last: int, spans: Array, order: Array, sorted_boxes: Array, wanted: Array, positions: Array, ids: Array
+) -> None:
+    """Write the entries that pieces first..last of the order, whose boxes are sorted, bring to each tile."""
+    columns, flat = wanted.shape[1], wanted.reshape(-1)
+    for piece in range(first, last):
+        places = positions[piece]
+        for place in range(spans[piece, 0], spans[piece, 0] + spans[piece, 1]):
+            k = np.uint64(place)
+            for row in range(sorted_boxes[k, 2], sorted_boxes[k, 3]):
+                for column in range(sorted_boxes[k, 0], sorted_boxes[k, 1]):
+                    tile = np.uint64(row * columns + column)
+                    if flat[tile]:
+                        ids[np.uint64(places[tile])] = order[k]
+                        places[tile] += 1
+
+
 def blend(
-    splats: Splats,
-    lists: TileLists,
-    view: KernelCamera,
-    wanted: Array,
-    onto: Rendering | None,
-    keep_linear: bool = False,
+    splats: Splats, lists: TileLists, view: KernelCamera, wanted: Array, onto: Rendering | None, keep_linear: bool
 ) -> Drawing:
     """Draw the wanted tiles; see `draw`."""
     size = (view.height, view.width)
     linear = np.zeros((*(size if keep_linear else (0, 0)), 3), np.float32)
     if onto is None:
-        rgb, depth, alpha = (np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
+        images = tuple(np.zeros((*size, *rest), np.float32) for rest in ((3,), (), ()))
     else:
-        rgb, depth, alpha = (np.array(as_array(image)) for image in onto.tensors)
+        images = tuple(np.array(as_array(image)) for image in onto.tensors)
+    images = (*images, linear)
     tiles = np.flatnonzero(wanted)
-
-    def chunk(start: int, stop: int) -> None:
-        blend_tiles(
-            start, stop, tiles, wanted.shape[1], lists.ids, lists.starts, splats.records, rgb, depth, alpha, linear
-        )
-
-    run_chunks(chunk, len(tiles), BLEND_GRAIN)
-    return Drawing(view, wanted, splats, lists, rgb, depth, alpha, linear)
-
-
-class Draw(torch.autograd.Function):
-    """Draw sets of Gaussians, given as a flat row of tensors, over the three images of `onto`."""
-
-    @staticmethod
-    def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw; `tensors` are rgb, depth and alpha of `onto` (or None), then the five of each set, all float32."""
-        under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
-        sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
-        onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
-        drawing = draw(sets, view, wanted, onto, keep_linear=True)
-        rendering = drawing.rendering()
-        ctx.drawing, ctx.sizes = drawing, [len(part) for part in sets]
-        ctx.save_for_backward(*rendering.tensors, *fields)
-        return rendering.tensors
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        """From the gradients of the three images to those of the tensors that asked for one."""
-        outputs, fields = tuple(as_array(t) for t in ctx.saved_tensors[:3]), ctx.saved_tensors[3:]
-        needs = ctx.needs_input_grad[2:]
-        drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
-        under = [  # nothing where tiles were drawn over the image beneath
-            torch.where(mask, 0, gradient) if need else None
-            for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
-        ]
-        rows, count, parts = np.full(sum(ctx.sizes), -1, np.int32), 0, []
-        for k, size in enumerate(ctx.sizes):
-            if any(needs[3 + k * FIELDS : 3 + (k + 1) * FIELDS]):
-                first = sum(ctx.sizes[:k])
-                rows[first : first + size] = np.arange(count, count + size)
-                parts.append((slice(k * FIELDS, (k + 1) * FIELDS), slice(count, count + size)))
-                count += size
-        table = pixel_sums(ctx.drawing, outputs, tuple(as_array(g) for g in gradients), rows, count)
-        results: list[Tensor | None] = [None] * len(fields)
-        for own, of in parts:
-            results[own] = set_gradients(fields[own], ctx.drawing.view, table[of])
-        return None, None, *under, *(r if need else None for r, need in zip(results, needs[3:], strict=True))
-
-
-def pixel_sums(
-    drawing: Drawing, outputs: tuple[Array, ...], gradients: tuple[Array, ...], rows: Array, count: int
-) -> Array:
-    """What the pixels give to each Gaussian that wants gradients, a table [count, SUMS] float32.
-
-    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not depend on which
-    thread was faster. `rows` [N] int32 are the table's rows that belong to the Gaussians, -1 for none.
-    """
-    lists, columns = drawing.lists, drawing.wanted.shape[1]
-    entry_rows = rows[lists.ids]
-    wanted = entry_rows >= 0
-    slots = np.concatenate([[0], np.cumsum(wanted)])[lists.starts]
-    tiles = np.flatnonzero(np.diff(slots))
-    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((count, SUMS), np.float32)
-
-    def blend_chunk(start: int, stop: int) -> None:
-        backward_tiles(
-            start, stop, tiles, columns, lists.ids, entry_rows, lists.starts, drawing.splats.records,
-            outputs, gradients, drawing.linear, slots, sums,
-        )  # fmt: skip
-
-    run_chunks(blend_chunk, len(tiles), BLEND_GRAIN)
-    shares, slot_rows = thread_count(), entry_rows[wanted]
-    share = -(-count // shares)
-    run_chunks(lambda a, b: collect_sums(a, b, share, slot_rows, sums, table), shares, 1)
-    return table
-
-
-def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
-    """The gradients of one set's five tensors."""
-    arrays = [as_array(t) for t in fields[:4]]
-    gradients = [np.zeros(tuple(t.shape), np.float32) for t in fields]
-    run_chunks(
-        lambda a, b: project_backward(a, b, *arrays, view.lens, view.pose, view.eps2d, table, *gradients),
-        len(table),
-        PROJECT_GRAIN,
-    )
-    return [torch.from_numpy(g) for g in gradients]
+    run_chunks(lambda a, b: blend_tiles(a, b, tiles, lists, splats.records, images), len(tiles), BLEND_GRAIN)
+    return Drawing(view, wanted, splats, lists, images)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.device import enough_memory
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.render.project import FINITE
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering, check_tiles, paste, tile_grid
@@ -49,15 +49,6 @@ def upper_covariances(part: Gaussians) -> Tensor:
     x, y, z = (quat_to_matrix(part.quats) * part.scales[:, None, :]).unbind(1)
     pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
     return torch.stack([(a * b).sum(-1) for a, b in pairs], dim=-1)
-
-
-class Projection(NamedTuple):
-    """A set as a camera sees it."""
-
-    radii: Tensor  # [N, 2] int; 0 where nothing is seen
-    means2d: Tensor  # [N, 2] pixels; anything where nothing is seen, as the rest
-    depths: Tensor  # [N]
-    conics: Tensor  # [N, 3]
 
 
 class SetStore:
@@ -135,11 +126,11 @@ class GsplatRenderer:
         width, height = cameras[0].width, cameras[0].height
         if any((camera.width, camera.height) != (width, height) for camera in cameras):
             raise ValueError("views that are drawn together must be of one size")
-        chosen = tiles or [None] * len(cameras)
-        for each in chosen:
+        wanted: list[Tensor | None] = [None] * len(cameras)
+        for index, each in enumerate(tiles or []):
             if each is not None:
                 check_tiles(each, height, width)
-        wanted = [None if t is None else t.to(self.device, torch.bool, non_blocking=True) for t in chosen]
+                wanted[index] = each.to(self.device, torch.bool, non_blocking=True)
         count = sum(len(part) for parts in scenes for part in parts)
         what = f"to draw {count:,} Gaussians at {width}×{height} on the GPU"
         with enough_memory("make the picture smaller", "use --device cpu", what=what):
@@ -163,8 +154,7 @@ class GsplatRenderer:
         width, height = cameras[0].width, cameras[0].height
         rows, columns = tile_grid(height, width)
         materials: list[Material] = []
-        seen: list[Projection] = []
-        images: list[Tensor] = []
+        seen: list[Any] = []  # of each set the number of its view, radii [N, 2], means2d [N, 2], depths, conics [N, 3]
         for k, (parts, (view, lens)) in enumerate(zip(scenes, self._matrices(cameras), strict=True)):
             for part in parts:
                 if not len(part):  # gsplat 1.5.3 divides by the number of Gaussians
@@ -175,13 +165,11 @@ class GsplatRenderer:
                     eps2d=eps2d, near_plane=NEAR_PLANE, far_plane=FINITE, opacities=material.opacities,
                 )  # fmt: skip
                 materials.append(material)
-                seen.append(Projection(*(field[0] for field in found[:4])))
-                images.append(torch.full((len(part),), k, device=self.device))
+                seen.append((torch.full((len(part),), k, device=self.device), *(field[0] for field in found[:4])))
         if not seen:
             black = torch.zeros(len(cameras), height, width, 5, device=self.device)
             return [Rendering(image[..., :3], image[..., 3], image[..., 4]) for image in black]
-        radii, means2d, depths, conics = (torch.cat(field) for field in zip(*seen, strict=True))
-        of = torch.cat(images)
+        of, radii, means2d, depths, conics = (torch.cat(field) for field in zip(*seen, strict=True))
         _, keys, ids = self._gsplat.isect_tiles(
             means2d.detach(), radii, depths.detach(), TILE, columns, rows,
             packed=True, n_images=len(cameras), image_ids=of, gaussian_ids=of,
@@ -214,18 +202,16 @@ def load_gsplat(device: torch.device) -> ModuleType:
     """The package, once its kernels are known to be there; see `GsplatRenderer` for what it raises."""
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError("--device cuda: PyTorch sees no NVIDIA GPU on this machine; use --device cpu")
-    try:
-        import gsplat
-
+    # Its kernels are built when this is first imported: compilers fail in many ways.
+    with reading("--device cuda", "gsplat's kernels cannot be built here: {reason}; use --device cpu"):
+        try:
+            import gsplat
+        except ModuleNotFoundError as error:
+            if error.name == "gsplat":
+                raise InputError(f"--device cuda: needs gsplat: {INSTALL}, or use --device cpu") from error
+            raise
         check_version(gsplat.__version__)
         from gsplat.cuda import _backend
-    except InputError:
-        raise
-    except Exception as error:  # its kernels are built when this is first imported: compilers fail in many ways
-        if isinstance(error, ModuleNotFoundError) and error.name == "gsplat":
-            raise InputError(f"--device cuda: needs gsplat: {INSTALL}, or use --device cpu") from error
-        reason = reason_in_a_line(error)
-        raise InputError(f"--device cuda: gsplat's kernels cannot be built here: {reason}; use --device cpu") from error
     if _backend._C is None:
         raise InputError(
             "--device cuda: gsplat has no kernels here: it needs a CUDA toolkit (nvcc) or a wheel built for this "

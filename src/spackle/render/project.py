@@ -5,20 +5,17 @@ The arithmetic of a block of Gaussians runs in vector registers; they are packed
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spackle._numba import MANTISSA, ZERO, Array, inlined_kernel, kernel
+from spackle._numba import HALF, MANTISSA, ZERO, Array, inlined_kernel, kernel
 from spackle.camera import Camera
 from spackle.render.protocol import ALPHA_MIN, NEAR_PLANE, TILE, tile_grid
 
 Numbers = Array | tuple[Any, ...]
-Four = tuple[float, float, float, float]
-Six = tuple[float, float, float, float, float, float]
-Nine = tuple[float, float, float, float, float, float, float, float, float]
+Arrays = tuple[Array, ...]
 
 # A record is what the blender needs, in three quarters of a cache line. Along a row of pixels at distance dy
 # from the centre, a Gaussian's alpha is 2^(PEAK - FALL·dy² - ACROSS·(x - X - SLOPE·dy)²): no square of this
@@ -45,8 +42,7 @@ LOG_FAINT = math.log(ALPHA_MIN)
 FINITE = 1e30  # larger values would overflow float32 further on
 
 
-@dataclasses.dataclass(frozen=True)
-class KernelCamera:
+class KernelCamera(NamedTuple):
     """A camera as plain numbers."""
 
     lens: Array  # [8] float64: fx, fy, cx, cy and the bounds (left, right, top, bottom) of x/z and y/z
@@ -65,7 +61,7 @@ class KernelCamera:
         left, right = -cx / fx - slack_x, (camera.width - cx) / fx + slack_x
         top, bottom = -cy / fy - slack_y, (camera.height - cy) / fy + slack_y
         lens = np.array([fx, fy, cx, cy, left, right, top, bottom])
-        return KernelCamera(lens, pose, camera.width, camera.height, eps2d)
+        return KernelCamera(lens, pose, camera.width, camera.height, float(eps2d))
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -73,8 +69,7 @@ class KernelCamera:
         return tile_grid(self.height, self.width)
 
 
-@dataclasses.dataclass(frozen=True)
-class Splats:
+class Splats(NamedTuple):
     """Gaussians on the image plane, in the order in which they came."""
 
     records: Array  # [N, RECORD] float32
@@ -89,6 +84,14 @@ class Splats:
         return Splats(np.empty((n, RECORD), np.float32), boxes, keys, ids)
 
 
+@inlined_kernel
+def in_tile(record: Array, left: int, top: int) -> Numbers:
+    """A record's twelve numbers, the centre (X, Y) seen from the centre of a tile's first pixel (left, top)."""
+    x, y = record[X] - np.float32(left) - HALF, record[Y] - np.float32(top) - HALF
+    shape = x, y, record[SLOPE], record[ACROSS], record[FALL], record[PEAK], record[HALF_WIDTH], record[HALF_HEIGHT]
+    return *shape, record[DEPTH], record[RED], record[GREEN], record[BLUE]
+
+
 def count_before(wanted: Array) -> Array:
     """How many tiles are wanted above and to the left of each corner, [rows + 1, columns + 1] int32."""
     return np.pad(wanted.astype(np.int32).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0))).astype(np.int32)
@@ -96,59 +99,30 @@ def count_before(wanted: Array) -> Array:
 
 @kernel
 def project_chunk(
-    start: int,
-    stop: int,
-    first: int,
-    means: Array,
-    quats: Array,
-    scales: Array,
-    opacities: Array,
-    colors: Array,
-    lens: Array,
-    pose: Array,
-    width: int,
-    height: int,
-    eps2d: float,
-    wanted_before: Array,
-    records: Array,
-    boxes: Array,
-    keys: Array,
-    ids: Array,
+    start: int, stop: int, first: int, scene: Arrays, camera: KernelCamera, wanted_before: Array, splats: Splats
 ) -> int:
-    """Project Gaussians start..stop of one set, whose first one is number `first` of all.
+    """Project Gaussians start..stop of a set's five arrays; its first one is number `first` of all.
 
     A Gaussian that touches no wanted tile counts as invisible; see `count_before`.
 
     Returns:
         How many are visible; their keys and ids lie from first + start on.
     """
+    means, quats, scales, opacities, colors = scene
     found = first + start
     block = np.empty(BUFFER, np.float32)
     for begin in range(start, stop, BLOCK):
         end = min(begin + BLOCK, stop)
         # Only of flat arrays does the compiler know how far apart a Gaussian's numbers lie.
-        measure_block(
-            block, means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1),
-            opacities[begin:end], lens, pose, width, height, eps2d,
-        )  # fmt: skip
-        found = pack_block(
-            block, colors[begin:end].reshape(-1), first + begin, found, wanted_before, records, boxes, keys, ids
-        )
+        shapes = means[begin:end].reshape(-1), quats[begin:end].reshape(-1), scales[begin:end].reshape(-1)
+        measure_block(block, *shapes, opacities[begin:end], camera)
+        found = pack_block(block, colors[begin:end].reshape(-1), first + begin, found, wanted_before, splats)
     return found - first - start
 
 
 @kernel
 def measure_block(
-    block: Array,
-    means: Array,
-    quats: Array,
-    scales: Array,
-    opacities: Array,
-    lens: Array,
-    pose: Array,
-    width: int,
-    height: int,
-    eps2d: float,
+    block: Array, means: Array, quats: Array, scales: Array, opacities: Array, camera: KernelCamera
 ) -> None:
     """Do the arithmetic of up to BLOCK Gaussians, whether or not they are visible, which their boxes tell.
 
@@ -158,7 +132,9 @@ def measure_block(
     Args:
         block: [BUFFER], the result; an invisible Gaussian's RIGHT is 0.
         means, quats, scales, opacities: flat arrays.
+        camera: the view.
     """
+    lens, pose = camera.lens, camera.pose
     for k in range(len(opacities)):
         i, i3, i4 = np.uint64(k), np.uint64(3 * k), np.uint64(4 * k)
         px, py, pz = np.float64(means[i3]), np.float64(means[i3 + ONCE]), np.float64(means[i3 + TWICE])
@@ -169,7 +145,7 @@ def measure_block(
         x, y = x * nearness, y * nearness
         quat = (quats[i4], quats[i4 + ONCE], quats[i4 + TWICE], quats[i4 + THRICE])
         scale = (scales[i3], scales[i3 + ONCE], scales[i3 + TWICE])
-        cxx, cxy, cyy, det = covariance(x, y, nearness, quat, scale, lens, pose, eps2d)
+        cxx, cxy, cyy, det = covariance(x, y, nearness, quat, scale, camera)
         u, v = lens[0] * x + lens[2], lens[1] * y + lens[3]
         opacity = opacities[i]
         log_opacity = natural_log(opacity)
@@ -177,8 +153,8 @@ def measure_block(
         half_width, half_height = math.sqrt(reach * cxx), math.sqrt(reach * cyy)
         narrow = 1.0 / cyy
         fall, across = 0.5 * LOG2_E * narrow, 0.5 * LOG2_E * cyy / det
-        left, right = cover(u, half_width, width)
-        top, bottom = cover(v, half_height, height)
+        left, right = cover(u, half_width, camera.width)
+        top, bottom = cover(v, half_height, camera.height)
         # Written so that NaN fails each test.
         sound = (z >= NEAR_PLANE) & (z < FINITE) & (opacity >= ALPHA_MIN) & (opacity < FINITE)
         sound &= (det > 0.0) & (det < FINITE) & (cxx < FINITE) & (cyy < FINITE)
@@ -200,22 +176,20 @@ def measure_block(
 
 
 @inlined_kernel
-def covariance(
-    x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, lens: Array, pose: Array, eps2d: float
-) -> tuple[float, float, float, float]:
+def covariance(x: float, y: float, nearness: float, quat: Numbers, scale: Numbers, camera: KernelCamera) -> Numbers:
     """The projected covariance (xx, xy, yy) and its determinant, of a Gaussian at (x, y, 1) / nearness."""
-    return spread(factor(jacobian(x, y, nearness, lens), pose, rotation(quat), scale), eps2d)
+    return spread(factor(jacobian(x, y, nearness, camera.lens), camera.pose, rotation(quat), scale), camera.eps2d)
 
 
 @inlined_kernel
-def jacobian(x: float, y: float, nearness: float, lens: Array) -> Four:
+def jacobian(x: float, y: float, nearness: float, lens: Array) -> Numbers:
     """(a, b, c, d) of the projection's Jacobian J, with rows (a, 0, b) and (0, c, d), at (x, y, 1) / nearness."""
     a, c = lens[0] * nearness, lens[1] * nearness
     return a, -a * min(lens[5], max(lens[4], x)), c, -c * min(lens[7], max(lens[6], y))
 
 
 @inlined_kernel
-def rotation(quat: Numbers) -> Nine:
+def rotation(quat: Numbers) -> Numbers:
     """The matrix R of a quaternion (wxyz) of any length, row by row."""
     qw, qx, qy, qz = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     two = 2.0 / max(qw * qw + qx * qx + qy * qy + qz * qz, 1e-24)  # 2/‖q‖² makes the rotation a unit one
@@ -226,7 +200,7 @@ def rotation(quat: Numbers) -> Nine:
 
 
 @inlined_kernel
-def factor(j: Four, pose: Array, r: Nine, scale: Numbers) -> Six:
+def factor(j: Numbers, pose: Array, r: Numbers, scale: Numbers) -> Numbers:
     """The two rows of M = J W R S, one after the other; the projected covariance is M Mᵀ."""
     a, b, c, d = j
     h0, h1, h2 = a * pose[0, 0] + b * pose[2, 0], a * pose[0, 1] + b * pose[2, 1], a * pose[0, 2] + b * pose[2, 2]
@@ -239,7 +213,7 @@ def factor(j: Four, pose: Array, r: Nine, scale: Numbers) -> Six:
 
 
 @inlined_kernel
-def spread(m: Six, eps2d: float) -> Four:
+def spread(m: Numbers, eps2d: float) -> Numbers:
     """The covariance M Mᵀ + eps2d (xx, xy, yy) and its determinant.
 
     The determinant of M Mᵀ is the squared cross product of M's rows (Cauchy–Binet), which does not cancel where a
@@ -266,22 +240,13 @@ def cover(center: float, extent: float, size: int) -> tuple[np.int32, np.int32]:
 
 
 @kernel
-def pack_block(
-    block: Array,
-    colors: Array,
-    first: int,
-    found: int,
-    wanted_before: Array,
-    records: Array,
-    boxes: Array,
-    keys: Array,
-    ids: Array,
-) -> int:
+def pack_block(block: Array, colors: Array, first: int, found: int, wanted_before: Array, splats: Splats) -> int:
     """Write the boxes of measured Gaussians first, first + 1, …, and what else there is of the visible ones.
 
     Returns:
         Where the next key belongs, `found` being where the first one does.
     """
+    records, boxes, keys, ids = splats
     depth_bits = keys.view(np.float32)
     for k in range(len(colors) // 3):
         # Unsigned numbers need no look at whether they count from an array's end.

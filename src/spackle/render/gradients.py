@@ -1,0 +1,424 @@
+"""The gradient of a drawing: each tile is drawn again in chunks of Gaussians, then walked back to front.
+
+What its pixels say about a splat then goes to the Gaussian behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from spackle._numba import ONE, ZERO, Array, kernel, reordering_kernel
+from spackle.device import run_chunks, thread_count
+from spackle.gaussians import Gaussians
+from spackle.render.blend import CHECK_EVERY, LIMIT, PLANE, STOP, TileLists, alpha_of, is_full, span_of, srgb_slope
+from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN, Drawing, as_array
+from spackle.render.cpu import draw as draw_plainly
+from spackle.render.project import Arrays, KernelCamera, Numbers, factor, in_tile, jacobian, rotation, spread
+from spackle.render.protocol import ALPHA_MIN, TILE, Rendering, tile_mask
+
+FIELDS = 5  # tensors in a set of Gaussians
+
+# What the pixels of a tile give to one Gaussian. With u = x - centre and v = ∂L/∂ln(alpha), sums of v,
+# v·u, v·u², v·dy, v·dy², v·u·dy, then the gradients of red, green, blue and depth.
+SUMS = 10
+
+# The workspace is one flat buffer of planes, as in `blend`, but with the pixels row by row: the light that is
+# left, what lies behind the Gaussian in hand, the gradients of red, green, blue, depth and alpha.
+BEHIND = 1 * PLANE
+GRADIENTS = 2 * PLANE
+WORKSPACE = 7 * PLANE
+
+# The alphas and light of a chunk of Gaussians are noted down on the way forth, for the way back; small
+# enough for the second-level cache.
+CHUNK = 128  # Gaussians
+NOTE = 2 * TILE  # floats for one row of one Gaussian
+NOTES = CHUNK * TILE * NOTE
+INVISIBLE = np.float32(math.log2(ALPHA_MIN) - 1e-3)  # a row that peaks below this shows nothing
+
+
+def draw(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array, onto: Rendering | None) -> Rendering:
+    """Draw as `spackle.render.cpu.draw`, with gradients for the tensors that ask for them."""
+    under = [None] * 3 if onto is None else [image.float() for image in onto.tensors]
+    fields = [t.to(device="cpu", dtype=torch.float32) for part in sets for t in part.tensors]
+    return Rendering(*Draw.apply(view, wanted, *under, *fields))  # type: ignore[no-untyped-call]
+
+
+class Draw(torch.autograd.Function):
+    """Draw sets of Gaussians, given as a flat row of tensors, over the three images of `onto`."""
+
+    @staticmethod
+    def forward(ctx: Any, view: KernelCamera, wanted: Array, *tensors: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw; `tensors` are rgb, depth and alpha of `onto` (or None), then the five of each set, all float32."""
+        under, fields = tensors[:3], [t for t in tensors[3:] if t is not None]
+        sets = [Gaussians(*fields[k : k + FIELDS]) for k in range(0, len(fields), FIELDS)]
+        onto = None if under[0] is None else Rendering(*under)  # type: ignore[arg-type]
+        ctx.drawing, ctx.sizes = draw_plainly(sets, view, wanted, onto, keep_linear=True), [len(part) for part in sets]
+        rendering: Rendering = ctx.drawing.rendering()
+        ctx.save_for_backward(*rendering.tensors, *fields)
+        return rendering.tensors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        """From the gradients of the three images to those of the tensors that asked for one."""
+        fields = ctx.saved_tensors[3:]  # PyTorch refuses where somebody has changed these or the images
+        needs = ctx.needs_input_grad[2:]
+        drawn = tile_mask(torch.from_numpy(ctx.drawing.wanted), *gradients[1].shape)
+        under = [  # nothing where tiles were drawn over the image beneath
+            torch.where(mask, 0, gradient) if need else None
+            for mask, gradient, need in zip((drawn[..., None], drawn, drawn), gradients, needs, strict=False)
+        ]
+        sets = [slice(k, k + FIELDS) for k in range(0, len(fields), FIELDS)]
+        asking = np.array([any(needs[3:][part]) for part in sets], np.bool_)
+        wanted = np.repeat(asking, ctx.sizes)
+        rows = np.where(wanted, np.cumsum(wanted) - 1, -1).astype(np.int32)
+        table = pixel_sums(ctx.drawing, tuple(as_array(g) for g in gradients), rows, int(wanted.sum()))
+        results: list[Tensor | None] = []
+        for part, size, asks in zip(sets, ctx.sizes, asking, strict=True):
+            found = set_gradients(fields[part], ctx.drawing.view, table[:size]) if asks else [None] * FIELDS
+            results += [gradient if need else None for gradient, need in zip(found, needs[3:][part], strict=True)]
+            table = table[size if asks else 0 :]
+        return None, None, *under, *results
+
+
+def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> Array:
+    """What the pixels give to each Gaussian that wants gradients, a table [count, SUMS] float32.
+
+    Each tile writes sums of its own, which are added up in the order of the tiles: the result does not depend on which
+    thread was faster. `rows` [N] int32 are the table's rows that belong to the Gaussians, -1 for none.
+    """
+    lists, records, images = drawing.lists, drawing.splats.records, drawing.images
+    entry_rows = rows[lists.ids]
+    wanted = entry_rows >= 0
+    slots = np.concatenate([[0], np.cumsum(wanted)])[lists.starts]
+    tiles = np.flatnonzero(np.diff(slots))
+    sums, table = np.zeros((slots[-1], SUMS), np.float32), np.zeros((count, SUMS), np.float32)
+
+    def chunk(start: int, stop: int) -> None:
+        backward_tiles(start, stop, tiles, lists, wanted, records, images, gradients, slots, sums)
+
+    run_chunks(chunk, len(tiles), BLEND_GRAIN)
+    shares, slot_rows = thread_count(), entry_rows[wanted]
+    share = -(-count // shares)
+    run_chunks(lambda a, b: collect_sums(a, b, share, slot_rows, sums, table), shares, 1)
+    return table
+
+
+def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
+    """The gradients of one set's five tensors."""
+    scene = tuple(as_array(t) for t in fields)
+    gradients = tuple(np.zeros(tuple(t.shape), np.float32) for t in fields)
+    run_chunks(lambda a, b: project_backward(a, b, scene, view, table, gradients), len(table), PROJECT_GRAIN)
+    return [torch.from_numpy(g) for g in gradients]
+
+
+@kernel
+def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
+    """Draw one row as `blend_patch` does; note alpha (0 where nothing is drawn) and the light before it.
+
+    `bell` is how fast the Gaussian falls across the row, and where its middle lies.
+    """
+    across, center = bell
+    for x in range(TILE):
+        i, n = offset + np.uint64(x), note + np.uint64(x)
+        u = np.float32(x) - center
+        alpha = alpha_of(peak - across * u * u)
+        light = work[i]
+        after = light * (ONE - alpha)
+        full = after <= STOP
+        work[i] = ZERO if full else after
+        notes[n] = ZERO if full else alpha
+        notes[n + np.uint64(TILE)] = light
+
+
+@kernel
+def replay(work: Array, notes: Array, records: Array, ids: Array, left: int, top: int, first_notes: Array) -> int:
+    """Draw a chunk of Gaussians again; `first_notes` [CHUNK] gets where the notes of each begin.
+
+    Returns:
+        How many were drawn before the tile was full.
+    """
+    note = np.uint64(0)
+    for k in range(len(ids)):
+        first_notes[k] = note
+        x, y, slope, across, fall, height, _, half_height, _, _, _, _ = in_tile(records[ids[k]], left, top)
+        first, last = span_of(y, half_height)
+        for row in range(first, last):
+            dy = np.float32(row) - y
+            peak = height - fall * dy * dy
+            if peak < INVISIBLE:
+                continue
+            replay_row(work, np.uint64(row * TILE), notes, note, peak, (across, x + slope * dy))
+            note += np.uint64(NOTE)
+        if k % CHECK_EVERY == CHECK_EVERY - 1 and is_full(work):
+            return k + 1
+    return len(ids)
+
+
+@kernel
+def pass_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, look: Numbers) -> None:
+    """Walk back past a row of a Gaussian, with its colour and depth in `look`, that wants no gradient."""
+    red, green, blue, depth = look
+    for x in range(TILE):
+        i, n = offset + np.uint64(x), note + np.uint64(x)
+        g = i + np.uint64(GRADIENTS)
+        value = red * work[g] + green * work[g + np.uint64(PLANE)] + blue * work[g + np.uint64(2 * PLANE)]
+        value += depth * work[g + np.uint64(3 * PLANE)] + work[g + np.uint64(4 * PLANE)]
+        work[i + np.uint64(BEHIND)] += notes[n] * notes[n + np.uint64(TILE)] * value
+
+
+@reordering_kernel
+def gather_row(
+    work: Array, offset: np.uint64, notes: Array, note: np.uint64, center: np.float32, look: Numbers
+) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:
+    """Walk back past a row of a Gaussian, and add up what its pixels give to it: see SUMS, without dy."""
+    red, green, blue, depth = look
+    sum_v, sum_vu, sum_vuu = ZERO, ZERO, ZERO
+    sum_red, sum_green, sum_blue, sum_depth = ZERO, ZERO, ZERO, ZERO
+    for x in range(TILE):
+        i, n = offset + np.uint64(x), note + np.uint64(x)
+        g = i + np.uint64(GRADIENTS)
+        by_red, by_green, by_blue = work[g], work[g + np.uint64(PLANE)], work[g + np.uint64(2 * PLANE)]
+        by_depth, by_alpha = work[g + np.uint64(3 * PLANE)], work[g + np.uint64(4 * PLANE)]
+        value = red * by_red + green * by_green + blue * by_blue + depth * by_depth + by_alpha
+        alpha, light, behind = notes[n], notes[n + np.uint64(TILE)], work[i + np.uint64(BEHIND)]
+        weight = alpha * light
+        work[i + np.uint64(BEHIND)] = behind + weight * value
+        # More alpha shows more of this one and less of what lies behind; at the clamp nothing moves.
+        slope = alpha * (light * value - behind / (ONE - alpha))
+        v = slope if alpha < LIMIT else ZERO
+        u = np.float32(x) - center
+        sum_v += v
+        sum_vu += v * u
+        sum_vuu += v * u * u
+        sum_red += weight * by_red
+        sum_green += weight * by_green
+        sum_blue += weight * by_blue
+        sum_depth += weight * by_depth
+    return sum_v, sum_vu, sum_vuu, sum_red, sum_green, sum_blue, sum_depth
+
+
+@kernel
+def walk_back(
+    work: Array, notes: Array, note: np.uint64, record: Array, left: int, top: int, wanted: bool, sums: Array
+) -> None:
+    """Walk back past one Gaussian, whose notes begin at `note`; if it wants gradients, `sums` [SUMS] gets them."""
+    x, y, slope, _, fall, height, _, half_height, depth, red, green, blue = in_tile(record, left, top)
+    look, (first, last) = (red, green, blue, depth), span_of(y, half_height)
+    for row in range(first, last):
+        dy = np.float32(row) - y
+        if height - fall * dy * dy < INVISIBLE:
+            continue
+        offset = np.uint64(row * TILE)
+        if wanted:
+            gifts = gather_row(work, offset, notes, note, x + slope * dy, look)
+            v, vu, vuu, by_red, by_green, by_blue, by_depth = gifts
+            sums[0] += v
+            sums[1] += vu
+            sums[2] += vuu
+            sums[3] += v * dy
+            sums[4] += v * dy * dy
+            sums[5] += vu * dy
+            sums[6] += by_red
+            sums[7] += by_green
+            sums[8] += by_blue
+            sums[9] += by_depth
+        else:
+            pass_row(work, offset, notes, note, look)
+        note += np.uint64(NOTE)
+
+
+@kernel
+def load_gradients(work: Array, left: int, top: int, images: Arrays, gradients: Arrays) -> None:
+    """Turn the gradients by rgb, depth and alpha of a tile's pixels into those of the blended sums, 0 off the image."""
+    rgb, depth, alpha, linear = images
+    rgb_grad, depth_grad, alpha_grad = gradients
+    for i in range(GRADIENTS, GRADIENTS + 5 * PLANE):
+        work[i] = ZERO
+    for row in range(min(TILE, depth.shape[0] - top)):
+        for column in range(min(TILE, depth.shape[1] - left)):
+            i, y, x = GRADIENTS + row * TILE + column, top + row, left + column
+            for channel in range(3):
+                slope = srgb_slope(linear[y, x, channel], rgb[y, x, channel])
+                work[i + channel * PLANE] = rgb_grad[y, x, channel] * slope
+            work[i + 4 * PLANE] = alpha_grad[y, x]
+            if alpha[y, x] > ZERO:
+                by_sum = depth_grad[y, x] / alpha[y, x]
+                work[i + 3 * PLANE] = by_sum
+                work[i + 4 * PLANE] -= by_sum * depth[y, x]
+
+
+@kernel
+def backward_tile(room: Arrays, records: Array, ids: Array, wanted: Array, left: int, top: int, sums: Array) -> None:
+    """The gradients of one tile, whose list is `ids` [n], for the entries that are wanted, [n] bool.
+
+    Args:
+        room: [WORKSPACE], its gradients loaded; [NOTES], room for notes; [CHUNK], where each Gaussian's notes begin.
+        sums: [m, SUMS], one row for each wanted entry, in the list's order.
+    """
+    work, notes, first_notes = room
+    chunks = (len(ids) + CHUNK - 1) // CHUNK
+    before = np.empty((chunks, PLANE), np.float32)  # the light that reaches each chunk
+    work[:PLANE] = ONE
+    work[BEHIND : BEHIND + PLANE] = ZERO
+    for chunk in range(chunks):
+        before[chunk] = work[:PLANE]
+        if chunk < chunks - 1:
+            replay(work, notes, records, ids[chunk * CHUNK : (chunk + 1) * CHUNK], left, top, first_notes)
+    slot = len(sums)
+    for chunk in range(chunks - 1, -1, -1):
+        work[:PLANE] = before[chunk]
+        part = ids[chunk * CHUNK : (chunk + 1) * CHUNK]
+        drawn = replay(work, notes, records, part, left, top, first_notes)
+        for k in range(len(part) - 1, -1, -1):
+            if slot == 0:
+                return
+            asks = wanted[chunk * CHUNK + k]
+            slot -= asks
+            if k < drawn:
+                own = sums[slot if asks else 0]
+                walk_back(work, notes, first_notes[k], records[part[k]], left, top, asks, own)
+
+
+@kernel
+def backward_tiles(
+    first: int, last: int, tiles: Array, lists: TileLists, wanted: Array, records: Array,
+    images: Arrays, gradients: Arrays, slots: Array, sums: Array,
+) -> None:  # fmt: skip
+    """The gradients of tiles first..last of the list `tiles` [K], for the entries that are wanted, [E] bool.
+
+    Args:
+        slots: [T + 1] int64, where each tile's rows in `sums` begin.
+        sums: [M, SUMS] float32, zeros.
+    """
+    room = np.empty(WORKSPACE, np.float32), np.empty(NOTES, np.float32), np.empty(CHUNK, np.uint64)
+    columns = (images[1].shape[1] + TILE - 1) // TILE
+    for k in range(first, last):
+        tile = tiles[k]
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        load_gradients(room[0], left, top, images, gradients)
+        part, own = slice(lists.starts[tile], lists.starts[tile + 1]), sums[slots[tile] : slots[tile + 1]]
+        backward_tile(room, records, lists.ids[part], wanted[part], left, top, own)
+
+
+@kernel
+def collect_sums(first: int, last: int, share: int, rows: Array, sums: Array, table: Array) -> None:
+    """Add sums [M, SUMS] to their rows [M] of the table [G, SUMS], for rows first·share to last·share, in order."""
+    for slot in range(len(rows)):
+        row = rows[slot]
+        if first * share <= row < last * share:
+            for s in range(SUMS):
+                table[row, s] += sums[slot, s]
+
+
+@kernel
+def project_backward(
+    start: int, stop: int, scene: Arrays, camera: KernelCamera, table: Array, gradients: Arrays
+) -> None:
+    """Gradients of Gaussians start..stop of one set, by its five arrays; arithmetic is float64 as in `project_chunk`.
+
+    `table` [N, SUMS] is what the pixels give to each Gaussian of the set (see SUMS). All zeros mean that no pixel saw
+    it; the gradients are then left as they are.
+    """
+    (means, quats, scales, opacities, _), lens, pose = scene, camera.lens, camera.pose
+    means_grad, quats_grad, scales_grad, opacities_grad, colors_grad = gradients
+    local, factor_grad, rotation_grad, jacobian_grad = np.empty(3), np.empty((2, 3)), np.empty((3, 3)), np.empty((2, 3))
+    for i in range(start, stop):
+        row = table[i]
+        if not row.any():
+            continue
+        colors_grad[i, 0], colors_grad[i, 1], colors_grad[i, 2] = row[6], row[7], row[8]
+        opacities_grad[i] = row[0] / opacities[i]
+        for a in range(3):
+            local[a] = pose[a, 0] * means[i, 0] + pose[a, 1] * means[i, 1] + pose[a, 2] * means[i, 2] + pose[a, 3]
+        nearness = 1.0 / local[2]
+        j, r = jacobian(local[0] * nearness, local[1] * nearness, nearness, lens), rotation(quats[i])
+        u_grad, v_grad = splat_backward(row, factor(j, pose, r, scales[i]), camera.eps2d, factor_grad)
+        factor_backward(j, pose, r, scales[i], factor_grad, (jacobian_grad, rotation_grad), scales_grad[i])
+        quat_backward(quats[i], rotation_grad, quats_grad[i])
+        local_grad = point_backward(local, lens, jacobian_grad, u_grad, v_grad, row[9])
+        for b in range(3):
+            means_grad[i, b] = pose[0, b] * local_grad[0] + pose[1, b] * local_grad[1] + pose[2, b] * local_grad[2]
+
+
+@kernel
+def splat_backward(row: Array, factors: Numbers, eps2d: float, factor_grad: Array) -> tuple[float, float]:
+    """From sums over pixels to the gradients of the factor M, and of the centre, which are returned.
+
+    For a pixel at d from the centre, ∂ln(alpha)/∂centre = p and ∂ln(alpha)/∂Σ = ½ p pᵀ with p = Σ⁻¹ d.
+    In the blender's terms p = (A·u, D·dy - k·A·u), with A = Σyy/det, D = 1/Σyy and the slope k = Σxy/Σyy.
+    """
+    _, xy, yy, det = spread(factors, eps2d)
+    across, fall = yy / det, 1.0 / yy
+    skew = xy / yy * across
+    grad_xx = across * across * row[2]
+    grad_xy = across * fall * row[5] - across * skew * row[2]
+    grad_yy = fall * fall * row[4] - 2.0 * fall * skew * row[5] + skew * skew * row[2]
+    for k in range(3):
+        m, n = factors[k], factors[3 + k]
+        factor_grad[0, k] = grad_xx * m + grad_xy * n
+        factor_grad[1, k] = grad_xy * m + grad_yy * n
+    return across * row[1], fall * row[3] - skew * row[1]
+
+
+@kernel
+def factor_backward(
+    j: Numbers, pose: Array, r: Numbers, scale: Array, factor_grad: Array, grads: Arrays, scale_grad: Array
+) -> None:
+    """From the gradient of the factor M = J W R S to those of the Jacobian J and the rotation R, and to the scales'."""
+    jacobian_grad, rotation_grad = grads
+    jacobian_grad[:, :] = 0.0
+    for k in range(3):
+        scale_grad[k] = 0.0
+        for b in range(3):
+            # (J W) is two rows; its column b meets the axis' component b.
+            h0, h1 = j[0] * pose[0, b] + j[1] * pose[2, b], j[2] * pose[1, b] + j[3] * pose[2, b]
+            along, axis = h0 * factor_grad[0, k] + h1 * factor_grad[1, k], r[3 * b + k]
+            scale_grad[k] += along * axis
+            rotation_grad[b, k] = along * scale[k]
+            for a in range(2):
+                for c in range(3):
+                    jacobian_grad[a, c] += factor_grad[a, k] * scale[k] * axis * pose[c, b]
+
+
+@kernel
+def quat_backward(quat: Array, r: Array, grad: Array) -> None:
+    """From the gradient of a rotation matrix to that of the quaternion before normalisation."""
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    norm = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w * norm, x * norm, y * norm, z * norm
+    gw = 2 * (x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]))
+    gx = 2 * (w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0])) - 4 * x * (r[1, 1] + r[2, 2])
+    gy = 2 * (w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1])) - 4 * y * (r[0, 0] + r[2, 2])
+    gz = 2 * (w * (r[1, 0] - r[0, 1]) + x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1])) - 4 * z * (r[0, 0] + r[1, 1])
+    along = gw * w + gx * x + gy * y + gz * z
+    grad[0], grad[1] = (gw - along * w) * norm, (gx - along * x) * norm
+    grad[2], grad[3] = (gy - along * y) * norm, (gz - along * z) * norm
+
+
+@kernel
+def point_backward(
+    local: Array, lens: Array, jacobian_grad: Array, u_grad: float, v_grad: float, depth_grad: float
+) -> tuple[float, float, float]:
+    """The gradient of the centre in the camera's space, from its pixel, its Jacobian and its depth."""
+    x, y, z = local
+    tx, ty = min(lens[5], max(lens[4], x / z)), min(lens[7], max(lens[6], y / z))
+    fx, fy = lens[0] / z, lens[1] / z
+    x_grad, y_grad = fx * u_grad, fy * v_grad
+    z_grad = depth_grad - (x_grad * x + y_grad * y) / z
+    z_grad -= (fx * jacobian_grad[0, 0] + fy * jacobian_grad[1, 1]) / z
+    z_grad += (fx * tx * jacobian_grad[0, 2] + fy * ty * jacobian_grad[1, 2]) / z
+    if lens[4] <= x / z <= lens[5]:
+        x_grad -= fx / z * jacobian_grad[0, 2]
+        z_grad += fx / z * tx * jacobian_grad[0, 2]
+    if lens[6] <= y / z <= lens[7]:
+        y_grad -= fy / z * jacobian_grad[1, 2]
+        z_grad += fy / z * ty * jacobian_grad[1, 2]
+    return x_grad, y_grad, z_grad
