@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from command import Run
 
 from spackle.training.checkpoint import Checkpoint, load_checkpoint
 
@@ -28,6 +30,11 @@ def state(folder: Path) -> Checkpoint:
     checkpoint = load_checkpoint(folder, print)
     assert checkpoint is not None
     return checkpoint
+
+
+def losses_of(done: Run) -> list[float]:
+    """The loss of each step that a run has logged."""
+    return [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
 
 
 def assert_same_weights(one: Path, other: Path, tolerance: float = 0.0) -> None:
@@ -56,6 +63,13 @@ from spackle.training import train
 rate = train.learning_rate
 train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
 """
+
+
+def run_killed(arguments: Sequence[str], step: int) -> None:
+    """Run a command that is killed in a step, see `killed_at`."""
+    process = started(arguments, killed_at(step))
+    said = process.communicate()[1]
+    assert process.returncode == -signal.SIGKILL, said
 
 
 def run_two(arguments: Sequence[str], code: str = "") -> None:

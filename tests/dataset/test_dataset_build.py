@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import shutil
 import signal
 import sys
@@ -34,7 +33,7 @@ from spackle.render import get_renderer
 from spackle.training.recipe import DataRecipe
 from spackle.training.samples import digest_of_samples
 from spackle.training.sources import find_sources, open_pseudo, pseudo_view, views_with_holes
-from spackle.workers.local import results_of
+from spackle.workers import results_of
 
 # The same bytes, however --------------------------------------------------------------------------
 
@@ -85,8 +84,8 @@ def test_a_killed_build_goes_on_and_ends_the_same(
 
 
 @pytest.mark.parametrize("more", [(), pytest.param(("--ray", "local"), marks=pytest.mark.slow)])
-def test_workers_end_with_a_killed_build(whole: Path, place: Path, tmp_path: Path, more: tuple[str, ...]) -> None:
-    out, note = tmp_path / "out", tmp_path / "processes"
+def test_workers_end_with_a_killed_build(place: Path, tmp_path: Path, more: tuple[str, ...]) -> None:
+    note = tmp_path / "processes"
     if more:
         pytest.importorskip("ray")
     patch = f"""
@@ -95,7 +94,7 @@ def dying(*arguments):
         subprocess.run(["ps", "-eo", "pid=,ppid=,args="], stdout=file)
     die()
 build._Build._keep = dying"""
-    process = dying_build(tmp_path / "script.py", patch, place, out, "--workers", 2, *more)
+    process = dying_build(tmp_path / "script.py", patch, place, tmp_path / "out", "--workers", 2, *more)
     assert process.wait() == -signal.SIGKILL
     # Ray's own agents take a minute.
     pids = [pid for pid, args in below(process.pid, note.read_text()) if "agent" not in args.lower()]
@@ -104,8 +103,6 @@ build._Build._keep = dying"""
     while any(is_alive(pid) for pid in pids):
         assert time.monotonic() < deadline, "a worker goes on without its main process"
         time.sleep(0.05)
-    assert build(place, out).code == 0
-    assert content(out) == content(whole)
 
 
 def below(top: int, listing: str) -> list[tuple[int, str]]:
@@ -146,25 +143,10 @@ def test_a_lost_shard_is_made_again(whole: Path, place: Path, copy: Path) -> Non
     part.parent.mkdir()
     part.write_bytes((whole / "shard-000001.tar").read_bytes()[:1000])
     done = build(place, copy)
-    assert done.code == 2
-    assert f"{part}: not a photo of a dataset, or damaged" in done.lines[-1]
+    assert (done.code, f"{part}: not a photo of a dataset, or damaged" in done.lines[-1]) == (2, True), done.err
     part.unlink()
     assert build(place, copy).code == 0
     assert content(copy) == content(whole)
-
-
-def test_a_full_disk_is_a_line_and_the_build_goes_on_later(whole: Path, place: Path, tmp_path: Path) -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        done = build(place, tmp_path / "out")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert done.code == 2
-    assert "cannot write" in done.lines[-1]
-    assert names_in(tmp_path / "out" / "parts") == set()
-    assert build(place, tmp_path / "out").code == 0
-    assert content(tmp_path / "out") == content(whole)
 
 
 # Photos -------------------------------------------------------------------------------------------
@@ -252,8 +234,7 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--views", 101), "'--views': Input should be less than"), (("--shard-size", 0), "--shard-size"),
-        (("--seed", -1), "--seed"), (("--sample", 0), "--sample"), (("--threads", 0), "--threads"),
+        (("--views", 101), "'--views': Input should be less than"), (("--threads", 0), "--threads"),
         (("--disparity", 0.5, 0.1), "--disparity 0.5 0.1"), (("--disparity", 0.1, 9), "--disparity 0.1 9"),
         (("--trajectory", "loop"), "'loop' is not one of"), (("--base", "auto"), "--base auto"),
         (("--base", "sharp"), "--depth"), (("--depth", __file__), f"--depth {__file__}: no such folder"),
@@ -308,15 +289,10 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -
 
 def test_training_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
-    (tmp_path / "recipe.yaml").write_text(
-        f"""
-data: {{pseudo: {whole}, views: 4, validation_views: 2, crops: 2, cells: 16}}
-loss: {{features: none}}
-optim: {{steps: 2, batch: 2, warmup: 1, precision: fp32}}
-run: {{validate_every: 2, save_every: 2}}
-"""
-    )
-    done = run("train", "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out")
+    (tmp_path / "recipe.yaml").write_text("optim: {precision: fp32}\nloss: {features: none}")
+    words = ["views=4", "validation_views=2", "crops=2", "cells=16", f"pseudo={whole}"]
+    options = [f"data.{word}" for word in words] + ["optim.steps=2", "optim.batch=2", "run.validate_every=2"]
+    done = run("train", "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out", *options)
     assert done.code == 0, done.err
     assert json.loads((tmp_path / "out" / "run.json").read_text())["samples"]["train"] > 0
 

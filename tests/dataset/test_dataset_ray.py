@@ -15,11 +15,11 @@ import pytest
 from command import Run, names_in
 from dataset_builds import build, content, refused
 
+from spackle import workers as on_ray
 from spackle.bases.settings import BaseSettings
-from spackle.dataset.build import DatasetOptions, Made, Maker
+from spackle.dataset.build import DatasetOptions, Maker
 from spackle.dataset.photos import PhotoFile
-from spackle.workers import ray as on_ray
-from spackle.workers.ray import RemoteWorker
+from spackle.workers import RemoteWorker
 
 ray = pytest.importorskip("ray")
 
@@ -40,8 +40,8 @@ def address() -> Iterator[str]:
         process.communicate()
 
 
-def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteWorker]:
-    """Workers of which the first few are killed when they have made this photo, or as they begin."""
+def dying(times: int, notes: Path, where: str = "make") -> type[RemoteWorker]:
+    """Workers of which the first few are killed when they have made the photo number 2, or as they begin."""
 
     def turn() -> None:
         turns = len(list(notes.iterdir()))
@@ -55,9 +55,9 @@ def dying(at: int, times: int, notes: Path, where: str = "make") -> type[RemoteW
                 turn()
             super().begin(expected)
 
-        def make(self, job: PhotoFile, expected: object) -> Made:
-            answer: Made = super().make(job, expected)
-            if where == "make" and job.index == at:
+        def make(self, job: PhotoFile, expected: object) -> Any:
+            answer = super().make(job, expected)
+            if where == "make" and job.index == 2:
                 turn()
             return answer
 
@@ -84,7 +84,7 @@ def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, whole: Path,
 def test_a_killed_workers_photos_are_made_again(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(on_ray, "RemoteWorker", dying(2, 1, tmp_path / "notes"))
+    monkeypatch.setattr(on_ray, "RemoteWorker", dying(1, tmp_path / "notes"))
     done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (0, "", 3), done.err
     assert f"{place}/photos/3.png: at this photo a worker died, and another takes its place" in done.lines[0]
@@ -100,7 +100,7 @@ def test_what_kills_every_worker_ends_the_build(
     place: Path, whole: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str, line: str
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(on_ray, "RemoteWorker", dying(2, 99, tmp_path / "notes", where))
+        patch.setattr(on_ray, "RemoteWorker", dying(99, tmp_path / "notes", where))
         done = on(address, place, tmp_path / "out")
     assert (done.code, done.out, len(done.lines)) == (2, "", 4)
     assert f"{line} for the 4th time" in done.lines[-1]

@@ -11,17 +11,18 @@ from pathlib import Path
 import pytest
 import torch
 from command import Run, names_in, report_of, run
-from photos import metres, picture, read_ply, write_depth, write_photo
+from photos import picture, read_ply, write_photo
 from PIL import Image
 from safetensors.torch import save_file
 from sharp_weights import MICRO
 from torch import Tensor
-from training_runs import one_thread, run_two, state
+from training_runs import losses_of, one_thread, run_two, state
 
 from spackle.bases.sharp.base import TunableSharp
 from spackle.bases.sharp.checkpoint import PARTS, deterministic_weights, expected_shapes
 from spackle.bases.sharp.layers import CONFIGS
 from spackle.dataset import DatasetFiles
+from spackle.dataset.shards import load_manifest
 from spackle.render import get_renderer
 from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, drawn_views, render_photo
 from spackle.training.recipe import Recipe, load_recipe
@@ -32,7 +33,6 @@ __all__ = ["one_thread"]  # a fixture
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 PHOTOS, VIEWS = 3, 5
-NUDGE = 3e-4  # how far weights are moved to see what becomes of it
 RECIPE = """
 data: {pseudo: %s, validation_views: 5}
 loss: {features: none}
@@ -54,43 +54,43 @@ def small() -> Iterator[None]:
         yield
 
 
-def opaque_weights() -> dict[str, Tensor]:
-    """Random ones, but the photo's own view has no holes."""
-    weights = deterministic_weights(expected_shapes(MICRO))
-    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0
-    return weights
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights, a dataset that was built with them, and a recipe."""
     place = tmp_path_factory.mktemp("direct")
-    save_file(opaque_weights(), place / "sharp.safetensors")
+    weights = deterministic_weights(expected_shapes(MICRO))
+    weights["prediction_head.texture_prediction_head.bias"][-2:] = 6.0  # opaque: the photo's own view has no holes
+    save_file(weights, place / "sharp.safetensors")
     (place / "photos").mkdir()
     for number in range(PHOTOS):
         Image.fromarray(picture(WIDTH, HEIGHT)).rotate(180 * number).save(place / "photos" / f"{number}.png")
     Image.fromarray(picture(WIDTH, HEIGHT) // 2).save(place / "photos" / "2.png")  # no two alike
-    done = build(place, place / "data", "--base", "sharp", "-c", place / "sharp.safetensors", "--precision", "fp32")
+    options = (
+        "--views",
+        VIEWS,
+        "--threads",
+        1,
+        "--trajectory",
+        "swipe",
+        "--disparity",
+        0.4,
+        0.4,
+        "--precision",
+        "fp32",
+    )
+    words = (place / "photos", "-o", place / "data", "--base", "sharp", "-c", place / "sharp.safetensors")
+    done = run("dataset", "build", *words, *options)
     assert done.code == 0, done.err
     (place / "recipe.yaml").write_text(RECIPE % (place / "data"))
     return place
 
 
 @pytest.fixture(scope="module")
-def whole(place: Path) -> tuple[Path, Run]:
-    """A run of four steps in one go."""
-    return place / "whole", train(place, place / "whole")
-
-
-@pytest.fixture(scope="module")
-def base(place: Path) -> TunableSharp:
-    """To be read only."""
-    return TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
-
-
-def build(place: Path, output: Path, *more: object) -> Run:
-    options = ("--views", VIEWS, "--threads", 1, "--trajectory", "swipe", "--disparity", 0.4, 0.4)
-    return run("dataset", "build", "--photos", place / "photos", "-o", output, *options, *more)
+def whole(place: Path) -> Path:
+    """The folder of a run of four steps in one go."""
+    done = train(place, place / "whole")
+    assert done.code == 0, done.err
+    return place / "whole"
 
 
 def arguments(place: Path, output: Path, *more: object) -> list[str]:
@@ -102,10 +102,16 @@ def train(place: Path, output: Path, *more: object) -> Run:
     return run(*arguments(place, output, *more))
 
 
+def weights_of(file: Path) -> dict[str, Tensor]:
+    """Of the whole network that a checkpoint, or a decoder with a link to one, stands for."""
+    return TunableSharp.load(file, torch.float32, CPU).network.state_dict()
+
+
 # What learns, and what does not -------------------------------------------------------------------
 
 
-def test_the_first_views_are_those_of_the_dataset(place: Path, base: TunableSharp) -> None:
+def test_the_first_views_are_those_of_the_dataset(place: Path) -> None:
+    base = TunableSharp.load(place / "sharp.safetensors", torch.float32, CPU)
     group = DatasetFiles(place / "data").group(0)
     views = [group.view(index) for index in range(group.views)]
     holes = [float(view.mask.float().mean()) for view in views]
@@ -117,20 +123,10 @@ def test_the_first_views_are_those_of_the_dataset(place: Path, base: TunableShar
     assert torch.equal(batch.alpha < 0.95, batch.hole)
 
 
-def digest_of(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def weights_of(file: Path) -> dict[str, Tensor]:
-    """Of the whole network that a checkpoint, or a decoder with a link to one, stands for."""
-    return TunableSharp.load(file, torch.float32, CPU).network.state_dict()
-
-
 def test_the_loss_falls_and_nothing_but_the_decoder_changes(place: Path, tmp_path: Path) -> None:
     """On one photo, seen again and again."""
     options = ("data.views=1", "optim.steps=8", "optim.lr=2e-3", "optim.min_lr=2e-3", "optim.ema=0")
-    done = train(place, tmp_path / "out", *options)
-    losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+    losses = losses_of(train(place, tmp_path / "out", *options))
     assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
     before, unused = weights_of(place / "sharp.safetensors"), "feature_model.decoder.fusions.4.resnet1."
     for name, tensor in weights_of(tmp_path / "out" / "last.safetensors").items():
@@ -143,8 +139,7 @@ def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: P
     name, losses = "prediction_head.texture_prediction_head.bias", []
     for precision in ("bf16", "fp32"):
         options = ("optim.steps=1", "optim.lr=1e-5", "optim.min_lr=1e-5", f"optim.precision={precision}", "optim.ema=0")
-        done = train(place, tmp_path / precision, *options)
-        losses += [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+        losses += losses_of(train(place, tmp_path / precision, *options))
         weights = weights_of(tmp_path / precision / "last.safetensors")[name]
         moved = (weights - weights_of(place / "sharp.safetensors")[name]).abs()
         assert 0 < float(moved.max()) < 2e-5  # bf16 has no such number beside 6
@@ -154,15 +149,19 @@ def test_in_bf16_the_weights_that_learn_stay_in_float32(place: Path, tmp_path: P
 # Runs ---------------------------------------------------------------------------------------------
 
 
-def test_a_run_leaves_weights_pictures_and_a_report(place: Path, whole: tuple[Path, Run]) -> None:
-    folder, done = whole
-    assert done.code == 0, done.err
-    report = json.loads((folder / "run.json").read_text())
+def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, whole: Path, tmp_path: Path) -> None:
+    report = json.loads((whole / "run.json").read_text())
     assert (report["method"], report["ended"], report["step"]) == ("direct-ft", "steps", 4)
-    assert report["checkpoint"]["sha256"] == digest_of(place / "sharp.safetensors")
+    assert report["checkpoint"]["sha256"] == hashlib.sha256((place / "sharp.safetensors").read_bytes()).hexdigest()
     assert report["history"][0].keys() >= {"loss", "color", "preserve", "hole_psnr", "seen_psnr", "har_after"}
-    with Image.open(folder / "pictures" / "0000004.png") as sheet:
+    with Image.open(whole / "pictures" / "0000004.png") as sheet:
         assert sheet.size == (3 * WIDTH, 2 * HEIGHT)
+    write_photo(tmp_path / "photo.png")
+    options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
+    done = run("predict", *options, "-o", tmp_path, "-c", whole / "best.safetensors")
+    assert done.code == 0, done.err
+    assert report_of(tmp_path / "photo")["base"]["weights"] == "best.safetensors"
+    assert read_ply(tmp_path / "photo" / "base.ply").count > 0
 
 
 @pytest.mark.slow
@@ -186,14 +185,11 @@ def test_a_photo_whose_loss_is_no_number_is_named(place: Path, tmp_path: Path, m
     assert any(f"among {name}" in done.lines[-1] for name in names_in(place / "photos"))
 
 
-def test_each_step_has_the_photos_own_view_and_others_in_turn() -> None:
+def test_a_step_has_the_photos_own_view_and_a_photo_teaches_or_judges(place: Path) -> None:
     drawn = [drawn_views([0, step], VIEWS) for step in range(20)]
     assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
     assert {view for views in drawn for view in views} == set(range(VIEWS))
     assert drawn_views([0, 0], 2) == [0, 1]
-
-
-def test_a_photo_either_teaches_or_judges(place: Path) -> None:
     recipe = load_recipe(Recipe, place / "recipe.yaml", ["data.validation_views=1"])
     task = DirectFt(recipe, CPU, place / "sharp.safetensors")
     assert sorted([*task.learned, *task.validation]) == list(range(PHOTOS))
@@ -212,23 +208,22 @@ def test_a_photo_either_teaches_or_judges(place: Path) -> None:
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
         (["optim.batch=6"], "optim.batch=6: --method direct-ft takes 4 views"),
         (["init=weights.safetensors"], "init=weights.safetensors: --method direct-ft starts from SHARP's checkpoint"),
+        (["--method", "residual"], "sharp.safetensors: --method residual learns without a base"),
     ],
 )
 def test_what_cannot_be_trained_is_said_in_a_line(
-    place: Path, whole: tuple[Path, Run], other_inputs: None, tmp_path: Path, options: list[str], said: str
+    place: Path, whole: Path, other_inputs: None, tmp_path: Path, options: list[str], said: str
 ) -> None:
     done = train(place, tmp_path / "out", *(option.format(place=place) for option in options))
-    assert done.code == 2
-    assert said in done.lines[-1]
+    assert (done.code, said in done.lines[-1]) == (2, True), done.err
     assert not (tmp_path / "out").exists()
 
 
 @pytest.fixture(scope="module")
 def other_inputs(place: Path) -> None:
     """A dataset of another base, and other weights of SHARP."""
-    for number in range(PHOTOS):
-        write_depth(place / "depth" / f"{number}.npy", metres(WIDTH, HEIGHT))
-    assert build(place, place / "rgbd", "--base", "rgbd", "--depth", place / "depth").code == 0
+    manifest = load_manifest(shutil.copytree(place / "data", place / "rgbd"))
+    manifest.model_copy(update={"config": {**manifest.config, "base": {"name": "rgbd"}}}).save(place / "rgbd")
     save_file(deterministic_weights(expected_shapes(MICRO)), place / "other.safetensors")
 
 
@@ -238,21 +233,16 @@ def test_without_weights_a_line_says_where_they_come_from(
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
     words = ("train", "--method", "direct-ft", "--recipe", place / "recipe.yaml", "-o", tmp_path / "out")
     done = run(*words)
-    assert done.code == 2
-    assert "spackle weights get sharp" in done.err
+    assert (done.code, "spackle weights get sharp" in done.err) == (2, True), done.err
     (tmp_path / "weights").mkdir()
     shutil.copy(place / "sharp.safetensors", tmp_path / "weights" / "sharp_2572gikvuh.pt")  # its content tells its kind
     assert run(*words, "optim.steps=1").code == 0
 
 
-def test_a_folder_belongs_to_one_method(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    out = shutil.copytree(whole[0], tmp_path / "out")
+def test_a_folder_belongs_to_one_method_and_one_network(place: Path, whole: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(whole, tmp_path / "out")
     done = run("train", "--recipe", place / "recipe.yaml", "-o", out, "data.cells=16")
-    assert done.code == 2
-    assert f"{out}: holds a run of --method direct-ft" in done.err
-    done = run("train", "--recipe", place / "recipe.yaml", "-o", tmp_path / "new", "-c", place / "sharp.safetensors")
-    assert "sharp.safetensors: --method residual learns without a base" in done.err
-    # A checkpoint of another network.
+    assert (done.code, f"{out}: holds a run of --method direct-ft" in done.err) == (2, True), done.err
     saved = torch.load(out / "checkpoint.pt", weights_only=True)
     name = "prediction_head.geometry_prediction_head.weight"
     saved["network"][name] = saved["network"][name][:2].clone()
@@ -261,15 +251,3 @@ def test_a_folder_belongs_to_one_method(place: Path, whole: tuple[Path, Run], tm
     assert done.code == 2
     assert "its checkpoint is of another network " in done.lines[-1]
     assert name in done.lines[-1]
-
-
-# What comes out predicts --------------------------------------------------------------------------
-
-
-def test_predict_takes_a_decoder_in_place_of_a_checkpoint(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    write_photo(tmp_path / "photo.png")
-    options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
-    done = run("predict", *options, "-o", tmp_path, "-c", whole[0] / "best.safetensors")
-    assert done.code == 0, done.err
-    assert report_of(tmp_path / "photo")["base"]["weights"] == "best.safetensors"
-    assert read_ply(tmp_path / "photo" / "base.ply").count > 0

@@ -1,23 +1,28 @@
-"""The four losses and the reported distances, against numbers worked out by hand."""
+"""The four losses and the reported distances against numbers worked out by hand; the networks that they look with."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spackle.errors import InputError
+from spackle.training import losses
 from spackle.training.losses import (
     PAPER_WEIGHTS,
+    ResNet50,
+    SqueezeNet,
     alpha_loss,
     color_loss,
-    covered,
-    dilate,
     hole_distance,
     hole_psnr,
+    load_features,
     perceptual_loss,
     preserve_loss,
     total_loss,
@@ -54,8 +59,8 @@ def grad(tensor: Tensor) -> Tensor:
 def test_color_is_the_mean_difference_in_each_images_hole() -> None:
     hole = torch.tensor([[[True, False]], [[True, True]], [[False, False]]])
     each = [0.4 / 3, (0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6, 0]
-    assert [color_loss(RGB, TARGET, part[None]).item() for part in hole] == pytest.approx(each)
     rgb, target = RGB.expand(3, -1, -1, -1), TARGET.expand(3, -1, -1, -1)
+    assert [color_loss(RGB, TARGET, part[None]).item() for part in hole] == pytest.approx(each)
     assert color_loss(rgb, target, hole).item() == pytest.approx(sum(each) / 3)
 
 
@@ -99,8 +104,7 @@ def test_preserve_is_the_mean_difference_outside_of_the_hole() -> None:
 
 def perceptual_example() -> tuple[Tensor, Tensor]:
     """Mean square of the target 3/6; left pixels (0, 0.5, 0) and (1, 0, 0)."""
-    target = torch.tensor([[[[1.0, 0, 0], [0, 1, 1]]]])
-    return torch.tensor([[[[0.0, 0.5, 0], [9, 9, 9]]]]), target
+    return torch.tensor([[[[0.0, 0.5, 0], [9, 9, 9]]]]), torch.tensor([[[[1.0, 0, 0], [0, 1, 1]]]])
 
 
 FEATURE_TERM = (1 + 0.5 + 0) / math.sqrt(0.5) / 3
@@ -140,11 +144,11 @@ def test_perceptual_resizes_and_looks_only_near_the_hole(size: int | None, seen:
 def test_dilation_is_a_square_and_a_mask_is_pooled_by_area() -> None:
     mask = torch.zeros(1, 5, 5, dtype=torch.bool)
     mask[0, 1, 2] = True
-    assert dilate(mask, 3)[0].int().tolist() == [[0, 1, 1, 1, 0]] * 3 + [[0] * 5] * 2
+    assert losses.dilate(mask, 3)[0].int().tolist() == [[0, 1, 1, 1, 0]] * 3 + [[0] * 5] * 2
     with pytest.raises(ValueError, match="odd"):
-        dilate(mask, 4)
+        losses.dilate(mask, 4)
     mask = torch.tensor([[[True, True, False, False], [True, False, False, False]]])
-    assert covered(mask, torch.zeros(1, 7, 1, 2)).flatten().tolist() == [0.75, 0]
+    assert losses.covered(mask, torch.zeros(1, 7, 1, 2)).flatten().tolist() == [0.75, 0]
 
 
 LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
@@ -164,13 +168,14 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
 
 
 def test_without_a_hole_there_is_nothing_to_fill() -> None:
-    rgb, target = RGB.clone().requires_grad_(), TARGET
-    alpha = torch.tensor([[[0.0, 0.5]]], requires_grad=True)
-    loss, terms = total_loss(rgb, alpha, target, RGB, NO_HOLE, features=Pixels(1))
+    rgb, alpha = RGB.clone().requires_grad_(), torch.tensor([[[0.0, 0.5]]], requires_grad=True)
+    loss, terms = total_loss(rgb, alpha, TARGET, RGB, NO_HOLE, features=Pixels(1))
     loss.backward()
     assert terms == {"color": 0, "alpha": 0, "preserve": 0, "perceptual": 0}
     assert not grad(rgb).any()
     assert not grad(alpha).any()
+    assert math.isnan(hole_psnr(RGB[0], TARGET[0], NO_HOLE[0]))
+    assert math.isnan(hole_distance(Pixels(1), RGB[0], TARGET[0], NO_HOLE[0]))
 
 
 @pytest.mark.parametrize("weights", [PAPER_WEIGHTS, {"color": 1, "alpha": 2, "perceptual": 3, "preserve": 4}])
@@ -213,5 +218,117 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
 def test_psnr_is_of_the_hole_alone() -> None:
     assert hole_psnr(RGB[0], TARGET[0], LEFT[0]) == pytest.approx(-10 * math.log10((0.01 + 0.09) / 3))
     assert hole_psnr(RGB[0], RGB[0], LEFT[0]) == math.inf
-    assert math.isnan(hole_psnr(RGB[0], TARGET[0], NO_HOLE[0]))
-    assert math.isnan(hole_distance(Pixels(1), RGB[0], TARGET[0], NO_HOLE[0]))
+
+
+# Feature networks ---------------------------------------------------------------------------------
+
+WITHOUT_HEAD = 25_557_032 - 2048 * 1000 - 1000  # parameters of torchvision's ResNet-50 less its classifier
+# Inputs, squeezed and expanded channels of fire2 to fire9, as the paper of SqueezeNet has them in its table 1.
+FIRES = [(96, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128), (256, 48, 192), (384, 48, 192), (384, 64, 256)]
+FIRES += [(512, 64, 256)]
+
+
+@pytest.fixture(scope="module")
+def resnet() -> dict[str, Tensor]:
+    """Random weights, with statistics that are not those of a fresh network, and a classifier."""
+    torch.manual_seed(0)
+    state = dict(ResNet50().state_dict())
+    for name, value in state.items():
+        if name.endswith("running_var"):
+            value.uniform_(0.5, 2)
+    return state | {"fc.weight": torch.randn(1000, 2048), "fc.bias": torch.randn(1000)}
+
+
+@pytest.fixture
+def squeezed() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    shapes = {"conv1": (96, 3, 7, 7), "conv10": (1000, 512, 1, 1)}
+    for number, (inside, squeeze, expand) in enumerate(FIRES, 2):
+        shapes[f"fire{number}/conv1x1_1"] = (squeeze, inside, 1, 1)
+        shapes |= {f"fire{number}/conv{k}x{k}_2": (expand, squeeze, k, k) for k in (1, 3)}
+    arrays = {}
+    for name, shape in shapes.items():
+        fan = np.prod(shape[1:])
+        arrays[f"{name}.w"] = (rng.standard_normal(shape) * np.sqrt(2 / fan)).astype(np.float32)
+        arrays[f"{name}.b"] = rng.standard_normal(shape[0]).astype(np.float32)
+    return arrays
+
+
+@pytest.fixture
+def squeezenet(squeezed: dict[str, np.ndarray], tmp_path: Path) -> SqueezeNet:
+    np.savez(tmp_path / "squeeze.npz", **squeezed)
+    network = load_features("squeezenet", tmp_path / "squeeze.npz")
+    assert isinstance(network, SqueezeNet)
+    return network
+
+
+def test_resnet_has_torchvisions_names_shapes_and_input() -> None:
+    network = ResNet50().eval()
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
+    assert len(shapes) == 320 - 2  # torchvision's, less its classifier
+    assert shapes["bn1.num_batches_tracked"] == ()
+    assert shapes["layer1.0.downsample.0.weight"] == (256, 64, 1, 1)
+    assert shapes["layer3.5.bn3.running_var"] == (1024,)
+    seen: list[Tensor] = []
+    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
+    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_resnet_reads_torchvisions_file(resnet: dict[str, Tensor], tmp_path: Path, older: bool) -> None:
+    """Older files have no counters."""
+    path = tmp_path / "resnet.pth"
+    torch.save({name: v for name, v in resnet.items() if not (older and "num_batches" in name)}, path)
+    network = load_features("resnet50", path)
+    assert isinstance(network, ResNet50)
+    assert all(torch.equal(value, resnet[name]) for name, value in network.state_dict().items())
+    maps = network(torch.rand(1, 3, 64, 96))
+    assert [tuple(m.shape) for m in maps] == [(1, 256, 16, 24), (1, 512, 8, 12), (1, 1024, 4, 6), (1, 2048, 2, 3)]
+    assert all(m.min() >= 0 for m in maps)
+
+
+def test_squeezenet_has_caffes_sizes_and_input(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
+    shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
+    assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
+    images = torch.rand(2, 3, 35, 35, requires_grad=True)
+    torch.stack([m.mean() for m in squeezenet(images)]).sum().backward()
+    assert grad(images).any()
+    assert not any(parameter.requires_grad for parameter in squeezenet.parameters())
+    image = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(2))
+    bgr = 255 * image.numpy()[::-1] - np.array([104, 117, 123])[:, None, None]
+    window = bgr[:, 2 * 4 : 2 * 4 + 7, 2 * 9 : 2 * 9 + 7]
+    cell = np.maximum((squeezed["conv1.w"] * window).sum((1, 2, 3)) + squeezed["conv1.b"], 0)
+    np.testing.assert_allclose(squeezenet(image[None])[0][0, :, 4, 9].numpy(), cell, rtol=1e-4, atol=1e-3)
+
+
+def test_what_is_not_a_networks_weights_is_refused(
+    resnet: dict[str, Tensor], squeezed: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    def refused(name: str, path: Path | None, said: str) -> None:
+        with pytest.raises(InputError) as caught:
+            load_features(name, path)  # type: ignore[arg-type]
+        assert said in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert path is None or str(path) in str(caught.value)
+
+    assert load_features("none", None) is None
+    refused("resnet50", None, "name their file")
+    refused("squeezenet", tmp_path / "missing.npz", "no such weight file")
+    path = tmp_path / "other.pth"
+    path.write_bytes(b"\x80\x02cos\nsystem\n.")  # a pickle that would run a command
+    refused("resnet50", path, "not the weights of resnet50")
+    torch.save({name: value for name, value in resnet.items() if name != "bn1.bias"}, path)
+    refused("resnet50", path, '"bn1.bias"')
+    torch.save([1, 2], path)
+    refused("resnet50", path, "not the weights of resnet50")
+    first = squeezed["conv1.w"]
+    for change, said in (
+        ({"conv1.w": first[:, :, :3, :3]}, "size mismatch for conv1.weight"),
+        ({"conv1.w": np.full_like(first, np.nan)}, "conv1.weight holds numbers that are not finite"),
+        ({"fire10/conv1x1_1.w": first}, '"fire10.conv1x1_1.weight"'),
+        ({"conv1.w": np.array([{}])}, "not the weights of squeezenet"),  # an object: would have to be unpickled
+    ):
+        np.savez(tmp_path / "other.npz", **(squeezed | change))
+        refused("squeezenet", tmp_path / "other.npz", said)

@@ -18,7 +18,7 @@ from command import Run, names_in, run
 from photos import picture
 from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
-from training_runs import assert_same_weights, killed_at, one_thread, run_two, started, state
+from training_runs import assert_same_weights, losses_of, one_thread, run_killed, run_two, state
 
 from spackle.folders import hold
 from spackle.gaussians import Gaussians
@@ -55,9 +55,21 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(place: Path) -> tuple[Path, Run]:
-    """A run of six steps, in one go."""
-    return place / "whole", train(place, place / "whole")
+def done(place: Path) -> Run:
+    return train(place, place / "whole")
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path, done: Run) -> Path:
+    """The folder of a run of six steps, in one go."""
+    assert done.code == 0, done.err
+    return place / "whole"
+
+
+@pytest.fixture
+def out(whole: Path, tmp_path: Path) -> Path:
+    """Its copy, to go on in."""
+    return shutil.copytree(whole, tmp_path / "out")
 
 
 def arguments(place: Path, output: Path, *more: str) -> list[str]:
@@ -71,48 +83,42 @@ def train(place: Path, output: Path, *more: str) -> Run:
 # A run and what comes out -------------------------------------------------------------------------
 
 
-def test_a_run_leaves_weights_pictures_and_a_report(whole: tuple[Path, Run]) -> None:
-    folder, done = whole
-    assert done.code == 0, done.err
-    assert names_in(folder) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
-    report = json.loads((folder / "run.json").read_text())
+def test_a_run_leaves_weights_pictures_and_a_report(whole: Path, done: Run) -> None:
+    assert names_in(whole) >= {"checkpoint.pt", "best.safetensors", "last.safetensors", "run.json", "pictures"}
+    report = json.loads((whole / "run.json").read_text())
     assert (report["ended"], report["step"], report["features"]) == ("steps", 6, "none")
     assert report["history"][0].keys() >= {"loss", "color", "alpha", "preserve", "hole_psnr", "har_before", "har_after"}
-    with Image.open(folder / "pictures" / "0000006.png") as sheet:
+    with Image.open(whole / "pictures" / "0000006.png") as sheet:
         assert sheet.width == 4 * 32
-    average = state(folder).average
+    average = state(whole).average
     for name in ("best", "last"):
-        weights = load_residual(folder / f"{name}.safetensors").state_dict()
+        weights = load_residual(whole / f"{name}.safetensors").state_dict()
         assert all(torch.equal(weights[key], average[key].half().float()) for key in average)
     assert len([line for line in done.lines if "broken.jpg" in line]) == 1
 
 
-def test_curves_are_in_the_logs(whole: tuple[Path, Run]) -> None:
+def test_curves_are_in_the_logs(whole: Path) -> None:
     pytest.importorskip("tensorboard")
-    (events,) = (whole[0] / "logs").iterdir()
+    (events,) = (whole / "logs").iterdir()
     assert all(name in events.read_bytes() for name in (b"train/color", b"train/lr", b"validation/har_after"))
 
 
 # Going on -----------------------------------------------------------------------------------------
 
 
-def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path
-) -> None:
-    process = started(arguments(place, tmp_path / "out"), killed_at(4))
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-    assert state(tmp_path / "out").progress.step == 3
-    done = train(place, tmp_path / "out")
-    assert done.code == 0
-    assert_same_weights(tmp_path / "out", whole[0])
-    assert (tmp_path / "out" / "best.safetensors").read_bytes() == (whole[0] / "best.safetensors").read_bytes()
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(place: Path, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run_killed(arguments(place, out), 4)
+    assert state(out).progress.step == 3
+    assert train(place, out).code == 0
+    assert_same_weights(out, whole)
+    assert (out / "best.safetensors").read_bytes() == (whole / "best.safetensors").read_bytes()
 
 
 def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rate = training.learning_rate
+    out, rate = tmp_path / "out", training.learning_rate
 
     def interrupted(step: int, optim: OptimRecipe) -> float:
         if step == 0:
@@ -121,35 +127,28 @@ def test_ctrl_c_leaves_a_checkpoint_to_go_on_from(
 
     with monkeypatch.context() as patch:
         patch.setattr(training, "learning_rate", interrupted)
-        done = train(place, tmp_path / "out")
-    assert done.code == 130
-    assert state(tmp_path / "out").progress.step == 2
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["ended"] == "stopped"
-    assert train(place, tmp_path / "out").code == 0
-    assert_same_weights(tmp_path / "out", whole[0])
+        assert train(place, out).code == 130
+    assert state(out).progress.step == 2
+    assert json.loads((out / "run.json").read_text())["ended"] == "stopped"
+    assert train(place, out).code == 0
+    assert_same_weights(out, whole)
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    out = shutil.copytree(whole[0], tmp_path / "out")
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(place: Path, whole: Path, out: Path) -> None:
     (out / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
     done = train(place, out)
-    assert done.code == 0
-    assert "going on from the one before it" in done.err
-    assert_same_weights(out, whole[0])
+    assert (done.code, "going on from the one before it" in done.err) == (0, True), done.err
+    assert_same_weights(out, whole)
     for name in ("checkpoint.pt", "checkpoint.previous.pt"):
         (out / name).write_bytes(b"nothing")
     assert train(place, out).code == 2
 
 
-def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, whole: tuple[Path, Run], tmp_path: Path) -> None:
-    out = shutil.copytree(whole[0], tmp_path / "out")
+def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, out: Path) -> None:
     with hold(out / ".lock"):
-        done = train(place, out, "optim.steps=7")
-    assert done.code == 2
-    assert "another run is at work" in done.err
+        assert "another run is at work" in train(place, out, "optim.steps=7").err
     done = train(place, out, "optim.lr=2e-3")
-    assert done.code == 2
-    assert "another recipe (optim.lr differs)" in done.err
+    assert (done.code, "another recipe (optim.lr differs)" in done.err) == (2, True), done.err
     assert train(place, out, "run.validate_every=2", "optim.steps=7").code == 0
     assert state(out).progress.step == 7
     assert train(place, out, "optim.lr=2e-3", "optim.steps=1", "--overwrite").code == 0
@@ -159,25 +158,21 @@ def test_a_folder_belongs_to_one_recipe_and_one_process(place: Path, whole: tupl
 
 
 def test_an_old_run_stays_until_its_successor_is_whole(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def content() -> dict[str, bytes]:
         files = (path for path in out.rglob("[!.]*") if path.is_file() and ".new" not in path.parts)
         return {str(path): path.read_bytes() for path in files}
 
-    out = shutil.copytree(whole[0], tmp_path / "out")
+    def killed(old: str | os.PathLike[str], new: str | os.PathLike[str]) -> None:
+        if Path(new) == out / "checkpoint.pt":  # the last to be moved
+            raise KeyboardInterrupt
+        os.rename(old, new)
+
     before, words = content(), ("optim.lr=2e-3", "run.save_every=2", "--overwrite")
-    process = started(arguments(place, out, *words), killed_at(4))
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    run_killed(arguments(place, out, *words), 4)
     assert content() == before
-    with monkeypatch.context() as patch:  # moved in part, the checkpoint last
-
-        def killed(old: str | os.PathLike[str], new: str | os.PathLike[str]) -> None:
-            if Path(new) == out / "checkpoint.pt":
-                raise KeyboardInterrupt
-            os.rename(old, new)
-
+    with monkeypatch.context() as patch:
         patch.setattr("spackle.training.checkpoint.os.replace", killed)
         assert train(place, out, *words).code == 130
     assert names_in(out / ".new") == {"checkpoint.pt"}
@@ -195,28 +190,20 @@ def test_a_run_without_improvement_ends_and_needs_no_tensorboard(
 ) -> None:
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     done = train(place, tmp_path / "out", "run.validate_every=1", "run.patience=2", "run.min_delta=100")
-    assert done.code == 0
-    assert "pip install 'spackle-nvs[train]'" in done.err
+    assert (done.code, "pip install 'spackle-nvs[train]'" in done.err) == (0, True), done.err
     report = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (report["ended"], report["best_step"], report["stale"]) == ("patience", 1, 2)
 
 
-def test_a_full_disk_is_a_line_and_the_last_checkpoint_stays(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path
-) -> None:
-    out = shutil.copytree(whole[0], tmp_path / "out")
+def test_a_full_disk_is_a_line_and_the_last_checkpoint_stays(place: Path, whole: Path, out: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))
     try:
         done = train(place, out, "optim.steps=7", "run.validate_every=100", "run.save_every=1")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert done.code == 2
-    assert "cannot write" in done.lines[-1]
-    assert_same_weights(out, whole[0])
-
-
-# Several processes --------------------------------------------------------------------------------
+    assert (done.code, "cannot write" in done.lines[-1]) == (2, True), done.err
+    assert_same_weights(out, whole)
 
 
 def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
@@ -245,19 +232,19 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
     if options == ["run.device=cuda"] and torch.cuda.is_available():
         pytest.skip("there is a GPU")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "broken").mkdir()
-    shutil.copy(place / "photos" / "broken.jpg", tmp_path / "broken")
-    filled = [option.format(empty=tmp_path / "empty", broken=tmp_path / "broken") for option in options]
+    folders = {name: tmp_path / name for name in ("empty", "broken")}
+    for folder in folders.values():
+        folder.mkdir()
+    shutil.copy(place / "photos" / "broken.jpg", folders["broken"])
+    filled = [option.format(**folders) for option in options]
     done = run(*arguments(place, tmp_path / "out", *filled), f"data.cache={tmp_path}/cache")
-    assert done.code == 2
-    assert said in done.lines[-1]
+    assert (done.code, said in done.lines[-1]) == (2, True), done.err
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize(("part", "said"), [("rendering", "(loss, "), ("seeds", "(gradient)")])
 def test_a_loss_that_is_no_number_keeps_what_made_it(
-    place: Path, whole: tuple[Path, Run], tmp_path: Path, part: str, said: str
+    place: Path, whole: Path, tmp_path: Path, part: str, said: str
 ) -> None:
     cache = shutil.copytree(place / "cache", tmp_path / "cache")
     for path in cache.glob("*/train/*.safetensors"):
@@ -276,16 +263,12 @@ def test_a_loss_that_is_no_number_keeps_what_made_it(
 # What learns, and what does not -------------------------------------------------------------------
 
 
-def sample_of(base: Gaussians) -> Sample:
+def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
     scene = box_before_wall(width=96, height=80)
+    base = Gaussians(*(t.clone().requires_grad_() for t in scene.base().tensors))
     view = shifted(scene.camera, 0.3)
     rendering = get_renderer().render(base, view)
-    return Sample.of(base, rendering, view, scene.camera, torch.full_like(rendering.rgb, 0.5).detach())
-
-
-def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
-    base = Gaussians(*(t.clone().requires_grad_() for t in box_before_wall(width=96, height=80).base().tensors))
-    sample = sample_of(base)
+    sample = Sample.of(base, rendering, view, scene.camera, torch.full_like(rendering.rgb, 0.5).detach())
     assert not any(tensor.requires_grad for tensor in tensors_of(sample))
     assert not any(tensor.requires_grad for tensor in tensors_of(sample.crop(2, 3, 24, 24)))
     network = ResidualNet()
@@ -298,8 +281,7 @@ def test_gradients_reach_the_network_and_neither_base_nor_cues() -> None:
 
 def test_the_loss_falls_on_samples_that_are_seen_again(place: Path, tmp_path: Path) -> None:
     options = ("optim.batch=4", "optim.steps=12", "optim.warmup=0", "optim.min_lr=1e-4", "optim.ema=0.5")
-    done = train(place, tmp_path / "out", *options)
-    losses = [float(line.split("loss ")[1].split(",")[0]) for line in done.lines if line.startswith("train: ")]
+    losses = losses_of(train(place, tmp_path / "out", *options))
     assert len(losses) == 12
     assert sum(losses[-3:]) < 0.7 * sum(losses[:3])
     first, last = state(tmp_path / "out").progress.history

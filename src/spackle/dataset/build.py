@@ -211,10 +211,10 @@ class Maker:
         with timed("base", seconds):
             prediction, _ = self.base.predict(photo, options.depth_of(file))
         with timed("render", seconds):
-            path = draw_path(options.trajectory, options.disparity, options.seed, file.sha256)
+            kind, disparity = draw_path(options.trajectory, options.disparity, options.seed, file.sha256)
             with reading(file.path, "no camera path: {reason}", ValueError):
                 depth_range = DepthRange.of(prediction.gaussians)
-                cameras = path_cameras(path, prediction.camera.even(), depth_range, options.views)
+                cameras = path_cameras(kind, disparity, prediction.camera.even(), depth_range, options.views)
             stack = render_views(prediction, cameras, self.renderer)
         with timed("inpaint", seconds):
             targets = self.completion.complete(stack)
@@ -230,13 +230,9 @@ class Maker:
                 "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
                 "inpainter": {"name": self.completion.name, "version": self.completion.version},
                 "threshold": MASK_THRESHOLD,
+                "trajectory": {"kind": kind, "disparity": disparity},
             }
-            return pack_sample(key_of(file.index), resize_photo(photo).rgb, stack, targets, path, facts)
-
-
-def key_of(index: int) -> str:
-    """The first part of the names of a photo's files: its place among the photos."""
-    return f"{index:06d}"
+            return pack_sample(file.key, resize_photo(photo).rgb, stack, targets, facts)
 
 
 class _Build:
@@ -297,7 +293,7 @@ class _Build:
 
     def _part(self, index: int) -> Path:
         """Where a photo's sample waits for its shard."""
-        return self.output / PARTS / f"{key_of(index)}.tar"
+        return self.output / PARTS / f"{self.photos[index].key}.tar"
 
     def _keep(self, result: Made) -> None:
         """Write a photo's sample where it waits for its shard, or log why there is none."""
@@ -316,7 +312,7 @@ class _Build:
         indices = range(number * self.size, min((number + 1) * self.size, len(self.photos)))
         if number in self.shards or not self.missing.isdisjoint(indices):
             return
-        parts = [(key_of(i), self._part(i)) for i in indices if i not in self.problems]
+        parts = [(self.photos[i].key, self._part(i)) for i in indices if i not in self.problems]
         skipped = [self._portable(self.photos[i].name, self.problems[i]) for i in indices if i in self.problems]
         with timed("write", self.seconds):
             self.shards[number] = write_shard(parts, self.output / shard_name(number), skipped)

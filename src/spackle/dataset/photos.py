@@ -30,6 +30,11 @@ class PhotoFile:
     name: str  # relative to its folder, with slashes
     sha256: str  # of the file
 
+    @property
+    def key(self) -> str:
+        """The first part of the names of the photo's files in the dataset."""
+        return f"{self.index:06d}"
+
 
 def find_photos(source: Path, folder: Path | None, log: Callable[[str], None]) -> tuple[Path, list[str]]:
     """The folder of the photos, and their names in it, sorted.

@@ -23,7 +23,7 @@ from torch.nn.functional import normalize
 
 from spackle.camera import Camera
 from spackle.color import to_bytes
-from spackle.dataset.views import PathChoice, ViewStack
+from spackle.dataset.views import ViewStack
 from spackle.errors import reading
 from spackle.formats.camera_files import checked_camera, read_matrix
 from spackle.gaussians import Gaussians
@@ -52,13 +52,11 @@ class DatasetView:
     base: Gaussians | None  # where the reader was asked for it
 
 
-def pack_sample(
-    key: str, photo: Tensor, stack: ViewStack, targets: Tensor, path: PathChoice, facts: dict[str, Any]
-) -> bytes:
+def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]) -> bytes:
     """A photo as a stretch of a tar archive: KEY.json, KEY.photo.png, KEY.base.safetensors, then five files a view.
 
     The archive's end is missing, and so are time, owner and machine. `photo` [h, w, 3] (at its working size) and
-    `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold".
+    `targets` [V, H, W, 3] are sRGB; `facts` go into the JSON and hold the mask's "threshold" and the "trajectory".
     """
     files: list[tuple[str, bytes]] = []
     views: list[dict[str, Any]] = []
@@ -74,13 +72,8 @@ def pack_sample(
         }
         files += [(f"{key}.{index:02d}.{kind}.png", data) for kind, data in kinds.items()]
         views.append(_camera_facts(camera) | {"depth_range": list(depth_range), "hole": float(mask.double().mean())})
-    common = {
-        "key": key,
-        "trajectory": {"kind": path.kind, "disparity": path.disparity},
-        "photo_camera": _camera_facts(stack.prediction.camera),
-        "views": views,
-    }
-    text = json.dumps(facts | common, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    common = {"key": key, "photo_camera": _camera_facts(stack.prediction.camera), "views": views}
+    text = json.dumps({**facts, **common}, indent=1, sort_keys=True, allow_nan=False) + "\n"
     first = [(f"{key}.json", text.encode()), (f"{key}.photo.png", encode_rgb(photo))]
     parts: list[bytes] = []
     for name, data in [*first, (f"{key}.base.safetensors", encode_gaussians(stack.prediction.gaussians)), *files]:

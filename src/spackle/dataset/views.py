@@ -31,44 +31,41 @@ SPARE = 6  # frames of a path that may coincide with others
 COMPLETIONS = ("geometry", *INPAINTERS, "none")  # values of --inpainter
 
 
-class PathChoice(NamedTuple):
-    """A camera path around the photo's eye."""
-
-    kind: TrajectoryKind
-    disparity: float
-
-
-def draw_path(kind: TrajectoryKind | None, disparity: tuple[float, float], seed: int, photo_sha256: str) -> PathChoice:
-    """A photo's path, drawn where `kind` is None: the same for the same seed and file, whatever the dataset holds."""
+def draw_path(
+    kind: TrajectoryKind | None, disparity: tuple[float, float], seed: int, photo_sha256: str
+) -> tuple[TrajectoryKind, float]:
+    """A photo's path and its disparity, drawn by seed and file alone; `kind` is kept where it is given."""
     rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
     drawn = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
-    return PathChoice(kind or drawn, float(rng.uniform(*disparity)))
+    return kind or drawn, float(rng.uniform(*disparity))
 
 
-def path_cameras(path: PathChoice, camera: Camera, depth_range: DepthRange, views: int) -> list[Camera]:
+def path_cameras(
+    kind: TrajectoryKind, disparity: float, camera: Camera, depth_range: DepthRange, views: int
+) -> list[Camera]:
     """The photo's own view (`camera`, of the views' size), then others along the path: `views` in all, no two alike.
 
     Frames at the photo's eye and at the end of a closed path repeat others, so the path gets more frames instead.
     ValueError for a path that cannot be, or on which the camera does not move.
     """
+
+    def distance(one: Camera, other: Camera) -> float:
+        return float((one.position.double() - other.position.double()).norm())
+
     cameras = [camera]
-    least = APART * max_offset(camera, path.disparity, depth_range)
+    least = APART * max_offset(camera, disparity, depth_range)
     for frames in range(views - 1, views + SPARE) if least > 0 else ():
         cameras = [camera]
-        for view in trajectory(path.kind, camera, path.disparity, depth_range, frames):
-            if all(_distance(view, other) > least for other in cameras):
+        for view in trajectory(kind, camera, disparity, depth_range, frames):
+            if all(distance(view, other) > least for other in cameras):
                 cameras.append(view)
         if len(cameras) >= views:
             break
     if len(cameras) < views:
-        raise ValueError(f"{path.kind} at a disparity of {path.disparity:g} has no {views} different views")
+        raise ValueError(f"{kind} at a disparity of {disparity:g} has no {views} different views")
     while len(cameras) > views:  # without the one nearest to the photo's
-        del cameras[1 + int(np.argmin([_distance(view, camera) for view in cameras[1:]]))]
+        del cameras[1 + int(np.argmin([distance(view, camera) for view in cameras[1:]]))]
     return cameras
-
-
-def _distance(one: Camera, other: Camera) -> float:
-    return float((one.position.double() - other.position.double()).norm())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,12 +25,11 @@ from spackle.files import write_whole
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of
 from spackle.training.recipe import DataRecipe, Recipe
-from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask, sheet
+from spackle.training.residual import PICTURED, ViewBatch, ViewTask, sheet
 from spackle.training.samples import short_digest
 from spackle.training.sources import open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
-BASE = "sharp"  # the base whose decoder can learn
 VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
 
 
@@ -42,8 +41,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
     with enough_memory(*advice):
-        place = place_of(renderer)
-        gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera), place)
+        gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera), place_of(renderer))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
 
@@ -94,11 +92,9 @@ class DirectFt(ViewTask):
     def batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
         """Views of one photo: in a step its own and others at random, for validation all; InputError for a bad file."""
         (item,) = items
-        if step is None:
-            group = self.files.group(self.validation[item])
-            return [group.view(index) for index in range(group.views)]
-        group = self.files.group(self.learned[item])
-        return [group.view(index) for index in drawn_views([self.recipe.run.seed, step, item], group.views)]
+        group = self.files.group((self.validation if step is None else self.learned)[item])
+        drawn = range(group.views) if step is None else drawn_views([self.recipe.run.seed, step, item], group.views)
+        return [group.view(index) for index in drawn]
 
     def complete(self, network: nn.Module, batch: Sequence[DatasetView]) -> ViewBatch:
         return render_photo(network, self.base, batch, self.renderer)
@@ -111,7 +107,7 @@ class DirectFt(ViewTask):
             group = self.files.group(place)
             done = self.complete(network, [group.view(0), group.view(int(np.argmax(group.holes)))])
             rows += zip(done.base_rgb, done.rgb, done.target, strict=True)
-        return sheet(rows, PICTURE_SIDE)
+        return sheet(rows)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
         return [self.files.samples[self.learned[item]][1].photo for item in items]
@@ -134,7 +130,7 @@ def _divided(files: DatasetFiles, data: DataRecipe, weights_sha256: str) -> tupl
     InputError for a dataset of another base or of other weights than those that learn, or of a single photo.
     """
     base = files.manifest.config.get("base", {})
-    if base.get("name") != BASE:
+    if base.get("name") != "sharp":
         raise InputError(
             f"{data.pseudo}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
             "build one with --base sharp"
@@ -153,7 +149,7 @@ def _divided(files: DatasetFiles, data: DataRecipe, weights_sha256: str) -> tupl
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:
-    """The checkpoint that learns, held to its record where it was downloaded."""
+    """The checkpoint that learns, checked by the published digest where it was downloaded."""
     path = checkpoint or installed("sharp")
     if path is None:
         raise InputError(

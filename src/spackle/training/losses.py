@@ -1,15 +1,13 @@
-"""The four terms of eq. 6 as pure functions (paper, "Training Details and Loss Weights"), and two reported numbers: how
-far a filled hole is from the truth.
+"""The four terms of eq. 6 as pure functions, and two reported numbers: how far a filled hole is from the truth.
 
 They compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with the `target` [B, H, W, 3] in
 the `hole` [B, H, W] bool, and with `base_rgb` [B, H, W, 3], the same view of the base alone, outside of it. Each is a
-mean over the pixels of an image that it is about, then over the images of the batch: a small hole counts as much as a
-large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean of the
-losses of its images, however processes divide them.
+mean over an image's pixels inside or outside of the hole, then over the images of the batch: a small hole counts as
+much as a large one, and an image without such pixels gives 0, differentiable still. So the loss of a batch is the mean
+of the losses of its images, however processes divide them.
 
-The perceptual term and `hole_distance` look through a frozen network. The paper's is a ResNet-50; SqueezeNet 1.0 is the
-small one, 3 MB and many times faster. Both give the last map of each of their four resolutions: 1/4 to 1/32 of the
-image, and 1/2 to 1/16.
+The perceptual term and `hole_distance` look through a frozen network (paper, "Training Details and Loss Weights"): the
+paper's ResNet-50, or SqueezeNet 1.0, 3 MB and many times faster.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ SQUEEZED = dict(enumerate([(96, 16), (128, 16), (128, 32), (256, 32), (256, 48),
 
 
 class FeatureNet(nn.Module):
-    """[B, 3, H, W] sRGB 0..1 to feature maps [B, C, h, w], fine to coarse; gradients go to the images alone."""
+    """[B, 3, H, W] sRGB 0..1 to four feature maps [B, C, h, w], fine to coarse; gradients go to the images alone."""
 
     name: str  # in reports
     head: str  # how the classifier's names begin, which a file may hold and nothing here uses

@@ -36,7 +36,6 @@ from spackle.training.train import Task
 
 MIN_AUX = 64  # aux Gaussians of a view, however small its holes (paper, "Training Details and Loss Weights")
 PICTURED = 6  # views in the picture
-PICTURE_SIDE = 512  # pixels of a picture's longer side
 CACHE = "cache"  # in the output, where the recipe names no other folder
 
 
@@ -126,8 +125,8 @@ def parameters(network: nn.Module) -> dict[str, int]:
     return counts
 
 
-def sheet(rows: Sequence[Sequence[Tensor]], side: int) -> Tensor:
-    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` long; narrower rows are black at their end."""
+def sheet(rows: Sequence[Sequence[Tensor]], side: int = 512) -> Tensor:
+    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` pixels long; narrower rows are black at their end."""
     shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
     widest = max(row.shape[1] for row in shown)
     return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1])) for row in shown])
@@ -234,7 +233,7 @@ class ResidualTask(ViewTask):
         items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED]
         batch = self.batch(None, items)
         done, plain = self.complete(network, batch), self.complete(None, batch)
-        return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)), PICTURE_SIDE)
+        return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)))
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
         return [self.learned[item].name for item in items]

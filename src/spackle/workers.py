@@ -1,9 +1,16 @@
-"""Workers on a Ray cluster, with the same results as those here (optional: pip install 'spackle-nvs[ray]')."""
+"""Photos shared by processes, here or on a Ray cluster: each sets up once, and results come as they are made.
+
+Ray (optional: pip install 'spackle-nvs[ray]') gives the same results as the processes of this machine.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
+import itertools
 import logging
+import multiprocessing
 import os
 import signal
 import socket
@@ -11,21 +18,148 @@ import subprocess
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager
+from multiprocessing import connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import torch
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.folders import differences
-from spackle.workers.local import QUEUED, J, PhotoWorker, R, Workers, at_work_here
 
-ANSWER_S = 30.0  # for a cluster to answer
+QUEUED = 2  # jobs of a worker: the one it works on, and the next; results that are not yet taken use memory
+MAX_WORKERS = 1024
+ANSWER_S = 30.0  # for a Ray cluster to answer
 START_S = 600.0  # for a worker to start where there is none, on a cluster that has room for it
 RETRIES = 3  # of a photo whose worker died
 Log = Callable[[str], None]
+R = TypeVar("R")
+
+
+class PhotoWorker(Protocol):
+    """Does one job after the other. A job is pickled, and its `path` names the photo in messages."""
+
+    @property
+    def setup(self) -> Mapping[str, Any]:
+        """What decides its results besides the jobs, ready for JSON: the same on every machine."""
+
+    def inputs(self, job: Any) -> object:
+        """Digests of the files that a job reads, as they lie on this machine."""
+
+    def make(self, job: Any) -> Any:
+        """The result, which is pickled; InputError where no job can be done."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Workers:
+    """The number of processes, and where they work."""
+
+    count: int = 1
+    threads: int = 2  # of each
+    ray: str | None = None  # address of their cluster; this machine where None
+    gpu: bool = False  # each takes one, on a cluster that has any
+
+    def check(self) -> None:
+        """InputError for a number out of bounds."""
+        for name, value in (("--workers", self.count), ("--threads", self.threads)):
+            if not 1 <= value <= MAX_WORKERS:
+                raise InputError(f"{name} must be between 1 and {MAX_WORKERS}, got {value}")
+
+
+@contextlib.contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """Compute with this number of threads during the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def at_work(
+    ray: Any,
+    workers: Workers,
+    open_worker: Callable[[], PhotoWorker],
+    jobs: Sequence[Any],
+    log: Log,
+    stop: Callable[[], bool],
+) -> AbstractContextManager[Iterator[Any]]:
+    """Results as they come, in any order: from this process with one worker, from several, or on the cluster `ray`.
+
+    Each process calls `open_worker`, which is pickled, once. InputError where no job can be done. Where SIGTERM, of
+    which `stop` tells, ends the processes of this machine, the results end, too.
+    """
+    if ray is None:
+        return at_work_here(workers, open_worker, jobs, stop)
+    return contextlib.closing(_results(ray, workers, open_worker, jobs, log))
+
+
+# On this machine ----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def at_work_here(
+    workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], stop: Callable[[], bool]
+) -> Iterator[Iterator[Any]]:
+    """As `at_work`, on this machine; InputError also if a worker dies, unless `stop` says why."""
+    if workers.count == 1 or len(jobs) < 2:
+        with threads_of_torch(workers.threads):
+            yield map(open_worker().make, jobs)
+        return
+    count = min(workers.count, len(jobs))
+    spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(workers.threads, open_worker))
+    try:
+        yield results_of((pool.submit(_make, job) for job in jobs), QUEUED * count, stop)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], bool] = lambda: False) -> Iterator[R]:
+    """Results as they come, of at most `most` futures at a time; no more once SIGTERM came to all processes."""
+    left, pending = iter(futures), set[Future[R]]()
+    try:
+        while pending := pending | set(itertools.islice(left, most - len(pending))):
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+    except BrokenProcessPool as error:
+        if not stop():
+            raise InputError(
+                "a worker process died, most likely for want of memory: take fewer --workers; the same command goes on"
+            ) from error
+
+
+_open_worker: Callable[[], PhotoWorker]  # of a worker process; its errors belong to a job's result
+
+
+def _start(threads: int, open_worker: Callable[[], PhotoWorker]) -> None:
+    """Begin as a worker, which leaves Ctrl-C to the main process and ends with it."""
+    global _open_worker
+    _open_worker = functools.cache(open_worker)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    torch.set_num_threads(threads)
+
+
+def _make(job: Any) -> Any:
+    return _open_worker().make(job)
+
+
+def _end_with(sentinel: int) -> None:
+    """A worker whose main process was killed would wait for ever."""
+    connection.wait([sentinel])
+    os._exit(1)
+
+
+# On a Ray cluster ---------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -106,7 +240,7 @@ def gpus_of(workers: Workers, nodes: Sequence[Mapping[str, Any]]) -> int:
 class RemoteWorker:
     """A `PhotoWorker` on a node, which has to see the same files as the main process."""
 
-    def __init__(self, open_worker: Callable[[], PhotoWorker[Any, Any]], threads: int, folder: str) -> None:
+    def __init__(self, open_worker: Callable[[], PhotoWorker], threads: int, folder: str) -> None:
         self.open_worker, self.node = open_worker, f"node {socket.gethostname()}"
         torch.set_num_threads(threads)
         with contextlib.suppress(OSError):  # without this folder of the main process, its relative paths fail later
@@ -135,27 +269,9 @@ class RemoteWorker:
         return self.worker.make(job)
 
 
-def at_work(
-    ray: Any,
-    workers: Workers,
-    open_worker: Callable[[], PhotoWorker[J, R]],
-    jobs: Sequence[J],
-    log: Log,
-    stop: Callable[[], bool],
-) -> AbstractContextManager[Iterator[R]]:
-    """Results as they come, in any order: from this process with one worker, from several, or on the cluster `ray`.
-
-    Each process calls `open_worker`, which is pickled, once. InputError where no job can be done. Where SIGTERM, of
-    which `stop` tells, ends the processes of this machine, the results end, too.
-    """
-    if ray is None:
-        return at_work_here(workers, open_worker, jobs, stop)
-    return contextlib.closing(_results(ray, workers, open_worker, jobs, log))
-
-
 def _results(
-    ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker[J, R]], jobs: Sequence[J], log: Log
-) -> Generator[R, None, None]:
+    ray: Any, workers: Workers, open_worker: Callable[[], PhotoWorker], jobs: Sequence[Any], log: Log
+) -> Generator[Any, None, None]:
     """As `at_work`, on the cluster; InputError also for a node unlike the others.
 
     A worker that dies is logged and replaced, and its jobs are queued again; InputError after `RETRIES` deaths at one
@@ -164,8 +280,8 @@ def _results(
     here, queue, deaths = open_worker(), deque(jobs), Counter[Path | None]()  # deaths by photo; None as workers start
     gpus = gpus_of(workers, ray.nodes())
     kind = ray.remote(num_cpus=workers.threads, num_gpus=gpus, max_restarts=0)(RemoteWorker)
-    queued: dict[Any, list[J]] = {}  # of each worker that has started; it works on the first
-    calls: dict[Any, tuple[Any, J | None]] = {}  # worker and job of each awaited answer; no job as it starts
+    queued: dict[Any, list[Any]] = {}  # of each worker that has started; it works on the first
+    calls: dict[Any, tuple[Any, Any]] = {}  # worker and job of each awaited answer; no job as it starts
     missing = min(workers.count, len(jobs))
     try:
         while queue or any(queued.values()):
