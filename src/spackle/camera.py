@@ -64,7 +64,7 @@ class Camera:
         factors = torch.tensor([width / self.width, height / self.height, 1.0]).to(self.K)
         return dataclasses.replace(self, K=self.K * factors[:, None], width=width, height=height)
 
-    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+    def cropped(self, left: float, top: float, width: int, height: int) -> Camera:
         """The width×height pixels of this view that begin at (left, top)."""
         K = self.K.clone()
         K[0, 2] -= left

@@ -48,7 +48,7 @@ class Photo:
     focal_px: float  # in pixels of `rgb`
     focal_source: str  # "--focal-px", "--focal-mm", "--fov", "EXIF" or "default 30 mm"
     path: Path
-    frame: PhotoFrame | None = None  # that the file has around `rgb`, in the file's pixels
+    frame: PhotoFrame | None = None  # that was cut off, in pixels of `rgb`
 
     def __repr__(self) -> str:
         lens = f"focal length {self.focal_px:.4g} px ({self.focal_source})"
@@ -66,12 +66,16 @@ class Photo:
     def framed_size(self) -> tuple[int, int]:
         """(width, height) of the file's picture, of a photo at its full size."""
         left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
-        return self.width + left + right, self.height + top + bottom
+        return round(self.width + left + right), round(self.height + top + bottom)
 
     @property
     def camera(self) -> Camera:
-        """The photo's own camera, at the world's origin."""
-        return Camera.from_focal(self.focal_px, self.width, self.height)
+        """The photo's own camera, at the world's origin; a frame that was cut off has moved the principal point."""
+        camera = Camera.from_focal(self.focal_px, self.width, self.height)
+        if self.frame is not None:
+            left, top, right, bottom = self.frame.widths
+            camera.K[:2, 2] += camera.K.new_tensor([right - left, bottom - top]) / 2
+        return camera
 
 
 def load_photo(
@@ -93,7 +97,7 @@ def load_photo(
         focal_px: focal length in pixels of the upright photo.
         focal_mm: focal length as its 35 mm film equivalent, by the diagonal.
         fov: horizontal field of view in degrees.
-        keep_frame: otherwise a uniform frame around the picture is cut off.
+        keep_frame: otherwise a uniform frame around the picture is cut off, unless a focal length is given.
 
     Raises:
         InputError: a missing, broken or too large file, or a senseless focal length.
@@ -106,14 +110,10 @@ def load_photo(
         return _to_rgb(_upright(image), path), tags
 
     rgb, exif = read_image(path, read)
-    frame = None if keep_frame else find_frame(rgb)
     height, width = rgb.shape[:2]
-    if frame is not None:
-        # A frame is added after the picture was taken: lens and principal point are those of the picture inside.
-        rgb = frame.inside(rgb, width, height)
-        height, width = rgb.shape[:2]
     focal, source = focal_length(path, width, height, exif, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
-    return Photo(rgb, focal, source, Path(path), frame)
+    frame = None if keep_frame or source.startswith("--") else find_frame(rgb)
+    return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, Path(path), frame)
 
 
 def focal_length(
@@ -164,7 +164,8 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
         rgb[..., channel] = torch.from_numpy(resized).clamp_(0, 1)
 
     run_chunks(resize, 3, 1)
-    return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width)
+    frame = photo.frame and photo.frame.scaled(width / photo.width, height / photo.height)
+    return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width, frame=frame)
 
 
 def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:

@@ -250,7 +250,8 @@ def predict(
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
-        keep_frame: keep a uniform frame around a file's picture, which is otherwise cut off.
+        keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
+            focal length is given.
         focal_px: focal length of a photo's file in pixels; by default the file's own, see `load_photo`.
         focal_mm: its 35 mm film equivalent, in its place.
         fov: horizontal field of view in degrees, in its place.
@@ -269,7 +270,9 @@ def predict(
             raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
         loaded = photo
     else:
-        loaded = load_photo(photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame)
+        loaded = load_photo(
+            photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame or depth is not None
+        )
     source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
     options = Options(BaseSettings(depth=source), PathOptions(kind, disparity), FillOptions(fill=fill))
     opened = open_base(options.base) if base is None else open_loaded(base)

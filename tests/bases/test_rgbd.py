@@ -162,7 +162,7 @@ def test_the_lens_is_the_calibrations_else_the_photos() -> None:
     assert float((2 * uv - (2 * uv).round()).abs().max()) < 2e-3  # centres of pixels, or their borders
     torch.testing.assert_close(torch.stack([uv.amin(0), uv.amax(0)]), torch.tensor([[0.5, 0.5], [63.5, 47.5]]))
     # Nothing moves where a frame has been cut off.
-    framed = dataclasses.replace(photo, rgb=photo.rgb[6:-4, 2:-10], frame=PhotoFrame(2, 6, 10, 4, "dark"))
+    framed = dataclasses.replace(photo, rgb=photo.rgb[6:-4, 2:-10], frame=PhotoFrame(2, 6, 10, 4))
     inside = RgbdBase(half).predict(framed)
     assert inside.camera.K.tolist() == [[140, 0, 28], [0, 140, 19], [0, 0, 1]]
     uv, _ = found.camera.project(inside.gaussians.means)

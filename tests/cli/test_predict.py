@@ -318,21 +318,17 @@ def test_missing_depth_and_a_map_of_another_size_are_taken(tmp_path: Path) -> No
     assert base["depth_resampled_from"] == "640×480"
 
 
-def test_a_frame_is_cut_off_photo_and_depth_and_can_be_kept(tmp_path: Path) -> None:
-    photo, depth, out = tmp_path / "a.png", tmp_path / "a.npy", tmp_path / "out"
-    whole = np.pad(picture(), ((6, 7), (3, 4), (0, 0)))
-    Image.fromarray(whole).save(photo)
-    write_depth(depth, np.pad(metres(), ((6, 7), (3, 4)), constant_values=1))
-    result = predicted(photo, depth, out, "--no-render")
-    assert "a.png: a dark frame (4, 7, 5, 8 pixels: left, top, right, bottom)" in result.lines[0]
-    cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8, "shade": "dark"}  # the outermost pixels are mixed
-    inner = {"width": WIDTH - 2, "height": HEIGHT - 2}
-    assert report_of(out / "a")["photo"] == {"file": "a.png", **inner, "frame_cut_off": cut_off}
-    Image.fromarray(picture()[1:-1, 1:-1]).save(photo)
-    predicted(photo, write_depth(depth, metres()[1:-1, 1:-1]), tmp_path / "plain", "--no-render")
-    for file in ("base.ply", "scene.ply"):
-        assert (out / "a" / file).read_bytes() == (tmp_path / "plain" / "a" / file).read_bytes()
-    Image.fromarray(whole).save(photo)
-    kept = run("predict", "-i", photo, "-o", out, "--base", "lite", "--keep-frame", "--no-render", *SHORT)
-    assert "uniform" not in kept.err
-    assert report_of(out / "a")["photo"] == {"file": "a.png", "width": WIDTH + 7, "height": HEIGHT + 13}
+def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
+    photo, out = tmp_path / "a.png", tmp_path / "out"
+    Image.fromarray(np.pad(picture(), ((6, 7), (3, 4), (0, 0)))).save(photo)
+    lite = ("predict", "-i", photo, "-o", out, "--base", "lite", "--no-render", *SHORT)
+    cut = run(*lite)
+    assert "a.png: a frame (4, 7, 5, 8 pixels: left, top, right, bottom) is cut off; --keep-frame keeps it" in cut.err
+    cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8}  # the outermost pixels are mixed
+    inner, whole = ({"file": "a.png", "width": WIDTH + w, "height": HEIGHT + h} for w, h in ((-2, -2), (7, 13)))
+    assert report_of(out / "a")["photo"] == {**inner, "frame_cut_off": cut_off}
+    assert "is cut off" not in run(*lite, "--keep-frame").err
+    assert report_of(out / "a")["photo"] == whole
+    depth = write_depth(tmp_path / "a.npy", np.pad(metres(), ((6, 7), (3, 4)), constant_values=1))
+    predicted(photo, depth, out, "--no-render")
+    assert report_of(out / "a")["photo"] == whole

@@ -126,7 +126,7 @@ def predict(
         Options(settings, path, FillOptions(residual, fill, mode)),
         {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov},
         render=render,
-        keep_frame=keep_frame,
+        keep_frame=keep_frame or depth is not None or path.cameras is not None,
         overwrite=overwrite,
         workers=workers,
         threads=threads,
@@ -215,7 +215,7 @@ def view(
 
     reporter = Reporter(verbose, as_json=as_json)
     settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
-    uploads = Uploads(settings, disparity, keep_frame, reporter)
+    uploads = Uploads(settings, disparity, keep_frame or depth is not None, reporter)
     if view_page(target, uploads, {"focal_px": focal_px, "fov": fov}, host, port, token, browser):
         raise typer.Exit(INTERRUPTED)
     # A step of a network cannot be interrupted, and Python would wait for it, or fall over it, on its way out.
