@@ -29,7 +29,7 @@ from spackle.clips.temporal import flicker, pixel_grid, sample
 from spackle.color import srgb_to_linear
 from spackle.evaluation.datasets.stereo import load_motorcycle
 from spackle.gaussians import Gaussians
-from spackle.inpaint.opencv import OpenCV
+from spackle.inpaint.plain import OpenCV
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.network import shipped_network

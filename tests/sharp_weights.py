@@ -10,9 +10,10 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
-from spackle.bases.sharp.layers import LAYERS, STRIDE, TINY, SharpConfig
+from spackle.bases.sharp.base import expected_shapes
+from spackle.bases.sharp.encoder import LAYERS, STRIDE, TINY, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
+from spackle.cli.weights import deterministic_weights
 
 DATA = Path(__file__).parent / "data"
 # A ninth of the tiny network's pixels: quick, and of no checkpoint's size.

@@ -118,7 +118,7 @@ def start_decoder(network: LiteNet) -> LiteNet:
 
 def _network_of(path: Path, size: Size) -> LiteNet:
     """The network of this size in a file, the first where there are several."""
-    networks = load_networks(path, "a .safetensors file as init")
+    networks = load_networks(path)
     for network in networks:
         if network.encoder.size == size:
             return network

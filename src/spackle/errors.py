@@ -21,7 +21,7 @@ class InputError(ValueError):
 def reason_in_a_line(error: object) -> str:
     """What somebody else's exception says, for the middle of a message of ours: at most 200 characters."""
     said = getattr(error, "strerror", None) or error  # the system's words, without its number and the file's name
-    return " ".join(str(said).split())[:200] or type(error).__name__
+    return one_line(" ".join(str(said).split()))[:200] or type(error).__name__
 
 
 @contextlib.contextmanager

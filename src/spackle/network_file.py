@@ -1,47 +1,255 @@
-"""A network's weights out of a safetensors file."""
+"""Weights from a stranger's file into a network: strict about names, shapes and numbers, and nothing in a file is run.
+
+A file is safetensors, or what `torch.save` or TorchScript wrote, whatever its name: a zip archive of tensors, perhaps
+code, and a pickle that says where in a tree of objects each tensor stands. The code is not looked at, and the pickle is
+read with inert stand-ins for all classes and functions in it.
+"""
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Mapping
-from typing import TypeVar
+import pickle
+import struct
+import warnings
+import zipfile
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors import safe_open
 from torch import Tensor, nn
 
-from spackle.errors import InputError
+from spackle.device import enough_memory
+from spackle.errors import InputError, one_line, reading
+from spackle.files import check_file
 
 Network = TypeVar("Network", bound=nn.Module)
+Shapes = dict[str, tuple[int, ...]]  # of tensors, by name
+
+NAMED = 3  # how many of the names that differ are spelled out
+MAX_PICKLE = 4_000_000  # bytes; those of a thousand tensors are a tenth of that
+MAX_NODES = 100_000  # of the tree: an object that stands at several places counts at each
+MAX_PATH = 1000  # letters of the names from the tree's root
+STORAGES = {
+    "torch FloatStorage": torch.float32,
+    "torch HalfStorage": torch.float16,
+    "torch BFloat16Storage": torch.bfloat16,
+    "torch DoubleStorage": torch.float64,
+    "torch LongStorage": torch.int64,
+    "torch IntStorage": torch.int32,
+}
 
 
-def read_tensors(path: str | os.PathLike[str], what: str, otherwise: str) -> dict[str, Tensor]:
-    """The tensors of a file by name; InputError where it is missing or broken.
+def load_strict(
+    network: Network,
+    tensors: Mapping[str, Tensor],
+    path: str | os.PathLike[str],
+    advice: str,
+    *,
+    unused: Shapes | None = None,
+    prepare: Callable[[nn.Module], object] | None = None,
+) -> Network:
+    """Fill a network, which may lie on the meta device, with exactly the tensors that it has, and freeze it.
 
-    `what` says for messages whose weights they are, `otherwise` what to give in place of a missing file.
+    Its weights are float32; its constants, such as counts, stay as they are. Nothing shares memory with the file.
+
+    Args:
+        network: to be filled.
+        tensors: of the file, see `read_tensors`.
+        path, advice: for messages: the file, and what to do about a wrong one.
+        unused: what the file has to hold beside the network's tensors.
+        prepare: converts the filled network in place while its numbers still lie on the disk.
+
+    Raises:
+        InputError: tensors that are missing, unknown, of another shape, or not finite.
     """
-    if not os.path.isfile(path):
-        raise InputError(f"{what} weights {path} not found: give {otherwise}")
-    try:
-        tensors: dict[str, Tensor] = load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{what} weights {path} are not readable as safetensors: {error}") from error
+    ours = network.state_dict()
+    used = {name: tuple(tensor.shape) for name, tensor in ours.items() if tensor.is_floating_point()}
+    check_tensors(tensors, used | (unused or {}), path, advice, ignored=ours.keys() - used.keys())
+    state = {name: tensors[name].float().contiguous() for name in used}
+    network.load_state_dict(state, strict=False, assign=True)
+    network.eval().requires_grad_(False)
+    if prepare is not None:
+        prepare(network)
+    for name, tensor in (*network.named_parameters(), *network.named_buffers()):
+        if name in used and tensor.data_ptr() == tensors[name].data_ptr():  # the file may change later
+            tensor.data = tensor.data.clone()
+    check_finite(network, path, advice)
+    return network
+
+
+def channels_last(network: nn.Module) -> None:
+    """Lay out kernels as is fast on a processor."""
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+
+
+def check_tensors(
+    found: Mapping[str, Tensor],
+    expected: Shapes,
+    path: str | os.PathLike[str],
+    advice: str,
+    ignored: Collection[str] = (),
+) -> None:
+    """InputError unless a file holds floats of exactly these names and shapes, beside names that are `ignored`."""
+    kinds = {
+        "missing": sorted(expected.keys() - found.keys()),
+        "unknown": sorted(found.keys() - expected.keys() - set(ignored)),
+        "of another shape": [
+            f"{name} {list(found[name].shape)} instead of {list(shape)}"
+            for name, shape in expected.items()
+            if name in found and tuple(found[name].shape) != shape
+        ],
+        "not of floats": [name for name in expected if name in found and not found[name].is_floating_point()],
+    }
+    problems = [f"{len(names)} {kind} ({_some(names)})" for kind, names in kinds.items() if names]
+    if problems:
+        raise InputError(
+            f"{path}: another network's weights: of {len(expected)} tensors {'; '.join(problems)}: {advice}"
+        )
+
+
+def check_finite(network: nn.Module, path: str | os.PathLike[str], advice: str) -> None:
+    """InputError where a network's numbers, which are those of a file, are not all finite."""
+    # A finite sum proves it at little cost; but a sum of finite numbers can overflow.
+    broken = [name for name, t in network.state_dict().items() if not (t.sum().isfinite() or t.isfinite().all())]
+    if broken:
+        raise InputError(f"{path}: holds numbers that are not finite ({_some(broken)}): {advice}")
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - NAMED
+    shown = ", ".join(one_line(name[:120])[:200] for name in names[:NAMED])
+    return shown + (f", and {more} more" if more > 0 else "")
+
+
+def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]:
+    """The tensors of a file by name; numbers are read from the disk when they are used.
+
+    What else a file holds is left out. In TorchScript and in nested dicts a name is the path to the tensor, joined by
+    dots. `advice` says in messages what to do about a wrong file.
+
+    Raises:
+        InputError: a missing or broken file, or one of another kind.
+    """
+    check_file(path, "weight file")
+    with reading(path, f"not a file of weights, or damaged ({{reason}}): {advice}"), enough_memory():
+        tensors = _read(path)
+        if not tensors:
+            raise ValueError("it holds no named tensors")
     return tensors
 
 
-def fill_network(network: Network, tensors: Mapping[str, Tensor], path: str | os.PathLike[str], what: str) -> Network:
-    """The network with these weights, ready to be asked; half precision is widened to single.
+def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    """By the first bytes of a file: people rename files."""
+    with open(path, "rb") as file:
+        head = file.read(9)
+    if head.startswith(b"PK\x03\x04"):
+        return _read_archive(path)
+    if head[8:] == b"{":
+        with safe_open(path, framework="pt") as opened:
+            return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
+    if not head.startswith(b"\x80"):
+        raise ValueError("it is neither safetensors nor PyTorch's")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about kinds of tensors that are refused
+        try:
+            loaded = torch.load(path, map_location="cpu", weights_only=True)  # as PyTorch wrote before 1.6
+        except pickle.UnpicklingError as error:
+            raise ValueError("a bare pickle that holds more than tensors; nothing in it was run") from error
+    return {name: x for name, x in loaded.items() if isinstance(name, str) and _is_plain(x)}
 
-    InputError for weights of another architecture; `path` and `what` are for its message.
-    """
-    expected = network.state_dict()
-    wrong = sorted(name for name in expected.keys() & tensors.keys() if expected[name].shape != tensors[name].shape)
-    wrong += sorted(expected.keys() ^ tensors.keys())
-    if wrong:
-        raise InputError(f"{what} weights {path} are of another network: {len(wrong)} tensors differ, e.g. {wrong[0]}")
-    if endless := [name for name in expected if not bool(torch.isfinite(tensors[name]).all())]:
-        raise InputError(f"{what} weights {path} hold numbers that are not finite, e.g. in {endless[0]}: take others")
-    network.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-    return network.eval().requires_grad_(False)
+
+def _is_plain(value: object) -> bool:
+    """Whether it is a dense tensor on the processor without attributes, which could hide its methods."""
+    if type(value) not in (Tensor, nn.Parameter) or vars(value):
+        return False
+    assert isinstance(value, Tensor)
+    return not value.is_nested and value.layout == torch.strided and value.device.type == "cpu"
+
+
+def _read_archive(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+    with zipfile.ZipFile(path) as archive:
+        names = [name for name in archive.namelist() if name.count("/") == 1 and name.endswith("/data.pkl")]
+        if len(names) != 1:
+            raise ValueError("a zip archive without the pickle of a network")
+        root = names[0].removesuffix("data.pkl")
+        if archive.getinfo(names[0]).file_size > MAX_PICKLE:
+            raise ValueError("its pickle is too large for a network")
+        if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder") != b"little":
+            raise ValueError("its numbers are not little-endian")
+        summed = any(record.CRC for record in archive.infolist())  # torch.save can be told to leave the sums out
+        if summed and (damaged := archive.testzip()) is not None:
+            raise ValueError(f"damaged at {damaged}")
+        return _tensors(_Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load())
+
+
+class _StandIn:
+    """In place of an object of any class, or of what any function makes: keeps the fields that it is given."""
+
+    kind = ""  # of a subclass: module and name of what it stands for
+    fields: dict[object, object]
+
+    def __new__(cls, *arguments: Any) -> Any:
+        """An empty one; in place of torch's functions that make tensors and parameters, the tensor."""
+        if cls.kind == "torch._utils _rebuild_tensor_v2" and isinstance(arguments[0], Tensor):
+            storage, offset, shape, stride = arguments[:4]
+            return storage.as_strided(shape, stride, offset)  # refuses what lies outside of the storage
+        if cls.kind == "torch._utils _rebuild_parameter":
+            return arguments[0]
+        made: _StandIn = super().__new__(cls)
+        made.fields = {}
+        return made
+
+    def __setitem__(self, name: object, value: object) -> None:
+        self.fields[name] = value
+
+    def __setstate__(self, state: object) -> None:
+        if isinstance(state, dict):
+            self.fields.update(state)
+
+
+class _Unpickler(pickle._Unpickler):  # in Python: the one in C takes whatever memory a pickle asks for
+    """Reads a pickle of plain values, `_StandIn` and tensors: no class or function in it is looked up."""
+
+    def __init__(self, data: bytes, archive: zipfile.ZipFile, path: str | os.PathLike[str], folder: str) -> None:
+        super().__init__(io.BytesIO(data))
+        self._archive, self._path, self._folder = archive, path, folder
+        self._mapped = torch.UntypedStorage.from_file(os.fspath(path), False, os.path.getsize(path))
+
+    def find_class(self, module: str, name: str) -> type[_StandIn]:
+        return type("_StandIn", (_StandIn,), {"kind": f"{module} {name}"})
+
+    def persistent_load(self, pid: Any) -> Tensor | None:
+        """The numbers of a storage, in a row; None for those of a kind that no network here has."""
+        _, storage, key, _, count = pid
+        record = self._archive.getinfo(f"{self._folder}{key}")
+        if storage.kind not in STORAGES:
+            return None
+        numbers = torch.empty(0, dtype=STORAGES[storage.kind])
+        size = count * numbers.itemsize
+        if record.compress_type != zipfile.ZIP_STORED or record.flag_bits & 1 or record.file_size != size:
+            raise ValueError(f"storage {str(key)[:20]} is packed or has not the {size} bytes that its tensor needs")
+        with open(self._path, "rb") as file:
+            file.seek(record.header_offset + 26)
+            name, more = struct.unpack("<2H", file.read(4))  # lengths of what stands before the numbers
+        start = record.header_offset + 30 + name + more
+        return numbers.set_(self._mapped[start : start + size])
+
+
+def _tensors(root: object) -> dict[str, Tensor]:
+    """All tensors in a tree of objects and dicts by their path, joined by dots."""
+    found: dict[str, Tensor] = {}
+    waiting, nodes = [("", root)], 0
+    while waiting:
+        path, node = waiting.pop()
+        if isinstance(node, Tensor) and path:
+            found[path] = node
+        fields = vars(node).get("fields") if isinstance(node, _StandIn) else node
+        if isinstance(fields, dict):
+            fields = {name: child for name, child in fields.items() if isinstance(name, str)}
+            nodes += len(fields)
+            if nodes > MAX_NODES or len(path) > MAX_PATH:
+                raise ValueError("its objects are too many or too deep, or hold themselves")
+            waiting += [(f"{path}.{name}" if path else name, child) for name, child in fields.items()]
+    return found

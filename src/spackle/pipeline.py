@@ -26,8 +26,7 @@ from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, load_photo
-from spackle.inpaint.lama import LamaInpainter
-from spackle.inpaint.protocol import InpainterOptions
+from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.progress import Reporter, Step, progress_line
 from spackle.render import Renderer, get_renderer
 from spackle.residual.network import SHIPPED, ResidualNet, load_residual, shipped_network
@@ -352,4 +351,4 @@ def open_texture(fill: Fill) -> Texture | None:
 
 @functools.cache
 def _lama() -> Texture:
-    return functools.partial(painted_texture, LamaInpainter(InpainterOptions()))
+    return functools.partial(painted_texture, get_inpainter("lama", InpainterOptions()))

@@ -143,10 +143,9 @@ def test_stored_weights_that_do_not_fit_are_refused_in_a_line(tmp_path: Path, ha
         del tensors[name]
     save_file(tensors, tmp_path / "harmed.safetensors")
     (tmp_path / "broken.safetensors").write_bytes(b"\x00" * 100)
-    for name, problem in (("broken", "not readable as safetensors"), ("none", "not found")):
+    for name, problem in (("broken", "not a file of weights"), ("none", "no such weight file")):
         with pytest.raises(InputError, match=problem):
             LiteBase.load(tmp_path / f"{name}.safetensors")
-    with pytest.raises(
-        InputError, match=r"harmed.safetensors are of another network: (1 tensors differ, e.g. context|encoder\.stages)"
-    ):
+    problem = r"harmed\.safetensors: another network's weights: (.* 1 missing \(context\.weight\)|encoder\.stages)"
+    with pytest.raises(InputError, match=problem):
         LiteBase.load(tmp_path / "harmed.safetensors")

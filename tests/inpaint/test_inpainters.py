@@ -7,10 +7,10 @@ import torch
 from scenes import psnr
 
 from spackle.errors import InputError
-from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter
+from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, inpainter_class
 
 
-@pytest.mark.parametrize("name", sorted(name for name, kind in INPAINTERS.items() if not kind.network))
+@pytest.mark.parametrize("name", sorted(name for name in INPAINTERS if not inpainter_class(name).network))
 def test_only_the_holes_change_and_every_time_in_the_same_way(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")

@@ -1,4 +1,4 @@
-"""ProPainter with random weights, from their files to a whole dataset, over a stand-in for torchvision.
+"""ProPainter with random weights, from their files to painted views, over a stand-in for torchvision.
 
 The networks are the published ones in full size, on the smallest pictures that they take.
 """
@@ -6,7 +6,6 @@ The networks are the published ones in full size, on the smallest pictures that 
 from __future__ import annotations
 
 import re
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,13 +13,10 @@ from typing import Any
 
 import pytest
 import torch
-from dataset_builds import build, content, refused, write_inputs
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from spackle.dataset import DatasetFiles
-from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
+from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.inpaint.propainter import (
     DILATION,
     NETWORKS,
@@ -29,7 +25,6 @@ from spackle.inpaint.propainter import (
     give_weights,
     weight_files,
 )
-from spackle.inpaint.protocol import InpainterOptions
 
 OPS = """
 from torch import nn
@@ -55,7 +50,7 @@ def test_holes_grow_by_steps() -> None:
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """pytorchcv beside a torchvision that has one layer, without its offsets; workers find it too."""
+    """pytorchcv beside a torchvision that has one layer, without its offsets."""
     pytest.importorskip("pytorchcv")
     place = tmp_path_factory.mktemp("stand_in")
     (place / "torchvision").mkdir()
@@ -73,29 +68,19 @@ def forget_package() -> None:
         del sys.modules[name]
 
 
-def random_networks() -> dict[str, nn.Module]:
-    """The architectures with numbers that anyone can draw, the same each time."""
+@pytest.fixture(scope="module")
+def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files as they are published, with random numbers in half precision to save room."""
     from pytorchcv.models.propainter import propainter
     from pytorchcv.models.propainter_rfc import propainter_rfc
     from pytorchcv.models.raft import raft_things
 
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return {"raft_things": raft_things(), "propainter_rfc": propainter_rfc(), "propainter": propainter()}
-
-
-@pytest.fixture(scope="module")
-def weights(package: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files as they are published, two by torch.save and one as safetensors, in half precision to save room."""
     folder = tmp_path_factory.mktemp("weights")
-    for name, network in random_networks().items():
-        tensors = {
-            key: value.half() if value.is_floating_point() else value for key, value in network.state_dict().items()
-        }
-        if name == "raft_things":
-            save_file(tensors, folder / f"{name}.safetensors")
-        else:
-            torch.save(tensors | {"of_somebody_else": torch.zeros(1)}, folder / f"{name}-0000-random.pth")
+    torch.manual_seed(0)
+    for name, make in zip(NETWORKS, (raft_things, propainter_rfc, propainter), strict=True):
+        torch.save(
+            make().half().state_dict() | {"of_somebody_else": torch.zeros(1)}, folder / f"{name}-0000-random.pth"
+        )
     return folder
 
 
@@ -131,6 +116,17 @@ def video(package: None, monkeypatch: pytest.MonkeyPatch) -> type[Video]:
     Video.given = []
     monkeypatch.setattr("pytorchcv.models.propainter_stream.ProPainterIterator", Video)
     return Video
+
+
+def test_the_networks_paint_holes_alone(inpainter: PropainterInpainter) -> None:
+    rgb, hole, unknown = (x[:, :64, -64:] for x in views_of(2, 64, 64))
+    painted = inpainter.paint(rgb, hole, unknown)
+    assert torch.equal(painted[~hole], rgb[~hole])
+    assert 0 <= float(painted[hole].min()) <= float(painted[hole].max()) <= 1
+    assert float((painted - rgb)[hole].abs().mean()) > 0.05
+    assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", inpainter.version)
+    assert inpainter.files.keys() == set(NETWORKS)
+    assert "S-Lab" in inpainter.notice
 
 
 def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterInpainter) -> None:
@@ -181,117 +177,43 @@ def test_colours_that_are_none_are_refused(
 
 
 def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"give --inpainter-weights FOLDER with raft_things, .* unpacked from https"):
-        weight_files(None)
-    with pytest.raises(InputError, match="no folder that can be read"):
-        weight_files(tmp_path / "missing")
-    with pytest.raises(InputError, match="holds no raft_things"):
-        weight_files(tmp_path)
-    for name in ("raft_things-0000-d74fed4b.pth", "propainter_rfc-0000-a865ddc0.pth", "propainter-0000-5f3cc1e7.pth"):
-        (tmp_path / name).write_bytes(b"")
-    assert [file.name.split("-")[0] for file in weight_files(tmp_path).values()] == list(NETWORKS)
-    with pytest.raises(InputError, match="no folder"):
-        weight_files(tmp_path / "propainter-0000-5f3cc1e7.pth")
-    (tmp_path / "propainter.safetensors").write_bytes(b"")
-    with pytest.raises(InputError, match=r"holds propainter-0000-5f3cc1e7.pth and propainter.safetensors"):
-        weight_files(tmp_path)
+    published = [f"{name}-0000-d74fed4b.pth" for name in NETWORKS]
+    for given, files, said in (
+        (None, [], "give --inpainter-weights FOLDER with raft_things, .* unpacked from https"),
+        (tmp_path / "missing", [], "no folder that can be read"),
+        (tmp_path, [], "holds no raft_things"),
+        (tmp_path / published[0], published, "no folder"),
+        (tmp_path, ["propainter.safetensors"], "holds propainter-0000-d74fed4b.pth and propainter.safetensors"),
+    ):
+        for name in files:
+            (tmp_path / name).write_bytes(b"")
+        with pytest.raises(InputError, match=said):
+            weight_files(given)
+    (tmp_path / "propainter.safetensors").unlink()
+    assert [file.name for file in weight_files(tmp_path).values()] == published
 
 
-class Small(nn.Module):
-    """A network with a constant of its own."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.linear = nn.Linear(3, 2)
-        self.register_buffer("where", torch.arange(4))
-
-
-def test_weights_are_widened_and_constants_stay(tmp_path: Path) -> None:
-    network = Small()
-    values = {"linear.weight": torch.ones(2, 3).half(), "linear.bias": torch.zeros(2), "where": torch.tensor([9] * 4)}
-    torch.save(values | {"more": [1]}, tmp_path / "a.pth")
+def test_a_network_takes_its_own_from_a_published_file(tmp_path: Path) -> None:
+    network, values = nn.Linear(3, 2), {"weight": torch.ones(2, 3).half(), "bias": torch.zeros(2)}
+    torch.save(values | {"more": [1], "others": torch.ones(3)}, tmp_path / "a.pth")
     give_weights(network, "small", tmp_path / "a.pth")
-    assert torch.equal(network.linear.weight, torch.ones(2, 3))  # and float32
-    assert network.get_buffer("where").tolist() == [0, 1, 2, 3]
-    assert not network.linear.weight.requires_grad
+    assert torch.equal(network.weight, torch.ones(2, 3))  # and float32
+    torch.save({"weight": torch.ones(2, 3)}, tmp_path / "a.pth")
+    with pytest.raises(InputError, match=r"1 missing \(bias\): unpack the file of small from https"):
+        give_weights(network, "small", tmp_path / "a.pth")
+    torch.save(values, tmp_path / "small-0000-0badf00d.pth")
+    with pytest.raises(InputError, match="SHA-1 is not the one in its name"):
+        give_weights(network, "small", tmp_path / "small-0000-0badf00d.pth")
 
 
-GOOD = {"linear.weight": torch.ones(2, 3), "linear.bias": torch.zeros(2)}
-BROKEN: list[tuple[str, object, str]] = [  # names, bytes or what is saved, and what is said of them
-    ("folder.pth", Path.mkdir, "not a plain file"),
-    ("garbled.pth", b"\x80\x02no" * 50, "cannot be read as weights"),
-    ("cut.pth", ..., "cannot be read as weights"),
-    ("cut.safetensors", b"\x40\0\0\0\0\0\0\0{" + b" " * 9, "cannot be read as weights"),
-    ("code.pth", {"linear.weight": print}, "cannot be read as weights"),
-    ("alone.pth", torch.ones(3), "cannot be read as weights"),
-    ("others.pth", {"a": torch.ones(3)}, "2 of 2 tensors are missing"),
-    ("shape.pth", GOOD | {"linear.bias": torch.ones(3)}, "such as linear.bias"),
-    ("whole.pth", GOOD | {"linear.bias": torch.ones(2).int()}, "1 of 2 tensors"),
-    ("nan.pth", GOOD | {"linear.bias": torch.tensor([0, torch.nan])}, "not finite"),
-    ("sparse.pth", GOOD | {"linear.weight": GOOD["linear.weight"].to_sparse()}, "1 of"),
-    ("small-0000-0badf00d.pth", GOOD, "SHA-1 is not the one in its name"),
-]
-
-
-@pytest.mark.parametrize(("name", "held", "said"), BROKEN, ids=[name for name, *_ in BROKEN])
-def test_broken_weights_are_a_line(tmp_path: Path, name: str, held: object, said: str) -> None:
-    path = tmp_path / name
-    if isinstance(held, bytes):
-        path.write_bytes(held)
-    elif held is ...:  # a good file, cut off
-        torch.save(GOOD, path)
-        path.write_bytes(path.read_bytes()[:-200])
-    elif held is Path.mkdir:
-        path.mkdir()
-    else:
-        torch.save(held, path)
-    with pytest.raises(InputError, match=f"^{re.escape(str(path))}: .*{said}"):  # in one line
-        give_weights(Small(), "small", path)
-
-
-# The command --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two photos, nearly as small as a photo may be, and their depth."""
-    return write_inputs(tmp_path_factory.mktemp("inputs"), 2, 33, 32)
-
-
-def test_a_dataset_is_built_by_any_number_of_workers_and_says_by_what(
-    place: Path, weights: Path, tmp_path: Path
-) -> None:
-    options = ["--views", 3, "--inpainter", "propainter", "--inpainter-weights", weights]
-    done = build(place, tmp_path / "one", *options)
-    assert done.code == 0, done.err
-    assert [line for line in done.lines if "S-Lab" in line and "non-commercial" in line] == [done.lines[0]]
-    assert build(place, tmp_path / "two", *options, "--workers", 2).code == 0
-    assert content(tmp_path / "one") == content(tmp_path / "two")
-    manifest = load_manifest(tmp_path / "one")
-    view = DatasetFiles(tmp_path / "one").group(1).view(2)
-    assert float((view.target - view.rendering.rgb)[view.mask].abs().mean()) > 0.05
-    used = manifest.config["inpainter"]
-    assert used["name"] == "propainter"
-    assert re.fullmatch(r"1, pytorchcv [\d.]+, long side 640", used["version"])
-    assert used["weights"].keys() == set(NETWORKS)
-    # Other weights are another dataset.
-    other = shutil.copytree(weights, tmp_path / "other")
-    flow = {key: value + 1 for key, value in random_networks()["raft_things"].state_dict().items()}
-    save_file(flow, other / "raft_things.safetensors")
-    done = build(place, tmp_path / "one", *options[:-1], other, "--inpainter-side", 320)
-    assert done.code == 2
-    for words in ("inpainter.weights.raft_things: ", "long side 640", "long side 320"):
-        assert words in done.lines[-1]
-    assert "inpainter.weights.propainter: " not in done.lines[-1]
+# The package --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("found", ["nothing", "a torchvision of another torch"])
-def test_without_its_packages_propainter_is_a_line(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: str
-) -> None:
+def test_without_its_packages_propainter_is_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: str) -> None:
     for name in [name for name in sys.modules if name.startswith(OURS)]:
         monkeypatch.delitem(sys.modules, name)
-    said = ["pip install 'spackle-nvs[propainter]'"]
+    said = "pip install 'spackle-nvs[propainter]'"
     if found == "nothing":
         monkeypatch.setitem(sys.modules, "pytorchcv", None)
     else:
@@ -300,5 +222,8 @@ def test_without_its_packages_propainter_is_a_line(
         (tmp_path / "torchvision").mkdir()
         (tmp_path / "torchvision" / "__init__.py").write_text(f"raise RuntimeError({problem!r})\n")
         monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-        said = [f"torchvision cannot be imported ({problem})", torch.__version__]
-    refused(build(place, tmp_path / "out", "--inpainter", "propainter"), *said)
+        said = (
+            f"torchvision cannot be imported ({problem}): install the one that was built for torch {torch.__version__}"
+        )
+    with pytest.raises(InputError, match=re.escape(said)):
+        get_inpainter("propainter", InpainterOptions())

@@ -17,7 +17,7 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
 from spackle.filters import blurred, greatest_around
 from spackle.inpaint import InpainterOptions
-from spackle.inpaint.protocol import PlainInpainter
+from spackle.inpaint.plain import PlainInpainter
 from spackle.patches import Patches
 from spackle.render.protocol import Rendering
 from spackle.residual import Seeds, ViewFeatures, hole_mask

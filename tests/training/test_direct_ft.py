@@ -18,13 +18,13 @@ from sharp_weights import MICRO
 from torch import Tensor
 from training_runs import losses_of, one_thread, run_two, state
 
-from spackle.bases.sharp.base import TunableSharp
-from spackle.bases.sharp.checkpoint import PARTS, deterministic_weights, expected_shapes
-from spackle.bases.sharp.layers import CONFIGS
+from spackle.bases.sharp.base import PARTS, expected_shapes
+from spackle.bases.sharp.encoder import CONFIGS
+from spackle.cli.weights import deterministic_weights
 from spackle.dataset import DatasetFiles
 from spackle.dataset.shards import load_manifest
 from spackle.render import get_renderer
-from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, drawn_views, render_photo
+from spackle.training.direct_ft import VIEWS_AT_ONCE, DirectFt, TunableSharp, drawn_views, render_photo
 from spackle.training.recipe import Recipe, load_recipe
 
 pytest.importorskip("yaml")
@@ -40,9 +40,9 @@ optim: {steps: 4, batch: 4, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
 run: {validate_every: 4, save_every: 2, log_every: 1}
 """
 SMALL = """
-from spackle.bases.sharp import layers
+from spackle.bases.sharp import encoder
 import dataclasses
-layers.CONFIGS["tiny"] = dataclasses.replace(layers.TINY, window=128)
+encoder.CONFIGS["tiny"] = dataclasses.replace(encoder.TINY, window=128)
 """  # for other processes, as the fixture `small` does it in this one
 
 

@@ -318,17 +318,17 @@ def test_what_is_not_a_networks_weights_is_refused(
     refused("squeezenet", tmp_path / "missing.npz", "no such weight file")
     path = tmp_path / "other.pth"
     path.write_bytes(b"\x80\x02cos\nsystem\n.")  # a pickle that would run a command
-    refused("resnet50", path, "not the weights of resnet50")
+    refused("resnet50", path, "nothing in it was run")
     torch.save({name: value for name, value in resnet.items() if name != "bn1.bias"}, path)
-    refused("resnet50", path, '"bn1.bias"')
+    refused("resnet50", path, "1 missing (bn1.bias)")
     torch.save([1, 2], path)
-    refused("resnet50", path, "not the weights of resnet50")
+    refused("resnet50", path, "it holds no named tensors")
     first = squeezed["conv1.w"]
     for change, said in (
-        ({"conv1.w": first[:, :, :3, :3]}, "size mismatch for conv1.weight"),
-        ({"conv1.w": np.full_like(first, np.nan)}, "conv1.weight holds numbers that are not finite"),
-        ({"fire10/conv1x1_1.w": first}, '"fire10.conv1x1_1.weight"'),
-        ({"conv1.w": np.array([{}])}, "not the weights of squeezenet"),  # an object: would have to be unpickled
+        ({"conv1.w": first[:, :, :3, :3]}, "1 of another shape (conv1.weight"),
+        ({"conv1.w": np.full_like(first, np.nan)}, "numbers that are not finite (conv1.weight)"),
+        ({"fire10/conv1x1_1.w": first}, "1 unknown (fire10.conv1x1_1.weight)"),
+        ({"conv1.w": np.array([{}])}, "not a file of weights"),  # an object: would have to be unpickled
     ):
         np.savez(tmp_path / "other.npz", **(squeezed | change))
         refused("squeezenet", tmp_path / "other.npz", said)

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import json
 import os
 import random
 import re
-import signal
 import socket
 import ssl
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from email.message import Message
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from urllib.error import URLError
-from urllib.request import Request
 
 import pytest
 from command import Run, run
@@ -29,6 +23,7 @@ from sites import Site, serve
 from stand_in import SHARP_FILE, publish
 
 from spackle.errors import InputError
+from spackle.folders import hold
 from spackle.progress import Reporter
 from spackle.weights import PUBLISHED, check_undamaged, installed, weights_digest, weights_folder
 from spackle.weights import download as module
@@ -64,21 +59,6 @@ def fetch(url: str, target: Path, progress: Progress | None = None) -> None:
     download(url, target, len(CONTENT), SHA256, progress)
 
 
-@pytest.fixture
-def begun(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A download that broke off after BREAK bytes."""
-    site.drops = [BREAK]
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "PAUSES", ())
-        refused(site.url, target, "early", f"{BREAK:,} bytes")
-    site.requests.clear()
-    return target
-
-
-def names_in(target: Path) -> set[str]:
-    return set(os.listdir(target.parent))
-
-
 def refused(url: str, target: Path, *parts: str) -> None:
     """One line that says what is wrong, and no file."""
     with pytest.raises(InputError) as caught:
@@ -91,7 +71,7 @@ def refused(url: str, target: Path, *parts: str) -> None:
 
 def is_whole(target: Path) -> None:
     assert target.read_bytes() == CONTENT
-    assert names_in(target) == {"weights.pt"}
+    assert os.listdir(target.parent) == ["weights.pt"]
 
 
 def ranges(site: Site) -> list[str | None]:
@@ -112,24 +92,19 @@ def test_a_download_is_the_file(site: Site, target: Path) -> None:
     assert site.requests[0]["Accept-Encoding"] == "identity"
 
 
-def test_an_older_file_stays_until_the_new_one_is_whole(site: Site, target: Path) -> None:
-    target.write_bytes(b"old")
+def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(site: Site, tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    link, real = tmp_path / "link.pt", tmp_path / "real" / "weights.pt"
+    link.symlink_to(real)
+    real.write_bytes(b"old")
     site.status = 404
     with pytest.raises(InputError):
-        fetch(site.url, target)
-    assert target.read_bytes() == b"old"
+        fetch(site.url, link)
+    assert real.read_bytes() == b"old"
     site.status, site.headers = 200, {"Content-Length": None}  # a length that is not told is known all the same
-    fetch(site.url, target)
-    is_whole(target)
-
-
-def test_a_link_stays_a_link(site: Site, tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    link = tmp_path / "link.pt"
-    link.symlink_to(tmp_path / "real" / "weights.pt")
     fetch(site.url, link)
     assert link.is_symlink()
-    is_whole(tmp_path / "real" / "weights.pt")
+    is_whole(real)
 
 
 @pytest.mark.parametrize("knows_ranges", [True, False])
@@ -140,12 +115,18 @@ def test_a_broken_connection_goes_on_with_the_rest(site: Site, target: Path, kno
     assert ranges(site) == [None, f"bytes={BREAK}-", f"bytes={BREAK + 100_000 if knows_ranges else 100_000}-"]
 
 
-def test_a_later_call_goes_on_with_the_rest(site: Site, begun: Path) -> None:
-    assert names_in(begun) == {"weights.pt.part"}
+def test_a_later_call_goes_on_with_the_rest(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site.drops = [BREAK]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "PAUSES", ())
+        refused(site.url, target, "early", f"{BREAK:,} bytes")
+    assert os.listdir(target.parent) == ["weights.pt.part"]
+    with hold(target.with_name("weights.pt.lock")):
+        refused(site.url, target, "another process")
     steps: list[int] = []
-    fetch(site.url, begun, lambda done, total: steps.append(done))
-    is_whole(begun)
-    assert ranges(site) == [f"bytes={BREAK}-"]
+    fetch(site.url, target, lambda done, total: steps.append(done))
+    is_whole(target)
+    assert ranges(site) == [None, f"bytes={BREAK}-"]
     assert (steps[0], steps[-1]) == (BREAK, len(CONTENT))
 
 
@@ -157,44 +138,6 @@ def test_the_beginning_of_another_file_is_dropped(site: Site, target: Path, size
     assert ranges(site)[-1] is None
 
 
-def test_ctrl_c_keeps_what_has_come(site: Site, target: Path) -> None:
-    def interrupt(done: int, total: int) -> None:
-        if done >= BREAK:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fetch(site.url, target, interrupt)
-    kept = target.with_name("weights.pt.part").stat().st_size
-    fetch(site.url, target)
-    is_whole(target)
-    assert ranges(site) == [None, f"bytes={kept}-"]
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal here")
-def test_after_a_kill_the_next_download_finishes(site: Site, target: Path) -> None:
-    site.hang_after = BREAK
-    part = target.with_name("weights.pt.part")
-    arguments = f"{site.url!r}, {str(target)!r}, {len(CONTENT)}, {SHA256!r}"
-    code = f"from spackle.weights.download import download; download({arguments})"
-    with subprocess.Popen([sys.executable, "-c", code]) as process:
-        try:
-            deadline = time.monotonic() + 60
-            while not (part.exists() and part.stat().st_size >= BREAK):
-                assert process.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.005)
-            refused(site.url, target, "another process")
-        finally:
-            process.kill()
-    kept = part.stat().st_size
-    assert names_in(target) == {"weights.pt.part", "weights.pt.lock"}
-    site.hang_after = None
-    site.go_on.set()
-    fetch(site.url, target)
-    is_whole(target)
-    assert ranges(site) == [None, f"bytes={kept}-"]
-
-
 # What goes wrong for good
 
 
@@ -202,20 +145,14 @@ def test_after_a_kill_the_next_download_finishes(site: Site, target: Path) -> No
     ("server", "words"),
     [
         ({"status": 404}, ("HTTP 404", "check the address")),
-        ({"status": 416}, ("HTTP 416",)),
         ({"status": 500}, ("HTTP 500", "later")),
         ({"status": 206}, ("something else",)),
         ({"headers": {"Content-Type": "text/html"}}, ("something else",)),
-        ({"headers": {"Content-Encoding": "gzip"}}, ("packs", "gzip", "another address")),
         ({"headers": {"Content-Length": "0"}}, ("another file: 0 bytes, 1,000,003 were published",)),
         ({"content": CONTENT + b"more"}, ("another file: 1,000,007 bytes",)),
         ({"content": CONTENT[::-1]}, ("not the SHA-256", SHA256, "another address")),
         ({"drops": 3 * [len(CONTENT) - 10], "ranges": False}, ("10 bytes early",)),
         ({"status": 302, "headers": {"Location": "file:///etc/hostname"}}, ("HTTP 302",)),
-        ({"status": 302, "headers": {"Location": "ftp://127.0.0.1/a.pt"}}, ("ftp://127.0.0.1/a.pt",)),
-        ({"status": 302, "headers": {"Location": "http://me:secret@127.0.0.1:1/w"}}, ("sends on to", "password")),
-        ({"status": 302, "headers": {"Location": "http://me:secret@127.0.0.1:port/w"}}, ("sends on to", "password")),
-        ({"status": 302, "headers": {"Location": "ftp://me:secret@127.0.0.1:1/w"}}, ("sends on to", "password")),
     ],
 )
 def test_answers_that_are_not_the_file(
@@ -224,7 +161,7 @@ def test_answers_that_are_not_the_file(
     for name, value in server.items():
         setattr(site, name, value)
     refused(site.url, target, site.url, *words)
-    assert bool(names_in(target)) is ("10 bytes early" in words)  # all that came is kept
+    assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # all that came is kept
 
 
 def test_a_server_that_hangs(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,25 +173,12 @@ def test_a_server_that_hangs(site: Site, target: Path, monkeypatch: pytest.Monke
         refused(f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "no answer")
 
 
-def test_certificates(site: Site, target: Path) -> None:
+def test_why_there_is_no_connection(site: Site, target: Path) -> None:
     refused(site.url.replace("http:", "https:"), target, "SSL")
     error = ssl.SSLCertVerificationError(1, "failed")
     error.verify_message = "self-signed certificate"
     assert "not trusted (self-signed certificate)" in module.reason_of(URLError(error))
     assert "name is not known here" in module.reason_of(URLError(socket.gaierror(-2, "unknown")))
-
-
-def test_https_is_not_given_up_on_the_way() -> None:
-    def redirect(old: str, new: str) -> Request | None:
-        handler = module._SafeRedirects()
-        return handler.redirect_request(Request(old), io.BytesIO(), 302, "Found", Message(), new)
-
-    with pytest.raises(InputError, match="not https"):
-        redirect("https://a.org/w.pt", "http://a.org/w.pt")
-    for old, new in (("http://a.org", "https://b.org"), ("https://a.org", "https://b.org")):
-        request = redirect(old, new)
-        assert request is not None
-        assert request.full_url == new
 
 
 @pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "http://", "https://[/", "http://a:b/", "http://a:0/"])
@@ -263,39 +187,23 @@ def test_addresses_that_are_none(target: Path, url: str) -> None:
     refused(f"{url}\n", target)
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "http://me:secret@127.0.0.1:1/w.pt",
-        "ftp://me:secret@127.0.0.1:1/w.pt",
-        "http://me:secret@[/w.pt",
-        "http://me:secret/more@127.0.0.1:1/w.pt",
-        "me:secret@127.0.0.1:1/w.pt",
-    ],
-)
+@pytest.mark.parametrize("url", ["http://%s127.0.0.1:1/w", "ftp://%s127.0.0.1/w", "http://%s[/w", "%s127.0.0.1:1/w"])
 def test_a_password_is_refused_and_not_shown(target: Path, url: str) -> None:
     with pytest.raises(InputError, match="password") as caught:
-        fetch(url, target)
+        fetch(url % "me:secret@", target)
     assert "secret" not in str(caught.value)
-    assert names_in(target) == set()
 
 
-def test_places_that_cannot_be_written(site: Site, tmp_path: Path) -> None:
+def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = target.parent
     with pytest.raises(InputError, match="a folder"):
-        fetch(site.url, tmp_path)
-    refused(site.url, tmp_path / "missing" / "a.pt", "a.pt", "does not exist")
-    refused(site.url, tmp_path / ("a" * 300), "too long")
-    refused(site.url, tmp_path / ("a" * 252), "too long", "choose another folder")  # with .part it is
-    with pytest.raises(InputError):
-        fetch(site.url, tmp_path / "a\0b")
+        fetch(site.url, folder)
+    refused(site.url, folder / "missing" / "a.pt", "a.pt", "does not exist")
+    refused(site.url, folder / ("a" * 252), "too long", "choose another folder")  # with .part it is
     assert site.requests == []
-
-
-def test_a_full_disk(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(total=10, free=1))
-        refused(site.url, target, str(target.parent), "make room")
-        assert names_in(target) == set()
+        refused(site.url, target, str(folder), "make room")
 
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -310,16 +218,13 @@ def test_a_full_disk(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) 
 # What is published
 
 
-def test_the_entries_are_whole() -> None:
+def test_the_entries_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
         digests = [entry.sha256, *(sha256 for _, sha256 in entry.beside.values())]
         assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in digests)
         assert entry.address().startswith("https://")
         assert entry.address().endswith(Path(entry.file).name)
         assert all((entry.purpose, entry.licence, entry.notice, entry.option))
-
-
-def test_a_mirror_of_the_hub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example/hub/")
     at = "https://mirror.example/hub/depth-anything/Depth-Anything-V2-Small-hf/resolve/5426e4f0f36572d16453bbda7a838931"
     assert PUBLISHED["depth"].address("config.json") == f"{at}7b1bef99/config.json"
@@ -346,7 +251,6 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for name in ("SPACKLE_WEIGHTS", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     for variable, value, folder in (
-        ("XDG_CACHE_HOME", "", ".cache/spackle/weights"),
         ("XDG_CACHE_HOME", "relative", ".cache/spackle/weights"),  # to be ignored, says its standard
         ("XDG_CACHE_HOME", str(tmp_path / "cache"), "cache/spackle/weights"),
         ("SPACKLE_WEIGHTS", "~/mine", "mine"),
@@ -366,63 +270,55 @@ def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "weights"
 
 
-def weights_command(*arguments: object) -> Run:
-    return run("weights", *arguments)
-
-
-def refuses(result: Run, *words: object) -> None:
-    assert (result.code, result.out, len(result.err.splitlines())) == (2, "", 1), result.err
-    assert result.err.startswith("error: ")
-    for word in words:
-        assert str(word) in result.err
-
-
-def test_get_tells_scripts_where_the_file_lies(site: Site, weights: Path) -> None:
-    for new in (True, False):
-        result = weights_command("get", "sharp", "--url", site.url, "--json")
-        assert result.code == 0, result.err
-        told = {"name": "sharp", "file": str(weights / SHARP_FILE), "bytes": len(CONTENT)}
-        assert json.loads(result.out) == {**told, "sha256": SHA256, "downloaded": new}
-    failed = weights_command("get", "blunt", "--json")
-    assert (failed.code, list(json.loads(failed.out))) == (2, ["error"])
+def get(*arguments: object) -> Run:
+    return run("weights", "get", *arguments)
 
 
 def test_get_shows_the_terms_once_and_does_nothing_twice(site: Site, weights: Path) -> None:
+    file = weights / SHARP_FILE
     assert installed("sharp") is None
-    first = weights_command("get", "sharp", "--url", site.url)
+    first = get("sharp", "--url", site.url)
     assert first.code == 0, first.err
-    assert installed("sharp") == weights / SHARP_FILE
+    assert installed("sharp") == file
     assert os.listdir(weights) == [SHARP_FILE]
     assert first.err.count("research only") == first.err.count("LICENSE_MODEL") == 1
-    assert all(part in first.lines[-1] for part in ("1.0 MB", SHA256, str(weights / SHARP_FILE)))
-    again = weights_command("get", "sharp", "--url", site.url)
+    assert all(part in first.lines[-1] for part in ("1.0 MB", SHA256, str(file)))
+    again = get("sharp", "--url", site.url)
     assert (again.code, len(again.lines)) == (0, 1)
-    assert all(part in again.err for part in ("already", "intact", str(weights / SHARP_FILE)))
+    assert all(part in again.err for part in ("already", "intact", str(file)))
     assert len(site.requests) == 1
-    (weights / SHARP_FILE).write_bytes(CONTENT[::-1])
-    refuses(weights_command("get", "sharp", "--url", site.url), weights / SHARP_FILE, "damaged", "--force")
-    forced = weights_command("get", "sharp", "--url", site.url, "--force")
-    assert (forced.code, forced.err.count("research only"), len(site.requests)) == (0, 1, 2)
-    assert (weights / SHARP_FILE).read_bytes() == CONTENT
+    file.write_bytes(CONTENT[::-1])
+    assert f"{file}: damaged, or your own" in get("sharp", "--url", site.url).err
+    forced = get("sharp", "--url", site.url, "--force", "--json")
+    told = {"name": "sharp", "file": str(file), "bytes": len(CONTENT), "sha256": SHA256, "downloaded": True}
+    assert json.loads(forced.out) == told
+    assert file.read_bytes() == CONTENT
 
 
 def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -> None:
     for output, path in (("a/b", f"a/b/{SHARP_FILE}"), ("a/c.pt", "a/c.pt"), ("a/d.PT", "a/d.PT")):
-        result = weights_command("get", "sharp", "--url", site.url, "-o", tmp_path / output)
+        result = get("sharp", "--url", site.url, "-o", tmp_path / output)
         assert result.code == 0, result.err
         assert (tmp_path / path).read_bytes() == CONTENT
         assert "--checkpoint" in result.err
     assert not weights.exists()
 
 
-def test_get_in_one_line_where_it_fails(site: Site, weights: Path) -> None:
-    refuses(weights_command("get", "nothing"), "nothing", "sharp")
-    refuses(weights_command("get", "sharp", "--url", CLOSED), CLOSED, "check the network")
-    refuses(weights_command("get", "sharp", "--url", "http://me:secret@127.0.0.1:1/"), "password")
-    refuses(weights_command("get", "depth", "--url", site.url), "HF_ENDPOINT")
-    refuses(weights_command("get", "lama", "--url", site.url), "205,669,692 were published")
-    site.status = 404
-    refuses(weights_command("get", "sharp", "--url", site.url), site.url, "404")
+@pytest.mark.parametrize(
+    ("name", "url", "said"),
+    [
+        ("nothing", None, "weights nothing: unknown: there are sharp"),
+        ("sharp", CLOSED, "check the network"),
+        ("sharp", "http://me:secret@127.0.0.1:1/", "password"),
+        ("depth", None, "HF_ENDPOINT"),
+        ("lama", None, "205,669,692 were published"),
+    ],
+)
+def test_get_in_one_line_where_it_fails(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:
+    result = get(name, "--url", url or site.url)
+    assert (result.code, result.out, len(result.lines)) == (2, "", 1), result.err
+    assert result.err.startswith("error: ")
+    assert said in result.err
     assert not weights.exists()
 
 
@@ -432,24 +328,23 @@ def test_get_fetches_what_belongs_to_the_weights(site: Site, weights: Path, monk
     entry = publish(monkeypatch, "depth", CONTENT, beside=facts, needs="nothing_of_that_name")
     monkeypatch.setenv("HF_ENDPOINT", site.url.rpartition("/")[0])
     site.others = {**beside, "config.json": b"[]"}
-    assert f"not the SHA-256 {facts['config.json'][1]}" in weights_command("get", "depth").err
+    assert f"not the SHA-256 {facts['config.json'][1]}" in get("depth").err
     assert not weights.exists()
     site.others = beside
-    result = weights_command("get", "depth")
+    result = get("depth")
     assert result.code == 0, result.err
     assert "Apache License 2.0" in result.err
     assert "pip install 'spackle-nvs[hf]'" in result.lines[-1]
     found = {file.name: file.read_bytes() for file in (weights / entry.file).parent.iterdir()}
     assert found == {**beside, "model.safetensors": CONTENT}
-    assert {asked["path"].split("/")[1] for asked in site.requests} == {"depth-anything"}
 
 
 def test_get_warns_of_an_address_that_is_not_encrypted(
     site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "not encrypted" not in weights_command("get", "sharp", "--url", site.url).err  # it is this machine
+    assert "not encrypted" not in get("sharp", "--url", site.url).err  # it is this machine
     monkeypatch.setenv("http_proxy", site.url)
-    result = weights_command("get", "sharp", "--force", "--url", "http://mirror.example/w.pt")
+    result = get("sharp", "--force", "--url", "http://mirror.example/w.pt")
     assert result.code == 0, result.err
     assert "warning: http:// is not encrypted" in result.err
 
@@ -462,22 +357,18 @@ def test_an_interrupted_get_says_that_it_goes_on(site: Site, weights: Path, monk
 
     with monkeypatch.context() as patch:
         patch.setattr(Reporter, "log", interrupt)
-        result = weights_command("get", "sharp", "--url", site.url)
+        result = get("sharp", "--url", site.url)
     assert result.code == 130
     assert "goes on from there" in result.err
-    assert weights_command("get", "sharp", "--url", site.url).code == 0
+    assert get("sharp", "--url", site.url).code == 0
     assert ranges(site)[1] is not None
 
 
-def test_list_says_what_is_here(site: Site, weights: Path) -> None:
-    def listed() -> str:
-        result = weights_command("list")
+def test_list_says_what_is_here(weights: Path) -> None:
+    weights.mkdir()
+    for content, said in ((None, "not here"), (CONTENT, "1.0 MB, whole"), (CONTENT[:-1], "damaged")):
+        if content is not None:
+            (weights / SHARP_FILE).write_bytes(content)
+        result = run("weights", "list")
         assert (result.code, result.err) == (0, "")
-        assert all(part in result.out for part in ("sharp", SHARP_FILE, "research only", str(weights)))
-        return result.out
-
-    assert "not here" in listed()
-    assert weights_command("get", "sharp", "--url", site.url).code == 0
-    assert "1.0 MB, whole" in listed()
-    (weights / SHARP_FILE).write_bytes(CONTENT[:-1])
-    assert "damaged" in listed()
+        assert all(part in result.out for part in (said, "sharp", SHARP_FILE, "research only", str(weights)))

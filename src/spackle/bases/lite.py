@@ -22,7 +22,7 @@ from spackle.bases.protocol import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.device import own_arithmetic, pick_device
 from spackle.errors import InputError
 from spackle.image import Photo, resize_photo
-from spackle.network_file import fill_network, read_tensors
+from spackle.network_file import channels_last, load_strict, read_tensors
 
 STRIDE = 32  # both sides of the input are multiples of it
 Size = Literal["lite0", "lite2"]
@@ -155,16 +155,17 @@ def _places(x: Tensor) -> Tensor:
     return grid.expand(batch, -1, -1, -1)
 
 
+ADVICE = "give lite's weights"  # where a file is something else
 SCALE = "/scale"  # behind the name of weights in eight bits: what one step of them is, for each output
 LAST = f"encoder.stages.{len(STAGES['lite2']) - 1}.0.project.bias"  # its length tells the sizes of networks apart
 
 
-def load_networks(path: str | os.PathLike[str], otherwise: str = "a .safetensors file") -> list[LiteNet]:
+def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
     """The networks of a file, or the one whose plain tensors it holds, ready to be asked, in single precision.
 
-    InputError for a missing or broken file (`otherwise`: what to give in its place) or weights of another architecture.
+    InputError for a missing or broken file or weights of another architecture.
     """
-    tensors = _unpacked(read_tensors(path, "lite", otherwise))
+    tensors = _unpacked(read_tensors(path, ADVICE))
     if LAST in tensors:
         return [_network(tensors, path)]
     parts: dict[str, dict[str, Tensor]] = {}
@@ -179,8 +180,8 @@ def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNe
     last = tensors.get(LAST)
     for size, stages in STAGES.items():
         if last is not None and last.shape == (stages[-1][-1],):
-            return fill_network(LiteNet(size), tensors, path, "lite")
-    raise InputError(f"lite weights {path} are of another network: {LAST} is missing or of another length")
+            return load_strict(LiteNet(size), tensors, path, ADVICE, prepare=channels_last)
+    raise InputError(f"{path}: another network's weights: {LAST} is missing or of another length: {ADVICE}")
 
 
 def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from spackle.errors import InputError
 from spackle.files import write_json
 from spackle.folders import file_records, results_folder, whole_set
 from spackle.image import Photo, focal_length, resize_photo
-from spackle.inpaint.opencv import OpenCV
+from spackle.inpaint.plain import OpenCV
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, timed
 from spackle.residual import hole_area_ratio

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -73,15 +74,12 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
     parts = urlsplit(url)
     if parts.scheme == "http" and parts.hostname not in ("localhost", "127.0.0.1", "::1"):
         reporter.log(f"{entry.name}: warning: http:// is not encrypted: others on the way see what is downloaded")
-    noticed = False
+    notice = iter(entry.notice)
     with reporter.transfer(entry.name) as step:
 
         def advance(done: int, total: int) -> None:
-            nonlocal noticed
-            if not noticed:  # not before: where nothing comes, nothing needs a licence
-                noticed = True
-                for line in entry.notice:
-                    reporter.log(line)
+            for line in notice:  # once, and not before: where nothing comes, nothing needs a licence
+                reporter.log(line)
             step(done, total)
 
         try:
@@ -89,8 +87,7 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
                 download(entry.address(name), path.with_name(name), size, sha256)
             download(url, path, entry.bytes, entry.sha256, advance)
         except KeyboardInterrupt:
-            if noticed:
-                reporter.log(f"{entry.name}: what has come is kept; the same command goes on from there")
+            reporter.log(f"{entry.name}: what has come is kept; the same command goes on from there")
             raise
 
 
@@ -108,8 +105,8 @@ def weights_make(
     import torch
     from safetensors.torch import save_file
 
-    from spackle.bases.sharp.checkpoint import deterministic_weights, expected_shapes
-    from spackle.bases.sharp.layers import CONFIGS
+    from spackle.bases.sharp.base import expected_shapes
+    from spackle.bases.sharp.encoder import CONFIGS
     from spackle.files import atomic_path
     from spackle.folders import results_folder
     from spackle.progress import Reporter
@@ -122,9 +119,34 @@ def weights_make(
     Reporter().log(f"{name}: {numbers}, the same each time; they show no scene -> {output}")
 
 
+def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """A state dict [name → float32 tensor] that depends on names and shapes alone, and shows no scene.
+
+    The scale of each kind is such that signals neither die nor explode, and the Gaussians fill the picture.
+    """
+    import zlib
+
+    import numpy as np
+    import torch
+
+    def made(name: str, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+        generator = np.random.Generator(np.random.Philox(zlib.crc32(name.encode())))
+        x = generator.standard_normal(shape, dtype=np.float32)
+        if name.endswith(("pos_embed", "cls_token")):
+            return np.float32(0.02) * x
+        if name.endswith(".gamma"):
+            return np.float32(0.1) * (1 + np.float32(0.1) * x)
+        if name.endswith("monodepth_predictor.head.4.bias"):
+            return 1 + np.float32(0.1) * x  # disparities around one
+        if len(shape) > 1:
+            return x / np.float32(np.sqrt(np.prod(shape[1:])))
+        return 1 + np.float32(0.1) * x if name.endswith("weight") else np.float32(0.02) * x
+
+    return {name: torch.from_numpy(made(name, shape)) for name, shape in shapes.items()}
+
+
 def lama_weights(*size: int) -> dict[str, Tensor]:
     """`deterministic_weights` of LaMa's generator, of another width and depth where given; variances around one."""
-    from spackle.bases.sharp.checkpoint import deterministic_weights
     from spackle.inpaint.lama_network import expected_shapes
 
     made = deterministic_weights(expected_shapes(*size))

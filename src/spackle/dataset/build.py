@@ -23,7 +23,7 @@ from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
 from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import INPAINTERS, InpainterOptions
+from spackle.inpaint import INPAINTERS, InpainterOptions, inpainter_class
 from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
@@ -56,7 +56,7 @@ class DatasetOptions:
 
     @property
     def inpaints_by_network(self) -> bool:
-        return self.inpainter in INPAINTERS and INPAINTERS[self.inpainter].network
+        return self.inpainter in INPAINTERS and inpainter_class(self.inpainter).network
 
     @property
     def processes(self) -> Workers:

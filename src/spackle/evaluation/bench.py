@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from spackle.bases.protocol import BasePrediction
-from spackle.bases.sharp.checkpoint import unused_shapes
-from spackle.bases.sharp.layers import FULL
+from spackle.bases.sharp.base import unused_shapes
+from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, Viewpoint, load_case

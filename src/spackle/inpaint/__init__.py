@@ -1,28 +1,85 @@
-"""All that fills the holes of pictures: one protocol, and the registry where a name becomes an inpainter.
+"""All that fills the holes of pictures: one protocol, and the table where a name becomes an inpainter.
 
 To add an inpainter, write a class in a file of its own (see `Inpainter`), add a line to `INPAINTERS`, and test it.
 """
 
 from __future__ import annotations
 
-from spackle.errors import check_name
-from spackle.inpaint.exemplar import ExemplarInpainter
-from spackle.inpaint.lama import LamaInpainter
-from spackle.inpaint.opencv import OpencvInpainter
-from spackle.inpaint.propainter import PropainterInpainter
-from spackle.inpaint.protocol import Inpainter, InpainterOptions, known_inverse_depth
+import dataclasses
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import ClassVar, Protocol
 
-__all__ = ["INPAINTERS", "Inpainter", "InpainterOptions", "get_inpainter", "known_inverse_depth"]
+import torch
+from torch import Tensor
 
-INPAINTERS: dict[str, type[Inpainter]] = {
-    "exemplar": ExemplarInpainter,
-    "lama": LamaInpainter,
-    "opencv": OpencvInpainter,
-    "propainter": PropainterInpainter,
+from spackle.errors import InputError, check_name
+from spackle.image import MAX_SIDE
+
+MIN_SIDE = 128  # pixels; the coarsest map of ProPainter's flow, 1/64, needs two cells each way
+INPAINTERS = {  # file and class, imported when the inpainter is asked for
+    "exemplar": ("plain", "ExemplarInpainter"),
+    "lama": ("lama", "LamaInpainter"),
+    "opencv": ("plain", "OpencvInpainter"),
+    "propainter": ("propainter", "PropainterInpainter"),
 }
+
+
+@dataclasses.dataclass(frozen=True)
+class InpainterOptions:
+    """What inpainters are made of; each takes what it needs."""
+
+    weights: Path | None = None  # a file or a folder; where None, those that `spackle weights get` brought
+    side: int | None = None  # pixels of the long side at which a network works; its own default where None
+    device: str | None = None  # "cpu" or "cuda"; where None, CUDA if there is any
+
+    def side_or(self, default: int) -> int:
+        """The side, or a network's default; InputError for one that cannot be."""
+        if self.side is not None and not MIN_SIDE <= self.side <= MAX_SIDE:
+            raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self.side}")
+        return default if self.side is None else self.side
+
+
+class Inpainter(Protocol):
+    """Fills the holes of pictures; the same input gives the same output."""
+
+    name: str
+    version: str  # another version may give other pixels
+    network: ClassVar[bool]  # takes weights and a side, and uses a GPU
+    notice: ClassVar[str]  # a line that people read before it is used, such as its licence; empty where there is none
+    files: Mapping[str, Path]  # its weights, by the names that a manifest gives them
+
+    def __init__(self, options: InpainterOptions) -> None:
+        """Find what it needs; InputError where that is missing."""
+
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        """New colours in the holes of V views of one scene, ordered as a camera that flies past would see them.
+
+        Args:
+            rgb: [V, H, W, 3] sRGB in 0..1.
+            hole: [V, H, W] bool.
+            inverse_depth: [V, H, W] 1/z of what the views show; 0 where it is unknown.
+
+        Returns:
+            [V, H, W, 3] sRGB in 0..1, outside of the holes `rgb` bit for bit.
+        """
+        ...
+
+
+def inpainter_class(name: str) -> type[Inpainter]:
+    """The class of an inpainter by its name; InputError for an unknown one."""
+    check_name("inpainter", name, INPAINTERS)
+    file, kind = INPAINTERS[name]
+    found: type[Inpainter] = getattr(import_module(f"{__name__}.{file}"), kind)
+    return found
 
 
 def get_inpainter(name: str, options: InpainterOptions) -> Inpainter:
     """An inpainter by its name; InputError for an unknown one, or one whose package or weights are missing."""
-    check_name("inpainter", name, INPAINTERS)
-    return INPAINTERS[name](options)
+    return inpainter_class(name)(options)
+
+
+def known_inverse_depth(depth: Tensor, hole: Tensor) -> Tensor:
+    """`inverse_depth` for `Inpainter.paint` of renderings with depth [V, H, W]: 0 in the holes and where depth is 0."""
+    return torch.where(~hole & (depth > 0), 1 / depth.clamp_min(1e-6), 0.0)

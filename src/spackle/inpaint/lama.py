@@ -12,26 +12,24 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
 from torch import Tensor
 
 from spackle.crop import Crop
 from spackle.device import enough_memory, own_arithmetic, pick_device
-from spackle.errors import InputError, reason_in_a_line
-from spackle.files import check_file
-from spackle.image import MAX_SIDE, working_size
-from spackle.inpaint.lama_network import LamaNetwork, Shapes, expected_shapes
-from spackle.inpaint.protocol import InpainterOptions
-from spackle.inpaint.torchscript import TorchScriptFile
+from spackle.errors import InputError
+from spackle.image import working_size
+from spackle.inpaint import InpainterOptions
+from spackle.inpaint.lama_network import LamaNetwork, expected_shapes
+from spackle.network_file import check_finite, check_tensors, read_tensors
 from spackle.weights import installed
 
 SIDE = 1024  # pixels of the long side at which it works
-MIN_SIDE = 128
 MULTIPLE = 8  # of the sides of what the network is given
 SMALLEST = 16  # pixels of them: an eighth is reflected at its ends
 MARGIN = 128  # pixels around a group of holes that the network sees
 BLOCK = 16  # pixels of the grid on which groups are found
 FIRST = "model.1.ffc.convl2l.weight"
+ADVICE = "`spackle weights get lama` downloads LaMa's weights"
 
 
 class LamaInpainter:
@@ -47,9 +45,7 @@ class LamaInpainter:
         Raises:
             InputError: a side that cannot be, no such device, or weights that are missing, damaged or others.
         """
-        self._side = SIDE if options.side is None else options.side
-        if not MIN_SIDE <= self._side <= MAX_SIDE:
-            raise InputError(f"inpainter lama: its side must be between {MIN_SIDE} and {MAX_SIDE}, got {self._side}")
+        self._side = options.side_or(SIDE)
         self._device = pick_device(options.device)
         path = options.weights or installed("lama")
         if path is None:
@@ -67,11 +63,11 @@ class LamaInpainter:
         """
         painted = rgb.clone()
         for view, mask, target in zip(rgb, hole, painted, strict=True):
-            for group, seen in groups_of(mask):
+            for group, crop in groups_of(mask):
                 drawn = torch.empty_like(view)
-                drawn[seen.slices] = self._draw(view[seen.slices], mask[seen.slices]).to(drawn)
-                own = mask[group.slices]
-                target[group.slices][own] = drawn[group.slices][own]
+                drawn[crop.slices] = self._draw(view[crop.slices], mask[crop.slices]).to(drawn)
+                masked = mask[group.slices]
+                target[group.slices][masked] = drawn[group.slices][masked]
         return painted
 
     def _draw(self, rgb: Tensor, hole: Tensor) -> Tensor:
@@ -84,11 +80,9 @@ class LamaInpainter:
             known = F.adaptive_avg_pool2d((~mask).to(colors), small)
             mask = known < 0.999  # a pixel that lies in a hole with any part of it
             colors = F.adaptive_avg_pool2d(colors, small)
-        try:
-            with enough_memory(), own_arithmetic(self._device):
-                drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
-        except InputError as error:
-            raise InputError(f"inpainter lama: too little memory for {max(small)} pixels: lower its side") from error
+        shortage = enough_memory("lower --inpainter-side", what=f"for LaMa at {max(small)} pixels")
+        with shortage, own_arithmetic(self._device):
+            drawn: Tensor = self._network(padded(colors), padded(mask))[..., : small[0], : small[1]]
         if not bool(drawn.isfinite().all()):
             raise InputError(f"{self.files['lama']}: LaMa's colours are not finite with these weights: give others")
         if small != (height, width):
@@ -111,11 +105,11 @@ def groups_of(hole: Tensor) -> list[tuple[Crop, Crop]]:
     blocks = F.max_pool2d(hole[None].float(), BLOCK, ceil_mode=True)[0].cpu().numpy() > 0
     groups: list[Crop] = []
     for row, column in zip(*blocks.nonzero(), strict=True):
-        found = Crop(*(BLOCK * int(place) for place in (row, column, row + 1, column + 1)))
-        while near := [other for other in groups if belong(found, other)]:
+        group = Crop(*(BLOCK * int(index) for index in (row, column, row + 1, column + 1)))
+        while near := [other for other in groups if belong(group, other)]:
             groups.remove(near[0])
-            found = found.union(near[0])
-        groups.append(found)
+            group = group.union(near[0])
+        groups.append(group)
     return [(group, seen(group)) for group in groups]
 
 
@@ -129,51 +123,26 @@ def padded(x: Tensor) -> Tensor:
 
 
 def load_network(path: Path) -> LamaNetwork:
-    """The network with the weights of a TorchScript file, which is not run, or of safetensors.
+    """The network with the weights of a TorchScript file, which is not run, of `torch.save` or of safetensors.
 
-    Weights of another width or depth are LaMa's too. Half precision is widened.
+    Weights of another width or depth are LaMa's too. Half precision is widened. All names may begin with the path to
+    a generator; other networks' tensors beside it, such as a discriminator's, are ignored.
 
     Raises:
         InputError: a missing or broken file, or one of another network.
     """
-    check_file(path, "weight file")
-    again = "`spackle weights get lama` downloads LaMa's"
-    try:
-        with open(path, "rb") as file:
-            zipped = file.read(4) == b"PK\3\4"
-        if zipped:
-            with TorchScriptFile(path) as archive:
-                names = published_names(archive.shapes)
-                tensors = dict(zip(names, archive.read(names.values()), strict=True))
-        else:
-            found = load_file(path)
-            names = published_names({name: tuple(tensor.shape) for name, tensor in found.items()})
-            tensors = {name: found[other] for name, other in names.items()}
-        wrong = [name for name, x in tensors.items() if not (x.is_floating_point() and bool(x.isfinite().all()))]
-        if wrong:
-            raise ValueError(f"{len(wrong)} of {len(tensors)} tensors are no finite numbers, such as {wrong[0]}")
-        return LamaNetwork({name: tensor.float() for name, tensor in tensors.items()})
-    except Exception as error:  # a stranger's bytes can raise anything
-        raise InputError(f"{path}: cannot be read as LaMa's weights ({reason_in_a_line(error)}): {again}") from error
-
-
-def published_names(shapes: Shapes) -> dict[str, str]:
-    """Each name of `expected_shapes` to that in a file, where all may begin with the path to a generator.
-
-    Other networks' tensors beside it, such as a discriminator's, are ignored; ValueError where it is not LaMa's.
-    """
-    before = (name.removesuffix(FIRST) for name in shapes if name.endswith(FIRST))
+    found = read_tensors(path, ADVICE)
+    before = (name.removesuffix(FIRST) for name in found if name.endswith(FIRST))
     prefix = min((start for start in before if not start or start.endswith("generator.")), key=len, default=None)
     if prefix is None:
-        raise ValueError("it holds no generator")
-    own = {
-        name.removeprefix(prefix): shape
-        for name, shape in shapes.items()
+        raise InputError(f"{path}: another network's weights: it holds no generator: {ADVICE}")
+    tensors = {
+        name.removeprefix(prefix): tensor
+        for name, tensor in found.items()
         if name.startswith(f"{prefix}model.") and not name.endswith(".num_batches_tracked")
     }
-    blocks = sum(name.endswith(".conv1.bn_l.weight") for name in own)
-    wanted = expected_shapes(sum(own[FIRST][:1]), blocks)
-    wrong = sorted(name for name in wanted.keys() | own.keys() if wanted.get(name) != own.get(name))
-    if wrong:
-        raise ValueError(f"{len(wrong)} tensors are another network's, such as {wrong[0]}")
-    return {name: prefix + name for name in wanted}
+    blocks = sum(name.endswith(".conv1.bn_l.weight") for name in tensors)
+    check_tensors(tensors, expected_shapes(sum(tensors[FIRST].shape[:1]), blocks), path, ADVICE)
+    network = LamaNetwork({name: tensor.to(torch.float32, copy=True) for name, tensor in tensors.items()})
+    check_finite(network, path, ADVICE)
+    return network

@@ -12,11 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from spackle.network_file import Shapes
+
 LOCAL = 4  # one of so many channels is local in the blocks, the others are distant
 EPSILON = 1e-5  # of batch norms
 WIDTH, BLOCKS = 64, 18  # of "big-lama"
 
-Shapes = dict[str, tuple[int, ...]]
 Tensors = Mapping[str, Tensor]
 
 

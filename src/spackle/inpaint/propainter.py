@@ -8,28 +8,25 @@ from __future__ import annotations
 
 import hashlib
 import re
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d
 
 from spackle.device import enough_memory, pick_device
 from spackle.errors import InputError, reason_in_a_line
-from spackle.files import check_file
-from spackle.image import MAX_SIDE, working_size
-from spackle.inpaint.protocol import InpainterOptions
+from spackle.image import working_size
+from spackle.inpaint import MIN_SIDE, InpainterOptions
+from spackle.network_file import load_strict, read_tensors
 
 NETWORKS = ("raft_things", "propainter_rfc", "propainter")  # flow, its completion, colours; so their files begin
 SOURCE = "https://github.com/osmr/imgclsmob/releases/tag/v0.0.570"
 SIDE = 640  # pixels of the long side at which it works; it was trained on 432×240
-MIN_SIDE = 128  # of what the networks are given: the coarsest map of the flow, 1/64, needs two cells each way
-MULTIPLE = 8  # of that
+MULTIPLE = 8  # of the sides of what the networks are given
 DILATION = 4  # pixels around a hole that count as hole, the authors' choice: its rim is a mixture
 ITERATIONS = 20  # of the flow, the authors' choice
 
@@ -50,9 +47,7 @@ class PropainterInpainter:
         Raises:
             InputError: a side that cannot be, no package, or weights that are missing, damaged or others.
         """
-        self._side = SIDE if options.side is None else options.side
-        if not MIN_SIDE <= self._side <= MAX_SIDE:
-            raise InputError(f"--inpainter-side must be between {MIN_SIDE} and {MAX_SIDE}, got {self._side}")
+        self._side = options.side_or(SIDE)
         version = _package_version()
         self.files: Mapping[str, Path] = weight_files(options.weights)
         self._networks = [_network(name, file) for name, file in self.files.items()]
@@ -72,11 +67,8 @@ class PropainterInpainter:
         small = working_size(width, height, self._side)[::-1]
         frames = F.interpolate(rgb.permute(0, 3, 1, 2), small, mode="bicubic", antialias=True)
         holes = F.interpolate(hole[:, None].float(), small, mode="area") > 0  # a thin one is not lost
-        try:
-            with enough_memory():
-                filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
-        except InputError as error:
-            raise InputError(f"ProPainter: too little memory at {self._side} pixels: lower --inpainter-side") from error
+        with enough_memory("lower --inpainter-side", what=f"for ProPainter at {self._side} pixels"):
+            filled = self._fill(frames.clamp(0, 1), holes.float()).to(rgb)
         if not bool(filled.isfinite().all()):
             raise InputError("ProPainter: its colours are not finite: give the published --inpainter-weights")
         painted = F.interpolate(filled, (height, width), mode="bicubic").clamp(0, 1).permute(0, 2, 3, 1)
@@ -166,48 +158,15 @@ def weight_files(folder: Path | None) -> dict[str, Path]:
 def give_weights(network: nn.Module, name: str, file: Path) -> None:
     """Fill a network from its file and freeze it; half precision is widened.
 
-    As in the package that publishes them, tensors that the network does not have are ignored. Those that are no
-    floats are its own constants, and stay as they are.
+    As in the package that publishes them, tensors that the network does not have are ignored.
 
     Raises:
         InputError: a missing or broken file, or one of another network.
     """
-    found, ours = _read(file), network.state_dict()
-    used = {key: tensor for key, tensor in ours.items() if tensor.is_floating_point()}
-    wrong = [key for key, tensor in used.items() if not _fits(found.get(key), tensor)]
-    if wrong:
-        raise InputError(
-            f"{file}: not the weights of {name}: {len(wrong)} of {len(used)} tensors are missing, of another shape "
-            f"or not finite, such as {wrong[0]}: give the file of that name from {SOURCE}"
-        )
-    network.load_state_dict(ours | {key: found[key].float() for key in used})
-    network.eval().requires_grad_(False)
-
-
-def _read(file: Path) -> dict[str, Tensor]:
-    """Whatever is in a stranger's file, its kind told by its first bytes."""
-    check_file(file, "weight file")
-    try:
-        with open(file, "rb") as opened:
-            head = opened.read(9)
-        if head[8:] == b"{":
-            return dict(load_file(file))
-        named = re.search(r"-\d{4}-([0-9a-f]{8})\.pth$", file.name)  # as published: the first digits of its SHA-1
-        if named and not hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest().startswith(named[1]):
-            raise ValueError("its SHA-1 is not the one in its name")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about kinds of tensors that are refused
-            return dict(torch.load(file, map_location="cpu", weights_only=True))
-    except Exception as error:  # a stranger's bytes can raise anything
-        reason = reason_in_a_line(error)
-        raise InputError(f"{file}: cannot be read as weights ({reason}): unpack the file of {SOURCE} again") from error
-
-
-def _fits(value: object, ours: Tensor) -> bool:
-    """Whether a file's value is a plain tensor that can stand for ours."""
-    if type(value) not in (Tensor, nn.Parameter):  # others can hide what they are
-        return False
-    assert isinstance(value, Tensor)
-    if value.layout != torch.strided or value.device.type != "cpu":
-        return False
-    return value.is_floating_point() and value.shape == ours.shape and bool(value.float().isfinite().all())
+    advice = f"unpack the file of {name} from {SOURCE} again"
+    found = read_tensors(file, advice)
+    published = re.search(r"-\d{4}-([0-9a-f]{8})\.pth$", file.name)  # the first digits of its SHA-1
+    if published and not hashlib.sha1(file.read_bytes(), usedforsecurity=False).hexdigest().startswith(published[1]):
+        raise InputError(f"{file}: damaged, for its SHA-1 is not the one in its name: {advice}")
+    ours = network.state_dict().keys()
+    load_strict(network, {key: tensor for key, tensor in found.items() if key in ours}, file, advice)

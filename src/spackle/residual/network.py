@@ -20,7 +20,7 @@ from torch.nn.functional import interpolate, pad
 from spackle.camera import Camera
 from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.filters import broadly_blurred
-from spackle.network_file import fill_network, read_tensors
+from spackle.network_file import channels_last, load_strict, read_tensors
 from spackle.patches import TONE_CELLS, Patches, match_patches
 from spackle.residual.base_values import Seeds, inside_photo
 from spackle.residual.crops import crops_around
@@ -236,5 +236,5 @@ def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
     Raises:
         InputError: a missing or broken file, or weights of another architecture.
     """
-    tensors = read_tensors(path, "residual", "a .safetensors file, 'seeds' or 'none'")
-    return fill_network(ResidualNet(), tensors, path, "residual")
+    advice = "give the residual's weights, 'seeds' or 'none'"
+    return load_strict(ResidualNet(), read_tensors(path, advice), path, advice, prepare=channels_last)

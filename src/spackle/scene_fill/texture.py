@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle.fill import FAR_BIAS, far_fill
 from spackle.filters import blurred, broadly_blurred, distance_to, nearest_known
-from spackle.inpaint.protocol import Inpainter, known_inverse_depth
+from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.patches import Patches
 from spackle.render.protocol import Rendering
 from spackle.residual.base_values import Seeds

@@ -7,6 +7,8 @@ non-Spackle training path" alone ("Training Details and Loss Weights"): so each 
 
 from __future__ import annotations
 
+import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,13 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from spackle.bases.sharp.base import TunableSharp, normalised_camera
-from spackle.bases.sharp.checkpoint import Owner, decoder_bytes, link_owner, owner_of, read_checkpoint_tensors
+from spackle.bases.sharp.base import Owner, decoder_bytes, link_owner, load_network, owner_of, to_square, usual_windows
+from spackle.bases.sharp.encoder import set_precision
+from spackle.bases.sharp.network import Seen, SharpNetwork, compose
+from spackle.camera import Camera
 from spackle.dataset.sample import DatasetView
 from spackle.dataset.shards import DatasetFiles
-from spackle.device import enough_memory
+from spackle.device import enough_memory, own_arithmetic
 from spackle.errors import InputError
 from spackle.files import write_whole
+from spackle.gaussians import Gaussians
+from spackle.network_file import read_tensors
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of
 from spackle.training.recipe import DataRecipe, Recipe
@@ -31,6 +37,56 @@ from spackle.training.sources import open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
 VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
+
+
+@dataclasses.dataclass(frozen=True)
+class TunableSharp:
+    """A network whose decoder, `network.gaussian_decoder()`, keeps float32 weights that small steps can move."""
+
+    network: SharpNetwork
+    precision: torch.dtype  # of the heavy arithmetic: what is frozen is stored in it, the decoder converted on the fly
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
+        """Read a checkpoint (see `load_network`), with the heavy arithmetic in float32 or bfloat16; nothing learns yet.
+
+        Raises:
+            InputError: a missing, broken or foreign file, or too little memory: 2.8 GB while it is read.
+        """
+        network = load_network(path, torch.float32)
+        set_precision(network.monodepth_model, precision)
+        return TunableSharp(network.to(device), precision)
+
+    @torch.no_grad()
+    def see(self, rgb: Tensor, photo_camera: Camera) -> Seen:
+        """What the frozen part makes of a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
+        device = next(self.network.parameters()).device
+        image = to_square(rgb.to(device), self.network.config.side)
+        with own_arithmetic(device):
+            return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
+
+    def gaussians(self, decoder: nn.Module, seen: Seen, place: torch.device | str = "cpu") -> Gaussians:
+        """Gaussians in SHARP's normalised space, at a place, with gradients to a `GaussianDecoder`."""
+        device = seen.picture.device
+        autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
+        with own_arithmetic(device):
+            with autocast:
+                deltas = decoder(seen.picture, seen.maps)
+            return compose(seen.start, deltas).to(place)
+
+
+def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
+    """A camera that sees Gaussians of the normalised space as `camera`, in metres, sees the same ones in metres.
+
+    The way to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. On Gaussians it takes an
+    eigendecomposition (`stretch_gaussians`), whose gradient is not defined for round ones, as SHARP's are at first. A
+    renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P D draws the
+    same picture, and every gradient exists.
+    """
+    fx, fy = photo_camera.focal
+    matrix = camera.world_to_camera.double()  # the product rounded to float32 would move what is seen
+    stretch = matrix.new_tensor([photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0])
+    return dataclasses.replace(camera, world_to_camera=matrix * stretch)
 
 
 def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[DatasetView], renderer: Renderer) -> ViewBatch:
@@ -156,7 +212,7 @@ def _find_owner(checkpoint: Path | None) -> Owner:
             "--method direct-ft: no weights of SHARP on this machine: `spackle weights get sharp` downloads them "
             "(2.8 GB, for research only), -c FILE takes a local copy"
         )
-    read_checkpoint_tensors(path)  # refuses what is none, and reads no numbers yet
+    read_tensors(path, "give SHARP's checkpoint")  # refuses what is none, and reads no numbers yet
     if owner_of(path) is not None:
         raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")
     check_undamaged(path)

@@ -13,7 +13,6 @@ paper's ResNet-50, or SqueezeNet 1.0, 3 MB and many times faster.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -26,6 +25,7 @@ from torch import Tensor, nn
 from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.filters import blurred, greatest_around
+from spackle.network_file import load_strict, read_tensors
 
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
 NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhere
@@ -145,26 +145,18 @@ def load_features(
         return None
     if path is None:
         raise InputError(f"{name}: its weights are not given: name their file, or choose none")
-    check_file(path, "weight file")
     network: FeatureNet = ResNet50() if name == "resnet50" else SqueezeNet()
-    with reading(path, f"not the weights of {name} ({{reason}}): give another file"):
-        read = (_read_pth if name == "resnet50" else _read_npz)(path)
-        found = {key: value.float() for key, value in read.items() if not key.startswith(network.head)}
-        network.load_state_dict(found)
-        if endless := [key for key, value in found.items() if not value.isfinite().all()]:
-            raise ValueError(f"{endless[0]} holds numbers that are not finite")
-    return network.requires_grad_(False).eval().to(device)
+    advice = f"give another file with {name}'s weights"
+    found = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)
+    tensors = {key: value for key, value in found.items() if not key.startswith(network.head)}
+    return load_strict(network, tensors, path, advice).to(device)
 
 
-def _read_pth(path: Path) -> dict[str, Tensor]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about kinds of tensors that are refused
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
-
-
-def _read_npz(path: Path) -> dict[str, Tensor]:
+def _read_npz(path: Path, advice: str) -> dict[str, Tensor]:
     """The tensors of an .npz, `fire2/conv1x1_1.w` as `fire2.conv1x1_1.weight`."""
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
+    check_file(path, "weight file")
+    broken = reading(path, f"not a file of weights ({{reason}}): {advice}")
+    with broken, open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
         names = {name: name[:-1].replace("/", ".") + {"w": "weight", "b": "bias"}[name[-1]] for name in arrays.files}
         return {ours: torch.from_numpy(arrays[name]) for name, ours in names.items()}
 

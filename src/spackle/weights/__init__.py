@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from spackle.errors import InputError
+from spackle.errors import InputError, check_name, reading
 from spackle.files import check_file, sha256_of
 
 HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror of it
@@ -46,8 +46,7 @@ PUBLISHED = {name: PublishedWeights(name, **facts) for name, facts in _FACTS.ite
 
 def published_weights(name: str) -> PublishedWeights:
     """The entry of that name; InputError where there is none."""
-    if name not in PUBLISHED:
-        raise InputError(f"{name}: no weights of that name are known: choose from {', '.join(PUBLISHED)}")
+    check_name("weights", name, PUBLISHED)
     return PUBLISHED[name]
 
 
@@ -56,13 +55,11 @@ def weights_folder() -> Path:
 
     InputError where none is set, and there is no home.
     """
-    try:
+    with reading("downloaded weights", "there is no home folder for them: name one in SPACKLE_WEIGHTS", RuntimeError):
         if chosen := os.environ.get("SPACKLE_WEIGHTS"):
             return Path(chosen).expanduser()
         cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
         return (cache if cache.is_absolute() else Path.home() / ".cache") / "spackle" / "weights"
-    except RuntimeError as error:
-        raise InputError("no home folder for downloaded weights: name a folder in SPACKLE_WEIGHTS") from error
 
 
 def installed(name: str) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -9,13 +10,11 @@ import socket
 import ssl
 import time
 from collections.abc import Callable, Iterator
-from email.message import Message
 from http.client import HTTPException, HTTPResponse, responses
 from pathlib import Path
-from typing import IO
 from urllib.error import HTTPError, URLError
 from urllib.parse import urlsplit
-from urllib.request import HTTPRedirectHandler, Request, build_opener
+from urllib.request import Request, build_opener
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import check_writable, sha256_of
@@ -29,11 +28,7 @@ Progress = Callable[[int, int], None]  # (bytes done, of how many)
 
 
 class Dropped(Exception):
-    """No connection, or no longer; `begun`: the server had begun to send the file."""
-
-    def __init__(self, reason: str, begun: bool) -> None:
-        super().__init__(reason)
-        self.begun = begun
+    """No connection, or no longer."""
 
 
 def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, progress: Progress | None = None) -> None:
@@ -63,7 +58,7 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
     except BlockingIOError as error:
         raise InputError(f"{path}: another process is downloading this file: wait until it is done") from error
     except OSError as error:
-        reason = error.strerror or error
+        reason = reason_in_a_line(error)
         raise InputError(f"{path}: cannot write: {reason}: make room or choose another folder") from error
 
 
@@ -92,31 +87,44 @@ def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
         InputError: the file cannot be had; what has come stays in `part`.
         OSError: `part` cannot be written.
     """
-    begun, pauses = False, list(PAUSES)
-    while (done := part.stat().st_size if part.exists() else 0) != size:
+    kept, pauses = _size(part), list(PAUSES)
+    while _size(part) != size:
         try:
-            _receive_once(url, part, done if done < size else 0, size, progress)
+            _receive_rest(url, part, size, progress)
         except Dropped as error:
-            begun = begun or error.begun
-            if not (begun and pauses):
-                done = part.stat().st_size if part.exists() else 0
-                kept = f" (what has come is kept: {done:,} bytes)" if done else ""
-                raise InputError(f"{url}: {error}{kept}") from error
+            done = _size(part)
+            if not pauses or done == kept:
+                remark = f" (what has come is kept: {done:,} bytes)" if done else ""
+                raise InputError(f"{url}: {error}{remark}") from error
             time.sleep(pauses.pop(0))
 
 
-def _receive_once(url: str, part: Path, done: int, size: int, progress: Progress) -> None:
-    with _connect(url, done) as response:
-        done = _first_byte(url, response, done, size)
+def _size(part: Path) -> int:
+    return part.stat().st_size if part.exists() else 0
+
+
+def _receive_rest(url: str, part: Path, size: int, progress: Progress) -> None:
+    """Ask for what `part` lacks, through the environment's proxies (https_proxy, no_proxy) and redirects."""
+    there = _size(part)
+    headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"}
+    if 0 < there < size:
+        headers["Range"] = f"bytes={there}-"
+    with _network(url):
+        response: HTTPResponse = build_opener().open(Request(url, headers=headers), timeout=TIMEOUT)
+    with response:
+        done = _first_byte(url, response, there, size)
         usage = shutil.disk_usage(part.parent)
-        free = usage.free + (part.stat().st_size if done == 0 and part.exists() else 0)  # the old part makes way
-        if usage.total and free < size - done:  # some network folders say 0 of 0
-            gigabytes = f"{(size - done) / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free"
+        if usage.total and (free := usage.free + there) < size:  # some network folders say 0 of 0
+            gigabytes = f"{size / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free"
             raise InputError(f"{part.parent}: {gigabytes}: make room or choose another folder")
         with open(part, "ab") as file:
             file.truncate(done)
             progress(done, size)
-            for block in _blocks(response, size - done):
+            while done < size:
+                with _network(url):
+                    block = response.read1(min(CHUNK, size - done))  # what is there: read() would lose it at a break
+                if not block:
+                    raise Dropped(f"the connection ended {size - done:,} bytes early")
                 file.write(block)
                 file.flush()
                 done += len(block)
@@ -124,72 +132,36 @@ def _receive_once(url: str, part: Path, done: int, size: int, progress: Progress
             os.fsync(file.fileno())  # the file's name will promise that it is whole
 
 
-def _connect(url: str, done: int) -> HTTPResponse:
-    """Ask for the bytes from `done` on, through the environment's proxies (https_proxy, no_proxy) and redirects.
-
-    Raises Dropped where the server cannot be reached, and InputError where it does not give the file.
-    """
-    headers = {"User-Agent": "spackle", "Accept-Encoding": "identity"} | ({"Range": f"bytes={done}-"} if done else {})
+@contextlib.contextmanager
+def _network(url: str) -> Iterator[None]:
+    """Dropped where the server cannot be reached, InputError where it does not give the file."""
     try:
-        response: HTTPResponse = build_opener(_SafeRedirects).open(Request(url, headers=headers), timeout=TIMEOUT)
-        return response
+        yield
     except HTTPError as error:
         with error:
-            status = f"HTTP {error.code} {responses.get(error.code, '')}".rstrip()
+            status = f"the server answers HTTP {error.code} {responses.get(error.code, '')}".rstrip()
         if error.code >= 500 or error.code == 429:
-            raise Dropped(f"the server answers {status}: try again later", begun=False) from error
-        raise InputError(f"{url}: the server answers {status}: check the address, or give another") from error
+            raise Dropped(f"{status}: try again later") from error
+        raise InputError(f"{url}: {status}: check the address, or give another") from error
     except (OSError, HTTPException) as error:
-        raise Dropped(reason_of(error), begun=False) from error
+        raise Dropped(reason_of(error)) from error
 
 
-class _SafeRedirects(HTTPRedirectHandler):
-    """Follows redirects, but not from https to http, and to nothing that we would not take as an address."""
-
-    def redirect_request(
-        self, req: Request, fp: IO[bytes], code: int, msg: str, headers: Message, newurl: str
-    ) -> Request | None:
-        try:
-            check_url(newurl)
-            if req.full_url.startswith("https:") and not newurl.startswith("https:"):
-                raise InputError(f"{newurl}, which is not https: give another address")
-        except InputError as error:
-            fp.close()
-            raise InputError(f"{req.full_url}: the server sends on to {error}") from error
-        return super().redirect_request(req, fp, code, msg, headers, newurl)  # type: ignore[arg-type]
-
-
-def _first_byte(url: str, response: HTTPResponse, done: int, size: int) -> int:
-    """Where in the file an answer begins: at `done`, or at 0 where the server gives the whole.
+def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
+    """Where in the file an answer begins: after the bytes that are there, or at 0 where the server gives the whole.
 
     InputError where it is no file, or not one of `size` bytes.
     """
     rest = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers["Content-Range"] or "")
-    if response.status == 206 and rest and int(rest[1]) == done:
-        total = int(rest[2])
+    if response.status == 206 and rest and int(rest[1]) == there:
+        done, total = there, int(rest[2])
     elif response.status == 200 and response.headers.get_content_type() != "text/html":
         done, total = 0, size if response.length is None else response.length
     else:
         raise InputError(f"{url}: the server answers with something else than a file: check the address in a browser")
-    coding = response.headers["Content-Encoding"] or "identity"
-    if coding.strip().lower() != "identity":  # its bytes and its length would be those of the packed file
-        named = reason_in_a_line(coding)
-        raise InputError(f"{url}: the server packs the file ({named}), which was not asked for: give another address")
     if total != size:
         raise InputError(f"{url}: another file: {total:,} bytes, {size:,} were published: give another address")
     return done
-
-
-def _blocks(response: HTTPResponse, left: int) -> Iterator[bytes]:
-    while left > 0:
-        try:
-            block = response.read1(min(CHUNK, left))  # what is there: read() would lose it where the rest fails
-        except (OSError, HTTPException) as error:
-            raise Dropped(reason_of(error), begun=True) from error
-        if not block:
-            raise Dropped(f"the connection ended {left:,} bytes early", begun=True)
-        left -= len(block)
-        yield block
 
 
 def reason_of(error: Exception) -> str:

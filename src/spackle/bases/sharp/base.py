@@ -1,36 +1,47 @@
-"""The SHARP base: a photo alone to 1,179,648 metric Gaussians.
-
-Its forward may be translated by `torch.compile` and replayed as a CUDA graph, and its Gaussian decoder may learn while
-the encoder and the depth network stay as they are.
-"""
+"""The SHARP base: a photo alone to 1,179,648 metric Gaussians, by Apple's checkpoint or with a decoder trained anew."""
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import dataclasses
+import functools
+import json
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
+from safetensors import safe_open
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from spackle.bases.protocol import BasePrediction, Progress
-from spackle.bases.sharp.checkpoint import load_network
-from spackle.bases.sharp.layers import WINDOWS, TransformerBlock, set_precision
-from spackle.bases.sharp.network import DepthNetwork, InitialGaussians, Seen, SharpNetwork, SharpOutput, compose
+from spackle.bases.sharp.encoder import CONFIGS, WINDOWS, SharpConfig, set_precision
+from spackle.bases.sharp.network import (
+    GROUPS,
+    SharpNetwork,
+    SharpOutput,
+    compile_forward,
+    compose,
+    normed_residual,
+)
 from spackle.bases.sharp.unproject import stretch_gaussians
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, memory_is_short, own_arithmetic, pick_device, pick_dtype
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, one_line, reading, reason_in_a_line
+from spackle.files import sha256_of
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
+from spackle.network_file import Shapes, load_strict, read_tensors
 
 LOG = logging.getLogger("spackle")
 Forward = Callable[[Tensor, float, int, Progress | None], SharpOutput]  # as `SharpNetwork.forward`
 WINDOWS_AT_ONCE = 5  # enough to keep two cores or a small GPU at their peak
+ADVICE = "give SHARP's checkpoint as it was downloaded"
+NOTE = "spackle.gaussian_decoder"  # in the metadata of a decoder's file: JSON, for safetensors shuffles several notes
+PARTS = ("feature_model.", "prediction_head.")  # how the names of a decoder's tensors begin
 
 
 class SharpBase:
@@ -39,12 +50,7 @@ class SharpBase:
     name = "sharp"
 
     def __init__(
-        self,
-        network: SharpNetwork,
-        *,
-        windows: int | None = None,
-        compiled: bool = False,
-        weights: str = "",
+        self, network: SharpNetwork, *, windows: int | None = None, compiled: bool = False, weights: str = ""
     ) -> None:
         """Use a network that is loaded already, on its device; `weights` is what the report calls it."""
         check_windows("windows", windows)
@@ -84,8 +90,7 @@ class SharpBase:
         check_windows("windows", windows)  # before anything is read
         target = pick_device(device)
         network = load_network(path, pick_dtype(precision, target), target)
-        name = Path(path).name
-        return SharpBase(network, windows=windows, compiled=compiled, weights=name)
+        return SharpBase(network, windows=windows, compiled=compiled, weights=Path(path).name)
 
     @property
     def device(self) -> torch.device:
@@ -161,109 +166,142 @@ def to_square(rgb: Tensor, side: int) -> Tensor:
     return interpolate(image, size=(side, side), mode="bilinear", align_corners=True)
 
 
-WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels and take their workspaces
+# The checkpoint -----------------------------------------------------------------------------------
 
 
-def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork | GraphedForward:
-    """The forward of a network, sharing its weights, that `torch.compile` translates when it is first asked.
+def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch.device | str = "cpu") -> SharpNetwork:
+    """A frozen network from Apple's .pt file, or a safetensors file with the same names, on a device.
 
-    It takes a C++ compiler on a processor and Triton on a GPU; a RuntimeError at the first call says what is missing.
-    All 48 blocks of the two transformers are one translation; values differ from the network's by rounding. The
-    `backend` "eager" translates nothing.
+    The size, published or tiny, is told from the shapes. A file with a trained Gaussian decoder alone stands for the
+    checkpoint that it names, with that decoder in it. The heavy arithmetic is in `dtype`, float32 or bfloat16.
+
+    Raises:
+        InputError: a missing, broken or foreign file, or too little memory. Nothing in the file is executed.
     """
-    twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
-    depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
-    blocks = [module for module in twin.modules() if isinstance(module, TransformerBlock)]
-    for module in (*blocks, depth.decoder, depth.head, twin.feature_model):
-        module.compile(backend=backend, dynamic=False)
-    return GraphedForward(twin) if next(network.parameters()).device.type == "cuda" else twin
+    tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
+    if (owner := owner_of(path)) is not None:
+        tensors = _with_owner(tensors, path, owner)
+    token = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.cls_token")
+    width = token.shape[-1] if token is not None and token.ndim else None
+    config = next((config for config in CONFIGS.values() if config.embed == width), CONFIGS["full"])
+    with torch.device("meta"):
+        network = SharpNetwork(config)
+    advice = ["try --precision bf16"] if dtype == torch.float32 else []  # it takes half as much
+    with enough_memory(*advice):
+        convert = functools.partial(set_precision, dtype=dtype)
+        load_strict(network, tensors, path, ADVICE, unused=unused_shapes(config), prepare=convert)
+        return network.to(device)
 
 
-class GraphedForward:
-    """A network's forward, captured once and replayed as one CUDA graph, by one thread at a time."""
+def expected_shapes(config: SharpConfig) -> Shapes:
+    """Every name and shape that a checkpoint of this size has, 1,038 in the published one."""
+    with torch.device("meta"):
+        return _shapes_of(SharpNetwork(config)) | unused_shapes(config)
 
-    def __init__(self, network: SharpNetwork) -> None:
-        self.network = network
-        self.graph: torch.cuda.CUDAGraph | None = None
 
-    def __call__(
-        self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
-    ) -> SharpOutput:
-        """As the network's, always with the batch of the first call; there is no progress to see but its end."""
-        with torch.cuda.device(image.device):
-            if self.graph is None:
-                self._capture(image, batch)
-            self.image.copy_(image)
-            self.factor.fill_(disparity_factor)
-            assert self.graph is not None
-            self.graph.replay()
-        if progress:
-            progress(WINDOWS, WINDOWS)
-        start = self.output.start  # the next replay writes over it
-        return SharpOutput(InitialGaussians(*(t.clone() for t in vars(start).values())), self.output.deltas.clone())
+def unused_shapes(config: SharpConfig) -> Shapes:
+    """What a checkpoint holds and inference never reads: it is checked by name and shape, then dropped.
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
-    def _capture(self, image: Tensor, batch: int) -> None:
-        """Record a forward over buffers that later calls may write to, in inference mode or not."""
-        self.image, self.factor = image.clone(), image.new_ones(())
-        side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(WARM_UPS):
-                self.network(self.image, self.factor, batch)
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=side):  # by itself it takes that of the first device it was used on
-            self.output: SharpOutput = self.network(self.image, self.factor, batch)
-        self.graph = graph
+    These are the transformers' classifiers, and the U-Net that maps two depths to a scale in training.
+    """
+    shapes: Shapes = {}
+    for kind in ("patch_encoder", "image_encoder"):
+        name = f"monodepth_model.monodepth_predictor.encoder.{kind}.head"
+        shapes |= {f"{name}.weight": (config.classes, config.embed), f"{name}.bias": (config.classes,)}
+    width = 16  # the U-Net's channels at full size, doubled with each of four halvings
+    with torch.device("meta"):
+        into = nn.Sequential(nn.Conv2d(2, width, 3), nn.GroupNorm(GROUPS, width))
+        down = nn.ModuleList(_level(width << n, width << n + 1) for n in range(4))
+        # All but the first also see what the encoder made at their size.
+        up = nn.ModuleList(_level(width << (5 - n if n else 4), width << 3 - n) for n in range(4))
+        norms = nn.GroupNorm(GROUPS, 2 * width), nn.GroupNorm(GROUPS, width)
+        out = nn.Sequential(norms[0], nn.ReLU(), nn.Conv2d(2 * width, width, 1), norms[1])
+        encoder = nn.ModuleDict({"conv_in": into, "convs_down": down})
+        decoder = nn.ModuleDict({"convs_up": up, "conv_out": out})
+        unet = nn.ModuleDict({"encoder": encoder, "decoder": decoder, "conv_out": nn.Conv2d(width, 1, 1)})
+    return shapes | _shapes_of(unet, "depth_alignment.scale_map_estimator.")
+
+
+def _level(dim_in: int, dim_out: int) -> nn.Sequential:
+    """Two residual blocks behind a change of size, which has no parameters."""
+    first = normed_residual(dim_in, dim_out)
+    first.shortcut = nn.Conv2d(dim_in, dim_out, 1)
+    return nn.Sequential(nn.Identity(), first, normed_residual(dim_out, dim_out))
+
+
+def _shapes_of(module: nn.Module, prefix: str = "") -> Shapes:
+    return {prefix + name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+
+
+# A decoder that is trained while the rest stays ---------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
-class TunableSharp:
-    """A network whose decoder, `network.gaussian_decoder()`, keeps float32 weights that small steps can move."""
+class Owner:
+    """The checkpoint that a decoder was trained on, and needs for all that was not trained."""
 
-    network: SharpNetwork
-    precision: torch.dtype  # of the heavy arithmetic: what is frozen is stored in it, the decoder converted on the fly
+    path: Path  # where it lies; of one that a decoder's file names, the name alone
+    sha256: str
 
-    @staticmethod
-    def load(path: str | os.PathLike[str], precision: torch.dtype, device: torch.device) -> TunableSharp:
-        """Read a checkpoint (see `load_network`), with the heavy arithmetic in float32 or bfloat16; nothing learns yet.
-
-        Raises:
-            InputError: a missing, broken or foreign file, or too little memory: 2.8 GB while it is read.
-        """
-        network = load_network(path, torch.float32)
-        set_precision(network.monodepth_model, precision)
-        return TunableSharp(network.to(device), precision)
-
-    @torch.no_grad()
-    def see(self, rgb: Tensor, photo_camera: Camera) -> Seen:
-        """What the frozen part makes of a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
-        device = next(self.network.parameters()).device
-        image = to_square(rgb.to(device), self.network.config.side)
-        with own_arithmetic(device):
-            return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
-
-    def gaussians(self, decoder: nn.Module, seen: Seen, place: torch.device | str = "cpu") -> Gaussians:
-        """Gaussians in SHARP's normalised space, at a place, with gradients to a `GaussianDecoder`."""
-        device = seen.picture.device
-        autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
-        with own_arithmetic(device):
-            with autocast:
-                deltas = decoder(seen.picture, seen.maps)
-            return compose(seen.start, deltas).to(place)
+    @property
+    def places(self) -> tuple[str, str]:
+        """What it, or a link to it, is called beside a decoder: the link of `link_owner`, and its own name."""
+        return f"trained-on-{one_line(Path(self.sha256).name)[:12]}.link", self.path.name
 
 
-def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
-    """A camera that sees Gaussians of the normalised space as `camera`, in metres, sees the same ones in metres.
+def decoder_bytes(decoder: nn.Module, owner: Owner) -> bytes:
+    """A safetensors file of a `GaussianDecoder` in float32: weights that have not changed come back bit for bit."""
+    tensors = {name: tensor.detach().float().cpu().contiguous() for name, tensor in decoder.state_dict().items()}
+    return save(tensors, {NOTE: json.dumps({"checkpoint": owner.path.name, "sha256": owner.sha256})})
 
-    The way to metres, D = diag(W / 2fx, H / 2fy, 1) of the photo's camera, is not a rotation. On Gaussians it takes an
-    eigendecomposition (`stretch_gaussians`), whose gradient is not defined for round ones, as SHARP's are at first. A
-    renderer only ever applies the camera's matrix P, to centres as P x and to covariances as P Σ Pᵀ; so P D draws the
-    same picture, and every gradient exists.
+
+def link_owner(owner: Owner, folder: Path) -> None:
+    """Let decoders in a folder find their checkpoint; the link's name is one that nothing is ever written to."""
+    link = folder / owner.places[0]
+    with contextlib.suppress(OSError):  # this place has no links: then a person puts the checkpoint there
+        if link.is_symlink() and not link.exists():  # to where it lay once
+            link.unlink()
+        if not link.exists():
+            link.symlink_to(owner.path.absolute())
+
+
+def owner_of(path: str | os.PathLike[str]) -> Owner | None:
+    """The checkpoint that a readable file with a decoder names; None for other files, InputError if it names none."""
+    with open(path, "rb") as file:
+        if file.read(9)[8:] != b"{":  # no safetensors
+            return None
+    with safe_open(path, framework="pt") as opened:
+        note = (opened.metadata() or {}).get(NOTE)
+    if note is None:
+        return None
+    with reading(path, "does not say which checkpoint it was trained on: train it again"):
+        facts = json.loads(note)
+        return Owner(Path(Path(str(facts["checkpoint"])).name), str(facts["sha256"]))
+
+
+def _with_owner(decoder: Mapping[str, Tensor], path: str | os.PathLike[str], owner: Owner) -> dict[str, Tensor]:
+    """The tensors of the checkpoint beside a decoder's file, with the decoder's in place of its own.
+
+    InputError: it is not there, cannot be read or has changed, or the decoder is another network's.
     """
-    fx, fy = photo_camera.focal
-    matrix = camera.world_to_camera.double()  # the product rounded to float32 would move what is seen
-    stretch = matrix.new_tensor([photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0])
-    return dataclasses.replace(camera, world_to_camera=matrix * stretch)
+    beside = Path(path).absolute().parent
+    home = next((beside / name for name in owner.places if os.path.isfile(beside / name)), None)
+    name = one_line(owner.path.name)
+    if home is None:
+        raise InputError(
+            f"{path}: a decoder trained on {name}, which is not beside it: put that checkpoint, or a link to it, there"
+        )
+    with reading(home, "cannot be read: {reason}", OSError), open(home, "rb") as file:
+        found = sha256_of(file)
+    if found != owner.sha256:
+        raise InputError(
+            f"{path}: trained on a checkpoint with the SHA-256 {one_line(owner.sha256)[:64]}, which {home} has not: "
+            f"put that {name} beside it"
+        )
+    whole = read_tensors(home, ADVICE)
+    if wrong := sorted({name for name in whole if name.startswith(PARTS)} ^ decoder.keys()):
+        raise InputError(
+            f"{path}: not the decoder of {home}: {len(wrong)} names differ, e.g. {one_line(wrong[0])[:120]}: "
+            "give what `spackle train --method direct-ft` wrote"
+        )
+    return {**whole, **decoder}

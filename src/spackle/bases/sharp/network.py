@@ -1,27 +1,121 @@
-"""SHARP (Apple, 2025): one picture to two layers of Gaussians. Modules are named as in its checkpoint."""
+"""SHARP (Apple, 2025): one picture to two layers of Gaussians, by decoders of dense prediction (Ranftl 2021).
+
+Modules are named as in the checkpoint. `torch.compile` may translate a network's forward, and a CUDA graph replay it.
+"""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
 from spackle.bases.protocol import Progress
-from spackle.bases.sharp.layers import (
+from spackle.bases.sharp.encoder import (
     LAYERS,
     STRIDE,
-    Decoder,
+    WINDOWS,
     ExactConv,
-    Fusion,
     SharpConfig,
     SlidingPyramid,
-    normed_residual,
+    TransformerBlock,
 )
 from spackle.color import srgb_to_linear
 from spackle.gaussians import Gaussians
+
+GROUPS = 8  # of the group norms
+
+
+class Residual(nn.Module):
+    """x plus what a few layers make of it."""
+
+    def __init__(self, *layers: nn.Module) -> None:
+        super().__init__()
+        self.residual = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        delta: Tensor = self.residual(x)
+        return delta.add_(x)
+
+
+class GroupNorm(nn.GroupNorm):
+    """torch's, exact in float32 on a processor, where torch loses three digits over half a million pixels.
+
+    Sums of rows, then of those in float64, lose none.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[1, C, H, W] to the same."""
+        if x.device.type != "cpu" or x.dtype != torch.float32 or len(x) != 1:
+            return super().forward(x)
+        rows = x[0].permute(1, 2, 0)  # [H, W, C]
+        count = rows.numel() // self.num_groups
+        mean, square = (
+            moment.double().sum(0).view(self.num_groups, -1).sum(1) / count
+            for moment in (rows.sum(1), rows.square().sum(1))
+        )
+        scale = torch.rsqrt(square - mean.square() + self.eps)
+        each = self.num_channels // self.num_groups
+        scale, mean = (n.repeat_interleave(each) for n in (scale, mean))
+        factor = (self.weight * scale).float()
+        shift = (self.bias - self.weight * scale * mean).float()
+        return torch.addcmul(shift, rows, factor).permute(2, 0, 1)[None]
+
+
+def plain_residual(dim: int) -> Residual:
+    """Two 3×3 convolutions behind rectifiers. The first must leave x alone; the second may work in place."""
+    first, second = (nn.Conv2d(dim, dim, 3, padding=1) for _ in range(2))
+    return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
+
+
+def normed_residual(dim: int, out: int) -> Residual:
+    """The same with group norms, and half the width between them."""
+    first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
+    norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
+    return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
+
+
+class Fusion(nn.Module):
+    """Adds finer features to coarser ones, and doubles the size where asked."""
+
+    def __init__(self, dim: int, doubles: bool) -> None:
+        super().__init__()
+        self.resnet1 = plain_residual(dim)
+        self.resnet2 = plain_residual(dim)
+        self.deconv = nn.ConvTranspose2d(dim, dim, 2, stride=2, bias=False) if doubles else nn.Identity()
+        self.out_conv = nn.Conv2d(dim, dim, 1)
+
+    def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
+        """[1, C, H, W] each, to the same or twice the size."""
+        x = coarse if fine is None else coarse + self.resnet1(fine)
+        out: Tensor = self.out_conv(self.deconv(self.resnet2(x)))
+        return out
+
+
+class Decoder(nn.Module):
+    """Fuses feature maps from coarse to fine into one of the finest size."""
+
+    def __init__(self, dims: Sequence[int], width: int) -> None:
+        super().__init__()
+        finest = nn.Identity() if dims[0] == width else nn.Conv2d(dims[0], width, 1, bias=False)
+        coarser = (nn.Conv2d(dim, width, 3, padding=1, bias=False) for dim in dims[1:])
+        self.convs = nn.ModuleList([finest, *coarser])
+        self.fusions = nn.ModuleList(Fusion(width, doubles=level > 0) for level in range(len(dims)))
+
+    def forward(self, maps: Sequence[Tensor]) -> Tensor:
+        """Maps from fine to coarse, [1, dims[i], H/2^i, W/2^i], to [1, width, H, W]."""
+        features: Tensor | None = None
+        for level in reversed(range(len(maps))):
+            projected = self.convs[level](maps[level])
+            fuse = self.fusions[level]
+            features = fuse(projected) if features is None else fuse(features, projected)
+        assert features is not None
+        return features
+
 
 DISPARITY_RANGE = (1e-4, 1e4)  # what the depth head says is clamped to it
 HIDDEN = 32  # channels before the last layer of the depth head
@@ -229,3 +323,61 @@ def _inverse_softplus(y: Tensor) -> Tensor:
 def _rows(attribute: Tensor) -> Tensor:
     """[C, 2, H, W] to [2·H·W, C]."""
     return attribute.flatten(1).T.contiguous()
+
+
+WARM_UPS = 2  # calls before a capture, in which libraries choose their kernels and take their workspaces
+
+
+def compile_forward(network: SharpNetwork, backend: str = "inductor") -> SharpNetwork | GraphedForward:
+    """The forward of a network, sharing its weights, that `torch.compile` translates when it is first asked.
+
+    It takes a C++ compiler on a processor and Triton on a GPU; a RuntimeError at the first call says what is missing.
+    All 48 blocks of the two transformers are one translation; values differ from the network's by rounding. The
+    `backend` "eager" translates nothing.
+    """
+    twin = copy.deepcopy(network, {id(weight): weight for weight in network.parameters()})
+    depth: DepthNetwork = twin.monodepth_model.monodepth_predictor  # type: ignore[assignment]
+    blocks = [module for module in twin.modules() if isinstance(module, TransformerBlock)]
+    for module in (*blocks, depth.decoder, depth.head, twin.feature_model):
+        module.compile(backend=backend, dynamic=False)
+    return GraphedForward(twin) if next(network.parameters()).device.type == "cuda" else twin
+
+
+class GraphedForward:
+    """A network's forward, captured once and replayed as one CUDA graph, by one thread at a time."""
+
+    def __init__(self, network: SharpNetwork) -> None:
+        self.network = network
+        self.graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(
+        self, image: Tensor, disparity_factor: float, batch: int, progress: Progress | None = None
+    ) -> SharpOutput:
+        """As the network's, always with the batch of the first call; there is no progress to see but its end."""
+        with torch.cuda.device(image.device):
+            if self.graph is None:
+                self._capture(image, batch)
+            self.image.copy_(image)
+            self.factor.fill_(disparity_factor)
+            assert self.graph is not None
+            self.graph.replay()
+        if progress:
+            progress(WINDOWS, WINDOWS)
+        start = self.output.start  # the next replay writes over it
+        return SharpOutput(InitialGaussians(*(t.clone() for t in vars(start).values())), self.output.deltas.clone())
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _capture(self, image: Tensor, batch: int) -> None:
+        """Record a forward over buffers that later calls may write to, in inference mode or not."""
+        self.image, self.factor = image.clone(), image.new_ones(())
+        side = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(WARM_UPS):
+                self.network(self.image, self.factor, batch)
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=side):  # by itself it takes that of the first device it was used on
+            self.output: SharpOutput = self.network(self.image, self.factor, batch)
+        self.graph = graph

@@ -1,18 +1,18 @@
-"""SHARP's sizes, its precision, its decoders' blocks (after Ranftl 2021, dense prediction) and its encoder.
+"""SHARP's sizes, its precision and its encoder: a vision transformer over windows of three sizes of the picture.
 
-The encoder is a vision transformer over windows of three sizes of the picture. Modules are named as in the checkpoint.
+Modules are named as in the checkpoint.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
 
 from spackle.bases.protocol import Progress
+from spackle.network_file import channels_last
 
 LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it
 STRIDE = 2  # pixels of the network's picture for each cell of Gaussians
@@ -46,19 +46,8 @@ class SharpConfig:
 
 
 FULL = SharpConfig()
-TINY = SharpConfig(
-    embed=48,
-    depth=4,
-    heads=3,
-    classes=8,
-    taps=(0, 1),
-    pyramid=(16, 24, 32, 32),
-    depth_width=16,
-    gaussian_width=16,
-    feature_width=16,
-)
+TINY = SharpConfig(48, 4, 3, 8, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16)
 CONFIGS = {"full": FULL, "tiny": TINY}
-
 
 _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
@@ -71,9 +60,10 @@ class ExactConv(nn.Conv2d):
             return super().forward(x.float())
 
 
-def lower(x: Tensor, module: nn.Linear | nn.Conv2d | nn.ConvTranspose2d) -> Tensor:
+def lower(x: Tensor, module: nn.Module) -> Tensor:
     """`x` in the precision that a module computes in."""
-    return x.to(module.weight.dtype)
+    weight: Tensor = module.weight  # type: ignore[assignment]
+    return x.to(weight.dtype)
 
 
 def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
@@ -81,97 +71,7 @@ def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
     for module in network.modules():
         if isinstance(module, _HEAVY) and not isinstance(module, ExactConv):
             module.to(dtype)
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
-
-
-GROUPS = 8  # of the group norms
-
-
-class Residual(nn.Module):
-    """x plus what a few layers make of it."""
-
-    def __init__(self, *layers: nn.Module) -> None:
-        super().__init__()
-        self.residual = nn.Sequential(*layers)
-
-    def forward(self, x: Tensor) -> Tensor:
-        delta: Tensor = self.residual(x)
-        return delta.add_(x)
-
-
-class GroupNorm(nn.GroupNorm):
-    """torch's, exact in float32 on a processor, where torch loses three digits over half a million pixels.
-
-    Sums of rows, then of those in float64, lose none.
-    """
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[1, C, H, W] to the same."""
-        if x.device.type != "cpu" or x.dtype != torch.float32 or len(x) != 1:
-            return super().forward(x)
-        rows = x[0].permute(1, 2, 0)  # [H, W, C]
-        count = rows.numel() // self.num_groups
-        mean, square = (
-            moment.double().sum(0).view(self.num_groups, -1).sum(1) / count
-            for moment in (rows.sum(1), rows.square().sum(1))
-        )
-        scale = torch.rsqrt(square - mean.square() + self.eps)
-        each = self.num_channels // self.num_groups
-        scale, mean = (n.repeat_interleave(each) for n in (scale, mean))
-        factor = (self.weight * scale).float()
-        shift = (self.bias - self.weight * scale * mean).float()
-        return torch.addcmul(shift, rows, factor).permute(2, 0, 1)[None]
-
-
-def plain_residual(dim: int) -> Residual:
-    """Two 3×3 convolutions behind rectifiers. The first must leave x alone; the second may work in place."""
-    first, second = (nn.Conv2d(dim, dim, 3, padding=1) for _ in range(2))
-    return Residual(nn.ReLU(), first, nn.ReLU(inplace=True), second)
-
-
-def normed_residual(dim: int, out: int) -> Residual:
-    """The same with group norms, and half the width between them."""
-    first, second = nn.Conv2d(dim, out // 2, 3, padding=1), nn.Conv2d(out // 2, out, 3, padding=1)
-    norms = GroupNorm(GROUPS, dim), GroupNorm(GROUPS, out // 2)
-    return Residual(norms[0], nn.ReLU(inplace=True), first, norms[1], nn.ReLU(inplace=True), second)
-
-
-class Fusion(nn.Module):
-    """Adds finer features to coarser ones, and doubles the size where asked."""
-
-    def __init__(self, dim: int, doubles: bool) -> None:
-        super().__init__()
-        self.resnet1 = plain_residual(dim)
-        self.resnet2 = plain_residual(dim)
-        self.deconv = nn.ConvTranspose2d(dim, dim, 2, stride=2, bias=False) if doubles else nn.Identity()
-        self.out_conv = nn.Conv2d(dim, dim, 1)
-
-    def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
-        """[1, C, H, W] each, to the same or twice the size."""
-        x = coarse if fine is None else coarse + self.resnet1(fine)
-        out: Tensor = self.out_conv(self.deconv(self.resnet2(x)))
-        return out
-
-
-class Decoder(nn.Module):
-    """Fuses feature maps from coarse to fine into one of the finest size."""
-
-    def __init__(self, dims: Sequence[int], width: int) -> None:
-        super().__init__()
-        finest = nn.Identity() if dims[0] == width else nn.Conv2d(dims[0], width, 1, bias=False)
-        coarser = (nn.Conv2d(dim, width, 3, padding=1, bias=False) for dim in dims[1:])
-        self.convs = nn.ModuleList([finest, *coarser])
-        self.fusions = nn.ModuleList(Fusion(width, doubles=level > 0) for level in range(len(dims)))
-
-    def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Maps from fine to coarse, [1, dims[i], H/2^i, W/2^i], to [1, width, H, W]."""
-        features: Tensor | None = None
-        for level in reversed(range(len(maps))):
-            projected = self.convs[level](maps[level])
-            fuse = self.fusions[level]
-            features = fuse(projected) if features is None else fuse(features, projected)
-        assert features is not None
-        return features
+    channels_last(network)
 
 
 NORM_EPS = 1e-6
@@ -189,13 +89,13 @@ class VisionTransformer(nn.Module):
         self.grid = config.grid
         self.cls_token = nn.Parameter(torch.zeros(1, 1, config.embed))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, config.embed))
-        self.patch_embed = PatchEmbed(config)
+        self.patch_embed = nn.ModuleDict({"proj": ExactConv(3, config.embed, config.patch, stride=config.patch)})
         self.blocks = nn.ModuleList(TransformerBlock(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.embed, eps=NORM_EPS)
 
     def forward(self, windows: Tensor, taps: tuple[int, ...] = ()) -> tuple[Tensor, list[Tensor]]:
         """Normalised features [B, C, G, G] of windows [B, 3, S, S] in -1..1, and raw ones after the blocks `taps`."""
-        tokens = self.patch_embed(windows)
+        tokens = self.patch_embed["proj"](windows).flatten(2).transpose(1, 2)
         tokens = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1) + self.pos_embed
         tapped = []
         for index, block in enumerate(self.blocks):
@@ -209,76 +109,33 @@ class VisionTransformer(nn.Module):
         return tokens[:, 1:].reshape(len(tokens), self.grid, self.grid, -1).permute(0, 3, 1, 2)
 
 
-class PatchEmbed(nn.Module):
-    """Windows [B, 3, S, S] to tokens [B, G², C]."""
-
-    def __init__(self, config: SharpConfig) -> None:
-        super().__init__()
-        self.proj = ExactConv(3, config.embed, config.patch, stride=config.patch)
-
-    def forward(self, windows: Tensor) -> Tensor:
-        tokens: Tensor = self.proj(windows)
-        return tokens.flatten(2).transpose(1, 2)
-
-
 class TransformerBlock(nn.Module):
-    """Attention, then a perceptron, each added to the stream; tokens [B, T, C] float32."""
+    """Self-attention, then a perceptron, each scaled by channel and added; tokens [B, T, C] float32."""
 
     def __init__(self, config: SharpConfig) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(config.embed, eps=NORM_EPS)
-        self.attn = Attention(config.embed, config.heads)
-        self.ls1 = LayerScale(config.embed)
-        self.norm2 = nn.LayerNorm(config.embed, eps=NORM_EPS)
-        self.mlp = Mlp(config.embed)
-        self.ls2 = LayerScale(config.embed)
+        width = config.embed
+        self.heads = config.heads
+        self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
+        self.attn = nn.ModuleDict({"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)})
+        self.mlp = nn.ModuleDict(
+            {"fc1": nn.Linear(width, MLP_RATIO * width), "fc2": nn.Linear(MLP_RATIO * width, width)}
+        )
+        self.ls1, self.ls2 = (nn.ParameterDict({"gamma": torch.ones(width)}) for _ in range(2))
 
     def forward(self, tokens: Tensor) -> Tensor:
-        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
-        out: Tensor = tokens + self.ls2(self.mlp(self.norm2(tokens)))
+        tokens = tokens + self._attended(self.norm1(tokens)) * self.ls1["gamma"]
+        hidden = gelu(self.mlp["fc1"](lower(self.norm2(tokens), self.mlp["fc1"])))
+        out: Tensor = tokens + self.mlp["fc2"](hidden) * self.ls2["gamma"]
         return out
 
-
-class Attention(nn.Module):
-    """Self-attention of several heads."""
-
-    def __init__(self, embed: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.qkv = nn.Linear(embed, 3 * embed)
-        self.proj = nn.Linear(embed, embed)
-
-    def forward(self, tokens: Tensor) -> Tensor:
+    def _attended(self, tokens: Tensor) -> Tensor:
         batch, count, width = tokens.shape
-        qkv: Tensor = self.qkv(lower(tokens, self.qkv))
+        qkv = self.attn["qkv"](lower(tokens, self.attn["qkv"]))
         query, key, value = qkv.view(batch, count, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
         attended = scaled_dot_product_attention(query, key, value)
-        projected: Tensor = self.proj(attended.transpose(1, 2).flatten(2))
+        projected: Tensor = self.attn["proj"](attended.transpose(1, 2).flatten(2))
         return projected
-
-
-class Mlp(nn.Module):
-    """Two linear maps with a GELU between them."""
-
-    def __init__(self, embed: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(embed, MLP_RATIO * embed)
-        self.fc2 = nn.Linear(MLP_RATIO * embed, embed)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        out: Tensor = self.fc2(gelu(self.fc1(lower(tokens, self.fc1))))
-        return out
-
-
-class LayerScale(nn.Module):
-    """One learned factor for each channel; float32 comes out."""
-
-    def __init__(self, embed: int) -> None:
-        super().__init__()
-        self.gamma = nn.Parameter(torch.ones(embed))
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        return tokens * self.gamma
 
 
 # Windows a side over the picture at its full size, which overlap by a quarter, and at half of it, by a half.

@@ -1,20 +1,56 @@
-"""OpenCV: inpainting of flat pictures, and optical flow (optional: pip install 'spackle-nvs[opencv]')."""
+"""Inpainters without a network: patches of the picture itself; and OpenCV's (pip install 'spackle-nvs[opencv]')."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from spackle.errors import InputError
-from spackle.inpaint.protocol import InpainterOptions, PlainInpainter
+from spackle.fill import far_fill
+from spackle.inpaint import InpainterOptions
+from spackle.patches import match_patches
 
 RADIUS = 5.0  # pixels around a hole's pixel that colour it
 
 
+class PlainInpainter:
+    """What inpainters without a network have in common."""
+
+    network: ClassVar[bool] = False
+    notice: ClassVar[str] = ""
+    files: Mapping[str, Path] = {}
+
+
+class ExemplarInpainter(PlainInpainter):
+    """Each view by itself, with texture from the view: PatchMatch over colours that come from the far rim."""
+
+    name = "exemplar"
+    version = "1"
+
+    def __init__(self, options: InpainterOptions) -> None:
+        """Take no option."""
+
+    def paint(self, rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+        """The views [V, H, W, 3] with their holes [V, H, W] painted; see `Inpainter.paint`."""
+        return torch.stack([_painted(*view) for view in zip(rgb, hole, inverse_depth, strict=True)])
+
+
+def _painted(rgb: Tensor, hole: Tensor, inverse_depth: Tensor) -> Tensor:
+    if bool(hole.all()):
+        return rgb
+    if not bool(((inverse_depth > 0) & ~hole).any()):
+        inverse_depth = torch.ones_like(inverse_depth)
+    depth, colors = far_fill(inverse_depth, rgb.permute(2, 0, 1), (inverse_depth > 0) & ~hole)
+    guess = torch.where(hole[..., None], colors.permute(1, 2, 0), rgb)
+    return torch.where(hole[..., None], match_patches(guess, hole, depth).rgb.clamp(0, 1), rgb)
+
+
 class OpenCV:
-    """The package, found once."""
+    """The package: inpainting of flat pictures, and optical flow."""
 
     def __init__(self, wanted_by: str) -> None:
         """Find it; InputError where it is not installed, which says what needs it."""
@@ -48,6 +84,10 @@ class OpenCV:
         return torch.from_numpy(self._flow.calc(grey[0], grey[1], None)).to(picture.device)
 
 
+def _bytes(rgb: Tensor) -> Tensor:
+    return (rgb.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()
+
+
 class OpencvInpainter(PlainInpainter):
     """Telea's method on each view by itself: quick, blind to depth, and different from view to view."""
 
@@ -65,7 +105,3 @@ class OpencvInpainter(PlainInpainter):
             filled = self._opencv.inpaint(view, mask, RADIUS) if bool(mask.any()) else view
             painted.append(torch.where(mask[..., None], filled, view))
         return torch.stack(painted)
-
-
-def _bytes(rgb: Tensor) -> Tensor:
-    return (rgb.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).contiguous()

@@ -1,0 +1,275 @@
+"""Weights from strangers' files: all kinds that are read, what is refused in a line, and that nothing in them runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import warnings
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from spackle.errors import InputError
+from spackle.network_file import load_strict, read_tensors
+
+Weights = dict[str, Tensor]
+GOOD = {"linear.weight": torch.arange(6.0).view(2, 3), "linear.bias": torch.tensor([0.5, -1.0])}
+WHOLE = GOOD | {"places": torch.arange(4)}
+
+
+class Small(nn.Module):
+    """A network with a constant of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(3, 2)
+        self.register_buffer("places", torch.arange(4))
+
+
+def write_script(tensors: Weights, path: Path) -> None:
+    network = Small()
+    network.load_state_dict(tensors)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # TorchScript is of the past
+        torch.jit.save(torch.jit.script(network), path)
+
+
+def write_old(content: object, path: Path) -> None:
+    torch.save(content, path, _use_new_zipfile_serialization=False)
+
+
+def write_parameters(tensors: Weights, path: Path) -> None:
+    parameters = {name: nn.Parameter(tensor) for name, tensor in tensors.items() if tensor.is_floating_point()}
+    torch.save(OrderedDict(tensors | parameters | {"epoch": 3, "list": [1]}), path)
+
+
+WRITERS = [save_file, torch.save, write_script, write_old, write_parameters]
+
+
+def read(path: Path) -> Weights:
+    return read_tensors(path, "give another")
+
+
+def refused(path: Path) -> str:
+    """The one line that a file is refused with as weights of `Small`."""
+    with pytest.raises(InputError) as caught:
+        load_strict(Small(), read(path), path, "give another")
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ")
+    assert line.isprintable()
+    assert len(line) < 1000
+    return line
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_every_kind_of_file_is_read(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
+    write(WHOLE, tmp_path / "weights")  # whatever its name
+    found = read(tmp_path / "weights")
+    assert found.keys() == WHOLE.keys()
+    assert all(torch.equal(found[name], tensor) for name, tensor in WHOLE.items())
+
+
+def test_views_of_one_storage_and_empty_tensors_are_read(tmp_path: Path) -> None:
+    whole = torch.arange(12.0)
+    tensors = {"a": whole.view(3, 4).T, "b": whole[5:9], "c": whole[:0]}
+    torch.save(tensors, tmp_path / "a.pt")
+    found = read(tmp_path / "a.pt")
+    assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
+
+
+# Files that mean harm or are damaged --------------------------------------------------------------
+
+
+class Bomb:
+    """Unpickling this makes a folder."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Callable[[str], None], tuple[str]]:
+        return os.mkdir, (str(self.mark),)
+
+
+def archive(path: Path, records: dict[str, bytes], how: int = zipfile.ZIP_STORED) -> None:
+    with zipfile.ZipFile(path, "w", how) as opened:
+        for name, data in records.items():
+            opened.writestr(f"weights/{name}", data)
+
+
+def records_of(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as opened:
+        return {name.partition("/")[2]: opened.read(name) for name in opened.namelist()}
+
+
+def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
+    path, mark = tmp_path / "weights.pt", tmp_path / "mark"
+    write_script(WHOLE, path)
+    records = records_of(path)
+    code = next(name for name in records if name.startswith("code/") and name.endswith(".py"))
+    archive(path, records | {code: f"import os\nos.mkdir({str(mark)!r})\n".encode()})
+    assert read(path).keys() == WHOLE.keys()
+    torch.save(WHOLE | {"more": Bomb(mark)}, path)
+    assert read(path).keys() == WHOLE.keys()
+    for write in (torch.save, write_old):
+        for content in (Bomb(mark), nn.Linear(2, 2)):
+            write(content, path)
+            assert "nothing in it was run" in refused(path) or write is torch.save
+    path.write_bytes(pickle.dumps(Bomb(mark)))
+    assert "nothing in it was run" in refused(path)
+    assert not mark.exists()
+    pickle.loads(path.read_bytes())
+    assert mark.exists()
+
+
+@pytest.mark.parametrize("write", WRITERS[:4])
+def test_cut_and_damaged_files_are_a_line(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
+    path, random = tmp_path / "weights", np.random.default_rng(0)
+    write(WHOLE, path)
+    whole = path.read_bytes()
+    for size in [1, 3, 4, 9, *(len(whole) * np.arange(1, 30) // 30), len(whole) - 1]:
+        path.write_bytes(whole[:size])
+        refused(path)
+    for _ in range(30):  # a byte that does not matter may change
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << random.integers(8)
+        path.write_bytes(damaged)
+        with contextlib.suppress(InputError):
+            read(path)
+
+
+STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQ"
+TENSOR = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"K\x00(%s(%stR"
+NAME = b"X\x01\x00\x00\x00a"
+PICKLES = [  # and what is said of them
+    (b"\x80\x02}q\x00" + NAME + b"h\x00s.", "hold themselves"),
+    (b"\x80\x02}q\x00" + 60 * (b"}(" + NAME + b"h\x00X\x01\x00\x00\x00bh\x00uq\x00") + b".", "too many"),
+    (b"\x80\x02}" + NAME + TENSOR % (b"J\xff\xff\xff\x7ft", b"K\x01t") + b"s.", "out of bounds"),
+    (b"\x80\x02}" + NAME + TENSOR % (b"K\x02t", b"K\x04t") + b"s.", "out of bounds"),
+    (b"\x80\x02}" + NAME + TENSOR % (b"J\xff\xff\xff\xfft", b"K\x01t") + b"s.", "not a file of weights"),
+    (b"\x80\x02" + TENSOR.replace(b"Float", b"Metal") % (b"K\x02t", b"K\x01t") + b".", "holds no named tensors"),
+    (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0fno", "not a file of weights"),
+    (b"\x80\x02}\x82\x01.", "extension"),
+    (b"0" * 5_000_000, "too large"),
+    (b"\x80\x02R.", "not a file of weights"),
+    (b"\x80\x02}r\xff\xff\xff\x7f.", "holds no named tensors"),  # a memo of 2 billion places
+]
+
+
+@pytest.mark.parametrize(("data", "said"), PICKLES)
+def test_pickles_that_mean_harm_are_a_line(tmp_path: Path, data: bytes, said: str) -> None:
+    archive(tmp_path / "a.pt", {"data.pkl": data, "data/0": bytes(16)})
+    assert said in refused(tmp_path / "a.pt")
+
+
+def test_archives_that_are_not_as_torch_packs_them_are_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save(GOOD, path)
+    records = records_of(path)
+    for change, how, said in (
+        ({}, zipfile.ZIP_DEFLATED, "is packed"),
+        ({"data/0": records["data/0"][:-4]}, zipfile.ZIP_STORED, "has not the 24 bytes"),
+        ({"byteorder": b"big"}, zipfile.ZIP_STORED, "not little-endian"),
+    ):
+        archive(path, records | change, how)
+        assert said in refused(path)
+    archive(path, {name: data for name, data in records.items() if name != "data/0"})
+    assert "data/0" in refused(path)
+    archive(path, records)  # packed again without compression
+    assert all(torch.equal(tensor, GOOD[name]) for name, tensor in read(path).items())
+    content = path.read_bytes()  # of which one number changes
+    path.write_bytes(content.replace(GOOD["linear.weight"].numpy().tobytes(), bytes(24)))
+    assert "damaged at " in refused(path)
+
+
+OTHERS: dict[str, object] = {  # bytes, or what is saved
+    "empty": b"",
+    "text": b"<html>not found</html>",
+    "answer": b'{"data":{"error": "gone"}}',
+    "noise": bytes(range(256)) * 40,
+    "header": (2**62).to_bytes(8, "little") + b"{}",
+    "padded": b"\x40\0\0\0\0\0\0\0{" + b" " * 9,
+    "list": [1, 2, 3],
+    "tensor": torch.ones(3),
+    "numbered": {0: torch.zeros(2)},
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_files_of_other_kinds_are_a_line(tmp_path: Path, kind: str) -> None:
+    content = OTHERS[kind]
+    if isinstance(content, bytes):
+        (tmp_path / "a").write_bytes(content)
+    else:
+        torch.save(content, tmp_path / "a")
+    assert ("the file is empty" if kind == "empty" else "not a file of weights, or damaged (") in refused(
+        tmp_path / "a"
+    )
+
+
+def test_what_is_no_file_is_a_line(tmp_path: Path) -> None:
+    assert "no such weight file" in refused(tmp_path / "missing")
+    assert "not a plain file" in refused(tmp_path)
+    archive(tmp_path / "a.zip", {"hello.txt": b"hello"})
+    assert "without the pickle of a network" in refused(tmp_path / "a.zip")
+
+
+# Into a network -----------------------------------------------------------------------------------
+
+hiding = torch.zeros(2)
+hiding.float = "x"  # type: ignore[method-assign,assignment]
+DIFFERENCES: list[tuple[dict[str, Tensor | None], str]] = [
+    ({"linear.bias": None}, "of 2 tensors 1 missing (linear.bias): give another"),
+    ({"more": torch.ones(1)}, "1 unknown (more)"),
+    ({f"more{n}": torch.ones(1) for n in range(5)}, "5 unknown (more0, more1, more2, and 2 more)"),
+    ({"linear.bias": torch.ones(3)}, "1 of another shape (linear.bias [3] instead of [2])"),
+    ({"linear.bias": torch.tensor(1.0)}, "(linear.bias [] instead of [2])"),
+    ({"linear.bias": torch.ones(2).int()}, "1 not of floats (linear.bias)"),
+    ({"linear.bias": torch.ones(2).to_sparse()}, "1 missing (linear.bias)"),
+    ({"linear.bias": torch.ones(2, device="meta")}, "1 missing (linear.bias)"),
+    ({"linear.bias": hiding}, "1 missing (linear.bias)"),
+    ({"linear.bias": torch.tensor([0, torch.nan])}, "not finite (linear.bias): give another"),
+    ({"\x1b[31mred\x1b[0m\r\n\u202e": torch.ones(1)}, "1 unknown ("),
+    ({"\x07" * 100_000: torch.ones(1)}, "1 unknown ("),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), DIFFERENCES)
+def test_each_difference_is_listed(tmp_path: Path, change: dict[str, Tensor | None], said: str) -> None:
+    tensors = {name: tensor for name, tensor in (GOOD | change).items() if tensor is not None}
+    for write in (torch.save, write_old):
+        write(tensors, tmp_path / "a.pt")
+        assert said in refused(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("write", WRITERS[:2])
+def test_a_filled_network_is_frozen_and_leaves_its_file(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
+    large = torch.tensor([3e38, 3e38])  # finite, but their sum is not
+    write(GOOD | {"linear.bias": large, "places": torch.tensor([9] * 4)}, tmp_path / "a.pt")
+    network = load_strict(Small(), read(tmp_path / "a.pt"), tmp_path / "a.pt", "give another")
+    with open(tmp_path / "a.pt", "r+b") as file:  # changed later
+        file.write(bytes((tmp_path / "a.pt").stat().st_size))
+    assert torch.equal(network.linear.weight, GOOD["linear.weight"])
+    assert torch.equal(network.linear.bias, large)
+    assert network.get_buffer("places").tolist() == [0, 1, 2, 3]
+    assert not network.training
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+    write({name: tensor.half() for name, tensor in GOOD.items()}, tmp_path / "a.pt")
+    network = load_strict(Small(), read(tmp_path / "a.pt"), tmp_path / "a.pt", "give another")
+    assert torch.equal(network.linear.weight, GOOD["linear.weight"])
+    assert network.linear.weight.dtype == torch.float32
+
+
+def test_unused_tensors_have_to_be_there(tmp_path: Path) -> None:
+    path, tensors = tmp_path / "a", GOOD | {"more": torch.ones(3)}
+    load_strict(Small(), tensors, path, "give another", unused={"more": (3,)})
+    for unused, said in (({"more": (4,)}, r"more \[3\] instead"), ({"more": (3,), "rest": (1,)}, r"1 missing \(rest")):
+        with pytest.raises(InputError, match=said):
+            load_strict(Small(), tensors, path, "give another", unused=unused)
