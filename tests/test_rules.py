@@ -134,7 +134,7 @@ def test_a_view_behind_the_photos_guard_keeps_the_photo(name: str, right: float)
 
 TWINS = {
     "_numba.py": "the decorators",
-    "bases/cleanup.py": "test_cleanup.py",
+    "bases/lift.py": "test_cleanup.py",
     "bases/edges.py": "test_cleanup.py",
     "bases/quadtree.py": "test_quadtree.py",
     "bases/sharp/unproject.py": "test_sharp_unproject.py",

@@ -13,11 +13,19 @@ from scenes import Scene, box_before_wall, box_mask, slanted_plane, texture, wal
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
-from spackle.bases import cleanup, edges
-from spackle.bases.cleanup import LEAST_NOISE, OUTLIERS, attach_flying_pixels, fill_missing, noise_level, smooth_noise
+from spackle.bases import edges
+from spackle.bases import lift as lifting
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import HOLE, OPEN, SETTLED, find_edges, sample, settle
-from spackle.bases.lift import lift
+from spackle.bases.lift import (
+    LEAST_NOISE,
+    OUTLIERS,
+    attach_flying_pixels,
+    fill_missing,
+    lift,
+    noise_level,
+    smooth_noise,
+)
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
@@ -44,7 +52,15 @@ def map_of(inverse: Tensor, known: Tensor | None = None) -> DepthMap:
 def front(scene: Scene, depth: DepthMap) -> Tensor:
     """[H, W] the inverse depths that a scene's photo is lifted with."""
     means = lift(scene.rgb, depth, scene.camera, levels=0).gaussians.means
-    return 1 / means[: scene.camera.height * scene.camera.width, 2].reshape(scene.camera.height, scene.camera.width)
+    return 1 / means[: scene.depth.numel(), 2].reshape(scene.depth.shape)
+
+
+def settled(inverse: Tensor, known: Tensor, rgb: Tensor, focal: tuple[float, float] = FOCAL) -> tuple[Tensor, Tensor]:
+    """Inverse depth at the photo's size and where it is known, after resampling and sharpening."""
+    depths, mask = inverse.numpy(), known.numpy()
+    sampled = sample(depths, mask, find_edges(depths, mask, focal), *rgb.shape[:2])
+    found, seen = settle(sampled, rgb.contiguous().numpy())
+    return torch.from_numpy(found), torch.from_numpy(seen)
 
 
 def random_map(seed: int, height: int = 13, width: int = 17) -> tuple[np.ndarray, np.ndarray]:
@@ -68,29 +84,32 @@ def random_photo(seed: int, height: int, width: int) -> np.ndarray:
     return (smooth + 0.05 * torch.rand(height, width, 3, generator=generator)).contiguous().numpy()
 
 
-@pytest.mark.parametrize(("seed", "size"), [(0, (14, 18)), (1, (30, 35)), (2, (9, 12)), (3, (40, 55)), (4, (1, 1))])
+def noisy(inverse: np.ndarray, seed: int, noise: float = 0.005) -> np.ndarray:
+    return (inverse * (1 + noise * np.random.default_rng(seed).standard_normal(inverse.shape))).astype(np.float32)
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, (14, 18)), (1, (30, 35)), (2, (9, 12)), (4, (1, 1))])
 def test_kernels_agree_with_the_python_they_are_written_in(seed: int, size: tuple[int, int]) -> None:
     inverse, known = random_map(seed, 14, 18)
-    noisy = (inverse * (1 + 0.005 * np.random.default_rng(seed).standard_normal(inverse.shape))).astype(np.float32)
-    rgb = random_photo(seed, *size)
+    rgb, rough = random_photo(seed, *size), noisy(inverse, seed)
 
     def arrays() -> list[np.ndarray]:
         found = find_edges(inverse, known, FOCAL)
         sampled = sample(inverse, known, found, *size)
         depth, seen = settle(sampled, rgb)
-        filled = fill_missing(*map(torch.from_numpy, (noisy, random_photo(seed, 14, 18), known))).numpy()
+        filled = fill_missing(*map(torch.from_numpy, (rough, random_photo(seed, 14, 18), known))).numpy()
         images = (found.step, found.across, found.down, sampled.state, sampled.inverse_depth, sampled.step)
-        return [*images, *sampled.slope, seen, np.where(seen, depth, 0), smooth_noise(noisy, known), filled]
+        return [*images, *sampled.slope, seen, np.where(seen, depth, 0), smooth_noise(rough, known), filled]
 
     compiled = arrays()
     assert compiled[0].any()
-    with uncompiled(edges, cleanup):
+    with uncompiled(edges, lifting):
         plain = arrays()
     for one, other in zip(compiled, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
-# Edges.
+# Edges and upsampling.
 
 
 def sphere(radius_px: float, behind: float, size: int = 120) -> Tensor:
@@ -107,34 +126,25 @@ def sphere(radius_px: float, behind: float, size: int = 120) -> Tensor:
 def test_a_ball_keeps_its_roundness_even_at_the_wall(radius: float, behind: float) -> None:
     """Where the rim falls off to the wall like an edge a pixel or two wide, it ends a little more bluntly."""
     inverse = sphere(radius, behind)
-    known = np.ones(inverse.shape, bool)
-    edges = find_edges(inverse.numpy(), known, (200.0, 200.0))
-    rgb = torch.where((inverse == inverse.min())[..., None], 0.2, texture(*inverse.shape)).numpy()
-    found, _ = settle(sample(inverse.numpy(), known, edges, *inverse.shape), rgb)
-    error = np.abs(found / inverse.numpy() - 1)
-    assert error.max() < 0.04
-    assert (error > 0).sum() < 3 * 2 * math.pi * radius
-
-
-# Upsampling.
+    rgb = torch.where((inverse == inverse.min())[..., None], 0.2, texture(*inverse.shape))
+    error = (settled(inverse, inverse > 0, rgb, (200.0, 200.0))[0] / inverse - 1).abs()
+    assert float(error.max()) < 0.04
+    assert int((error > 0).sum()) < 3 * 2 * math.pi * radius
 
 
 @pytest.mark.parametrize("factor", [(1.0, 1.0), (1.25, 1.25), (3.3, 2.9), (4.0, 4.0), (12.0, 12.0), (0.7, 0.7)])
 @pytest.mark.parametrize("slope", [(0.0, 1.0), (1.0, 0.0), (-0.4, 0.7)])
 def test_a_plane_stays_that_plane_at_any_size(factor: tuple[float, float], slope: tuple[float, float]) -> None:
     """No stairs, up to the border; the photo is noise, so nothing of it may show."""
-    height, width = 96, 120
-    rows, columns = round(height / factor[0]), round(width / factor[1])
-    x, y = (torch.arange(columns) + 0.5) / columns, (torch.arange(rows) + 0.5) / rows
-    at_map = 0.5 + 0.4 * (slope[0] * x + slope[1] * y[:, None])
-    x, y = (torch.arange(width) + 0.5) / width, (torch.arange(height) + 0.5) / height
-    exact = 0.5 + 0.4 * (slope[0] * x + slope[1] * y[:, None])
-    scene = Scene(
-        torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0)),
-        1 / exact,
-        Camera.from_focal(100, width, height),
-    )
-    torch.testing.assert_close(front(scene, map_of(at_map)), exact, rtol=1e-5, atol=0)
+
+    def plane(rows: int, columns: int) -> Tensor:
+        x, y = (torch.arange(columns) + 0.5) / columns, (torch.arange(rows) + 0.5) / rows
+        return 0.5 + 0.4 * (slope[0] * x + slope[1] * y[:, None])
+
+    rgb = torch.rand(96, 120, 3, generator=torch.Generator().manual_seed(0))
+    scene = Scene(rgb, 1 / plane(96, 120), Camera.from_focal(100, 120, 96))
+    found = front(scene, map_of(plane(round(96 / factor[0]), round(120 / factor[1]))))
+    torch.testing.assert_close(found, plane(96, 120), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("nonsense", [0.0, 1e-9, 1e9])
@@ -144,17 +154,12 @@ def test_what_is_unknown_never_leaks(nonsense: float) -> None:
     known = torch.ones(36, 48, dtype=torch.bool)
     known[12:24, 13:16] = False
     depth = torch.where(known, scene.depth[1::4, 1::4], nonsense)
-    edges = find_edges((1 / depth).nan_to_num().numpy(), known.numpy(), FOCAL)
-    found = sample((1 / depth).nan_to_num(0).numpy(), known.numpy(), edges, 144, 192)
-    settled, seen = settle(found, scene.rgb.numpy())
+    found, seen = settled((1 / depth).nan_to_num(0), known, scene.rgb)
     hole = interpolate((~known).float()[None, None], size=(144, 192), mode="nearest-exact")[0, 0] > 0
-    assert int((seen ^ ~hole.numpy()).sum()) <= 4  # its corners
-    values = torch.from_numpy(settled[seen])
-    torch.testing.assert_close(
-        torch.minimum((values - 0.5).abs(), (values - 1 / 6).abs()), torch.zeros_like(values), rtol=0, atol=1e-6
-    )
+    assert int((seen ^ ~hole).sum()) <= 4  # its corners
     z = 1 / front(scene, DepthMap(depth, known, None, None, "depth", Path("sensor")))
-    assert bool(((z - 2).abs() < 1e-4).logical_or((z - 6).abs() < 1e-4).all())
+    for values in (1 / found[seen], z):
+        assert bool(torch.minimum((values - 2).abs(), (values - 6).abs()).max() < 1e-4)
 
 
 # Sharpening.
@@ -183,33 +188,29 @@ def test_cheapest_paths_are_those_of_dijkstra(seed: int) -> None:
     assert not seen[sampled.state == HOLE].any()
 
 
-def between(inverse: Tensor) -> Tensor:
-    """Which pixels of `box_before_wall` hang between its box and its wall, 5 % of the way or more from both."""
-    way = (inverse - 1 / 6) / (1 / 2 - 1 / 6)
-    return (way > 0.05) & (way < 0.95)
-
-
 @pytest.mark.parametrize(("sigma", "factor"), [(1.0, 1), (2.0, 1), (3.0, 1), (1.0, 4), (3.0, 4), (6.0, 4)])
 def test_a_smeared_outline_snaps_to_the_photos(sigma: float, factor: int) -> None:
     """Maps of the photo's size, as phones store them, and small ones, as networks give them."""
+
+    def hanging(inverse: Tensor) -> int:
+        """How many pixels hang between box and wall, 5 % of the way or more from both."""
+        way = (inverse - 1 / 6) / (1 / 2 - 1 / 6)
+        return int(((way > 0.05) & (way < 0.95)).sum())
+
     scene = box_before_wall(width=192, height=144, focal=200)
-    depth = map_of(avg_pool2d(blurred(1 / scene.depth, sigma)[None, None], factor)[0, 0])
-    inverse = torch.where(depth.valid, 1 / depth.depth, 0.0)[None, None]
-    before = interpolate(inverse, size=(144, 192), mode="bilinear")[0, 0]
-    found = front(scene, depth)
-    assert int(between(before).sum()) > 400
-    assert int(between(found).sum()) <= 8  # about the corners
+    smeared = avg_pool2d(blurred(1 / scene.depth, sigma)[None, None], factor)
+    found = front(scene, map_of(smeared[0, 0]))
+    assert hanging(interpolate(smeared, size=(144, 192), mode="bilinear")) > 400
+    assert hanging(found) <= 8  # about the corners
     assert int(((found > 1 / 3) ^ box_mask(192, 144)).sum()) <= 24
     assert float((found * scene.depth - 1).abs().median()) < 1e-3
 
 
 def test_a_sharp_map_of_the_photos_size_is_lifted_as_it_is() -> None:
     for scene in (box_before_wall(), slanted_plane(1.5, 1000, 0), wall()):
-        clean = attach_flying_pixels(1 / scene.depth)
-        torch.testing.assert_close(front(scene, scene.depth_map), clean, rtol=1e-6, atol=0)
-        edges = find_edges((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), scene.camera.focal)
-        sampled = sample((1 / scene.depth).numpy(), np.ones(scene.depth.shape, bool), edges, *scene.depth.shape)
-        assert np.array_equal(settle(sampled, scene.rgb.numpy())[0], (1 / scene.depth).numpy())
+        inverse = 1 / scene.depth
+        torch.testing.assert_close(front(scene, scene.depth_map), attach_flying_pixels(inverse), rtol=1e-6, atol=0)
+        assert torch.equal(settled(inverse, inverse > 0, scene.rgb, scene.camera.focal)[0], inverse)
 
 
 # Noise.
@@ -218,8 +219,7 @@ def test_a_sharp_map_of_the_photos_size_is_lifted_as_it_is() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_planes_match_least_squares(seed: int) -> None:
     inverse, known = random_map(seed)
-    generator = np.random.default_rng(seed)
-    inverse = (inverse * (1 + 0.005 * generator.standard_normal(inverse.shape))).astype(np.float32)
+    inverse = noisy(inverse, seed)
     level = noise_level(inverse, known)
     assert level > LEAST_NOISE
     found = smooth_noise(inverse, known)
@@ -229,10 +229,8 @@ def test_planes_match_least_squares(seed: int) -> None:
 
 @pytest.mark.parametrize("noise", [0.001, 0.003, 0.01])
 def test_the_noise_of_a_slanted_plane_is_measured(noise: float) -> None:
-    scene = slanted_plane(1.5, 6, 1)
-    generator = np.random.default_rng(0)
-    inverse = (1 / scene.depth).numpy() * (1 + noise * generator.standard_normal(scene.depth.shape))
-    assert noise_level(inverse.astype(np.float32), np.ones(inverse.shape, bool)) == pytest.approx(noise, rel=0.05)
+    inverse = noisy((1 / slanted_plane(1.5, 6, 1).depth).numpy(), 0, noise)
+    assert noise_level(inverse, np.ones(inverse.shape, bool)) == pytest.approx(noise, rel=0.05)
     assert noise_level(np.ones((2, 9), np.float32), np.ones((2, 9), bool)) == 0
     assert noise_level(np.ones((9, 9), np.float32), np.zeros((9, 9), bool)) == 0
 
@@ -240,8 +238,7 @@ def test_the_noise_of_a_slanted_plane_is_measured(noise: float) -> None:
 def test_a_clean_map_is_not_smoothed() -> None:
     """The second differences of a mesh before a wall are large everywhere, but nothing of it is to move."""
     mesh = torch.full((60, 80), 0.2)
-    mesh[::5] = mesh[1::5] = 1.0
-    mesh[:, ::5] = mesh[:, 1::5] = 1.0
+    mesh[::5] = mesh[1::5] = mesh[:, ::5] = mesh[:, 1::5] = 1.0
     for inverse in (1 / box_before_wall().depth, sphere(30, 1.0), 1 / slanted_plane(1.5, 6, 0).depth, mesh):
         clean = inverse.numpy()
         assert np.array_equal(smooth_noise(clean, np.ones(clean.shape, bool)), clean)
@@ -263,11 +260,10 @@ def test_a_noisy_slanted_plane_is_not_perforated(axis: int) -> None:
 def test_what_is_no_depth_is_filled_and_never_lifted() -> None:
     scene = slanted_plane(2, 4, 0, width=48, height=36, focal=40)
     depth = scene.depth.clone()
-    for place, value in enumerate((math.nan, math.inf, 0.0, -1.0)):
-        depth[10, 10 + 4 * place] = value
+    depth[10, 10:26:4] = torch.tensor([math.nan, math.inf, 0.0, -1.0])
     every = torch.ones(36, 48, dtype=torch.bool)
     found = lift(scene.rgb, DepthMap(depth, every, None, None, "depth", Path("d")), scene.camera, levels=0)
-    assert bool(torch.isfinite(found.gaussians.means).all())
+    assert found.gaussians.finite
     assert found.notes["depth_filled"] == round(4 / (36 * 48), 4)
     with pytest.raises(InputError, match=r"network: no depth is left at 48×36"):
         lift(scene.rgb, map_of(torch.zeros(36, 48)), scene.camera)

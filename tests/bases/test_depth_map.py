@@ -42,6 +42,18 @@ def pfm(values: NDArray[np.float32], endian: str = "<") -> bytes:
     return header + values[::-1].astype(f"{endian}f4").tobytes()
 
 
+def as_bytes(array: NDArray[Any], **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def npz(values: NDArray[np.float32]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, arr_0=values)
+    return buffer.getvalue()
+
+
 def same(found: DepthMap, expected: NDArray[Any], tolerance: float = 0.0) -> None:
     assert found.depth.dtype == torch.float32
     assert found.valid.dtype == torch.bool
@@ -50,8 +62,7 @@ def same(found: DepthMap, expected: NDArray[Any], tolerance: float = 0.0) -> Non
     assert torch.equal(found.valid, found.depth > 0)
 
 
-@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", ">f8"])
-@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize(("dtype", "order"), [("<f2", "C"), ("<f4", "F"), (">f4", "C"), ("<f8", "C"), (">f8", "F")])
 def test_npy(tmp_path: Path, dtype: str, order: Any) -> None:
     depth = ramp()
     depth[0, :3] = [np.nan, np.inf, 0]
@@ -84,26 +95,21 @@ def test_millimetre_png(tmp_path: Path) -> None:
     assert load_depth(tmp_path / "flat.png").quantum == pytest.approx(0.001)
 
 
-@pytest.mark.parametrize("endian", ["<", ">"])
-def test_pfm(tmp_path: Path, endian: str) -> None:
-    depth = ramp()
-    (tmp_path / "d.pfm").write_bytes(pfm(depth, endian))
-    same(load_depth(tmp_path / "d.pfm"), depth)
+def test_pfm(tmp_path: Path) -> None:
+    for endian in "<>":
+        (tmp_path / "d.pfm").write_bytes(pfm(ramp(), endian))
+        same(load_depth(tmp_path / "d.pfm"), ramp())
 
 
 @pytest.mark.parametrize("suffix", ["pfm", "npz", "npy", "png"])
 @pytest.mark.parametrize("beside", [True, False])
 def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
     stored = np.arange(48, dtype=np.float32).reshape(6, 8) + 40
+    stored[0, 0] = 0 if suffix == "png" else np.inf
     name = tmp_path / (f"disp0GT.{suffix}" if beside else f"x.{suffix}")
-    if suffix == "png":
-        stored[0, 0] = 0
-        Image.fromarray(stored.astype(np.uint8)).save(name)
-    else:
-        stored[0, 0] = np.inf
-        name.write_bytes(pfm(stored)) if suffix == "pfm" else None
-        np.save(name, stored) if suffix == "npy" else None
-        np.savez(name, arr_0=stored) if suffix == "npz" else None
+    name.write_bytes(
+        {"png": lambda values: png(values.astype(np.uint8)), "pfm": pfm, "npy": as_bytes, "npz": npz}[suffix](stored)
+    )
     calib = tmp_path / "calib.txt"
     calib.write_text(CALIB)
     found = load_depth(name) if beside else load_depth(name, calib=calib)
@@ -116,10 +122,7 @@ def test_middlebury(tmp_path: Path, suffix: str, beside: bool) -> None:
     assert found.K.tolist() == [[1000.5, 0, 30.25], [0, 1000.5, 20.5], [0, 0, 1]]
     np.save(tmp_path / "depth.npy", ramp())
     assert load_depth(tmp_path / "depth.npy").quantity == "depth"  # though a calibration lies beside it
-    longer = load_depth(name, calib=calib, focal_px=2001)
-    assert longer.K is not None
-    assert longer.K[0, 0] == 2001
-    same(longer, 2 * expected, 1e-6)
+    same(load_depth(name, calib=calib, focal_px=2001), 2 * expected, 1e-6)
 
 
 def test_scene_json(tmp_path: Path) -> None:
@@ -158,12 +161,6 @@ def test_bad_calibrations(tmp_path: Path, text: str) -> None:
 def npy_claiming(shape: str, descr: str = "<f4") -> bytes:
     header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + b"\0" * 64
-
-
-def as_bytes(array: NDArray[Any], **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, **options)
-    return buffer.getvalue()
 
 
 def zipped(content: bytes) -> bytes:
@@ -218,20 +215,21 @@ def test_random_damage_is_an_input_error_or_a_map(tmp_path_factory: Any, kind: s
         assert load_depth(path).valid.any()
 
 
-def test_paths_and_names(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such depth map"):
-        load_depth(tmp_path / "none.npy")
-    with pytest.raises(InputError, match="not a plain file"):
-        load_depth(tmp_path)
-    np.save(tmp_path / "motorcycle_disp.npy", ramp())
-    with pytest.raises(InputError, match="--calib"):
-        load_depth(tmp_path / "motorcycle_disp.npy")
-    with pytest.raises(InputError, match="no such calibration"):
-        load_depth(tmp_path / "motorcycle_disp.npy", calib=tmp_path / "none.txt")
-    np.save(tmp_path / "depth.npy", ramp())
-    for focal in (0.0, -3.0, float("nan")):
-        with pytest.raises(InputError, match="--focal-px"):
-            load_depth(tmp_path / "depth.npy", focal_px=focal)
+@pytest.mark.parametrize(
+    ("name", "options", "problem"),
+    [
+        ("none.npy", {}, "no such depth map"),
+        ("", {}, "not a plain file"),
+        ("motorcycle_disp.npy", {}, "--calib"),
+        ("motorcycle_disp.npy", {"calib": "none.txt"}, "no such calibration"),
+        *(("depth.npy", {"focal_px": focal}, "--focal-px") for focal in (0.0, -3.0, float("nan"))),
+    ],
+)
+def test_paths_and_names(tmp_path: Path, name: str, options: dict[str, Any], problem: str) -> None:
+    for file in ("motorcycle_disp.npy", "depth.npy"):
+        np.save(tmp_path / file, ramp())
+    with pytest.raises(InputError, match=problem):
+        load_depth(tmp_path / name, **options)
 
 
 def test_shape_against_the_photo(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from pathlib import Path
 
@@ -21,9 +20,7 @@ from spackle.bases.lite import (
     SHIPPED,
     LiteBase,
     LiteNet,
-    Size,
     load_networks,
-    merged,
 )
 from spackle.bases.protocol import NEAREST_M
 from spackle.errors import InputError
@@ -35,11 +32,6 @@ BOTH_WAYS = [scale for scale in INPUT_SCALES if scale.mirrored]
 @functools.cache
 def shipped() -> LiteBase:
     return LiteBase.load(device="cpu")
-
-
-def some_network(size: Size, seed: int) -> LiteNet:
-    torch.manual_seed(seed)
-    return LiteNet(size).eval().requires_grad_(False)
 
 
 def photo_of(rgb: torch.Tensor) -> Photo:
@@ -99,7 +91,7 @@ def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
     """Steps of 1/127 of an output's largest weight: half of that is the most that one can be off."""
     assert SHIPPED.stat().st_size <= 12_000_000
     assert [network.encoder.size for network in load_networks(SHIPPED)] == ["lite0", "lite2"]
-    networks = [some_network("lite2", 1), some_network("lite0", 2)]
+    networks = [LiteNet("lite2"), LiteNet("lite0")]
     save_networks(networks, tmp_path / "two.safetensors")
     read = load_networks(tmp_path / "two.safetensors")
     assert [network.encoder.size for network in read] == ["lite2", "lite0"]
@@ -114,18 +106,6 @@ def test_stored_weights_are_small_and_only_rounded(tmp_path: Path) -> None:
     save_networks(read, tmp_path / "again.safetensors")
     for one, other in zip(read, load_networks(tmp_path / "again.safetensors"), strict=True):
         torch.testing.assert_close(one.state_dict(), other.state_dict(), rtol=1e-6, atol=1e-9)
-
-
-def test_each_input_scale_has_its_network() -> None:
-    networks, rgb = [some_network("lite0", 1), some_network("lite0", 2)], motorcycle()[0][:96, :128]
-    seen = LiteBase(networks, torch.device("cpu")).at_scales(rgb, INPUT_SCALES)
-    alone = [LiteBase([network], torch.device("cpu")) for network in networks]
-    for scale, outputs in zip(INPUT_SCALES, seen, strict=True):
-        own = alone[scale.network].at_scales(rgb, [dataclasses.replace(scale, network=0), INPUT_SCALES[-1]])[0]
-        assert torch.equal(outputs, own)
-    first = [number for number, scale in enumerate(INPUT_SCALES) if scale.network == 0]
-    expected = merged(seen[first], [INPUT_SCALES[number].tilt for number in first]).exp()
-    torch.testing.assert_close(alone[0].inverse_depth(rgb), expected)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +48,16 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """SHARP and models of the hub in no time, from files that are not read; holds what was asked for."""
     asked: list[dict[str, Any]] = []
 
-    def load(name: str) -> Callable[..., StandIn]:
-        return lambda path, **options: (
-            asked.append({"path": path, **options}),
-            StandIn(name or f"hf:{path}"),
-        )[1]
+    def load_sharp(path: Path, **options: Any) -> StandIn:
+        asked.append({"path": path, **options})
+        return StandIn("sharp")
 
-    monkeypatch.setattr(SharpBase, "load", load("sharp"))
-    monkeypatch.setattr(HfBase, "load", load(""))
+    def load_model(name: str, **options: Any) -> StandIn:
+        asked.append({"path": name, **options})
+        return StandIn(f"hf:{name}")
+
+    monkeypatch.setattr(SharpBase, "load", load_sharp)
+    monkeypatch.setattr(HfBase, "load", load_model)
     return asked
 
 
@@ -65,15 +66,13 @@ def photo(tmp_path: Path) -> Path:
     return write_photo(tmp_path / "photo.png")
 
 
-def portrait(path: Path) -> Path:
-    """A photo with depth in it."""
-    return portraits.write(path, portraits.apple_jpeg(portraits.codes()))
-
-
-def broken_portrait(path: Path) -> Path:
-    """A photo with something in it that was depth once."""
-    image = portraits.png(portraits.codes())
-    return portraits.write(path, portraits.gdepth_jpeg(image[:60] + bytes(30) + image[90:]))
+@pytest.fixture
+def portrait(tmp_path: Path) -> Path:
+    """A photo with depth in it, and a lens of that."""
+    matrix = (70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0)
+    return portraits.write(
+        tmp_path / "portrait.jpg", portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp(matrix=matrix))
+    )
 
 
 def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
@@ -85,8 +84,8 @@ def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[
 # The order of auto, and why.
 
 
-def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
-    tmp_path: Path, photo: Path, made: dict[str, Path]
+def test_auto_takes_the_photos_depth_then_sharp_then_lite(
+    tmp_path: Path, photo: Path, portrait: Path, made: dict[str, Path]
 ) -> None:
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
@@ -96,20 +95,19 @@ def test_auto_takes_the_depth_in_the_photo_then_sharp_then_lite(
     prediction, choice = pick(photo)
     assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(TINY))
     assert prediction.notes["weights"] == SHARP_FILE
-    inside = portrait(tmp_path / "portrait.jpg")
-    prediction, choice = pick(inside)
+    prediction, choice = pick(portrait)
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
-    named, by_name = pick(inside, name="rgbd")
-    assert (by_name.why, by_name.note) == ("--base rgbd", "")
+    named, choice = pick(portrait, name="rgbd")
+    assert (choice.why, choice.note) == ("--base rgbd", "")
     assert same_bits(named.gaussians, prediction.gaussians)
-    given, choice = pick(inside, depth=write_depth(tmp_path / "depth.npy"))
+    given, choice = pick(portrait, depth=write_depth(tmp_path / "depth.npy"))
     assert (choice.base, choice.why, choice.note) == ("rgbd", "--depth", "")
     assert float(given.gaussians.means[0, 2]) == pytest.approx(metres()[0, 0], rel=1e-5)
 
 
 def test_weights_and_options_that_a_person_gave_reach_sharp(
-    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]]
+    tmp_path: Path, photo: Path, portrait: Path, sharp: Path, quick: list[dict[str, Any]]
 ) -> None:
     given = write_tiny(tmp_path / "mine.pt")
     choice = pick(photo, checkpoint=given)[1]
@@ -117,7 +115,7 @@ def test_weights_and_options_that_a_person_gave_reach_sharp(
     words: dict[str, Any] = {"precision": "fp32", "windows": 9, "compiled": True}
     assert pick(photo, **words)[1].base == "sharp"
     assert quick == [{"path": sharp, "device": None, **words}]
-    assert pick(portrait(tmp_path / "p.jpg"), **words)[1].base == "rgbd"
+    assert pick(portrait, **words)[1].base == "rgbd"
     sharp.unlink()
     assert pick(photo, **words)[1].base == "lite"
     assert len(quick) == 1
@@ -136,30 +134,31 @@ def test_a_machine_without_a_home_has_no_sharp(photo: Path, monkeypatch: pytest.
         pick(photo, name="sharp")
 
 
-def test_a_base_is_loaded_once_and_not_before_a_photo_needs_it(
-    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+def test_a_base_is_loaded_once_and_when_a_photo_needs_it(
+    photo: Path, portrait: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(LiteBase, "load", lambda *args, **options: pytest.fail("loaded"))
     base = open_base(BaseSettings())
-    base.predict(load_photo(portrait(tmp_path / "p.jpg")))
+    base.predict(load_photo(portrait))
     assert not quick
     news = [base.predict(load_photo(photo))[1].note for _ in range(2)]
     assert [bool(line) for line in news] == [True, False]
     assert len(quick) == 1
     model = open_base(BaseSettings("hf:me/small", precision="fp32", device="cpu"))
-    names = [model.predict(load_photo(photo))[1].base for _ in range(2)]
-    assert names == ["hf:me/small"] * 2
+    assert [model.predict(load_photo(photo))[1].base for _ in range(2)] == ["hf:me/small"] * 2
     assert quick[1:] == [{"path": "me/small", "precision": "fp32", "device": "cpu"}]
 
 
-def test_other_weights_of_lite_and_one_choice_for_a_whole_clip(tmp_path: Path, photo: Path, shipped: Path) -> None:
+def test_other_weights_of_lite_and_one_choice_for_a_clip(
+    tmp_path: Path, photo: Path, portrait: Path, shipped: Path
+) -> None:
     before = pick(photo, name="lite")[0].gaussians
     mine = tmp_path / "mine.safetensors"
     save_file({name: 1.5 * tensor for name, tensor in load_file(shipped).items()}, mine)
     assert not same_bits(pick(photo, name="lite", checkpoint=mine)[0].gaussians, before)
     base = open_base(BaseSettings())
     prediction, choice = base.predict(load_photo(photo))
-    kept, again = base.only(choice).predict(load_photo(portrait(tmp_path / "p.jpg")))
+    kept, again = base.only(choice).predict(load_photo(portrait))
     assert (choice.base, again.base) == ("lite", "lite")
     assert kept.notes == prediction.notes
 
@@ -167,39 +166,33 @@ def test_other_weights_of_lite_and_one_choice_for_a_whole_clip(tmp_path: Path, p
 # Whose lens counts.
 
 
-def test_focal_length_of_person_then_map_then_photo(tmp_path: Path) -> None:
-    photo, disparity = write_photo(tmp_path / "im0.png"), tmp_path / "disp0.npy"
+def test_focal_length_of_person_then_map_then_photo(tmp_path: Path, photo: Path) -> None:
+    disparity, ours_px = tmp_path / "disp0.npy", load_photo(photo, focal_px=60)
     np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
     calibration(tmp_path / "calib.txt", 80, 200, 1.5)
-    loaded = load_depth(disparity)
+    loaded, front = load_depth(disparity), slice(0, WIDTH * HEIGHT)
     for depth in (disparity, loaded):
         prediction, _ = pick(photo, depth=depth)
         assert (prediction.camera.focal[0], prediction.lens_source) == (80, "calibration")
-        ours, _ = open_base(BaseSettings(depth=depth)).predict(load_photo(photo, focal_px=60))
+        ours, _ = open_base(BaseSettings(depth=depth)).predict(ours_px)
         assert (ours.camera.focal[0], ours.lens_source) == (60, "")
         # depth = baseline · focal / (disparity + doffs)
-        torch.testing.assert_close(
-            ours.gaussians.means[: WIDTH * HEIGHT, 2], 0.75 * prediction.gaussians.means[: WIDTH * HEIGHT, 2]
-        )
-        scene = spackle.predict(load_photo(photo, focal_px=60), depth=depth, network=None)
+        torch.testing.assert_close(ours.gaussians.means[front, 2], 0.75 * prediction.gaussians.means[front, 2])
+        scene = spackle.predict(ours_px, depth=depth, network=None)
         assert scene.camera.focal[0] == 60
         assert same_bits(scene.base, ours.gaussians)
-    twice_as_fine = dataclasses.replace(load_photo(photo, focal_px=60), focal_source="EXIF")
-    assert open_base(BaseSettings(depth=loaded)).predict(twice_as_fine)[0].camera.focal[0] == 80
+    of_the_file = dataclasses.replace(ours_px, focal_source="EXIF")
+    assert open_base(BaseSettings(depth=loaded)).predict(of_the_file)[0].camera.focal[0] == 80
 
 
-def test_focal_length_of_person_then_depth_in_the_photo(tmp_path: Path) -> None:
-    matrix = (70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0)
-    data = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp(matrix=matrix))
-    photo = portraits.write(tmp_path / "photo.jpg", data)
-    depths = []
+def test_focal_length_of_person_then_depth_in_the_photo(portrait: Path) -> None:
+    middles = []
     for focal, source, given in ((70, "the photo's depth", None), (50, "", 50.0)):
-        for settings in (BaseSettings(), BaseSettings(depth=load_photo_depth(photo))):
-            prediction, _ = open_base(settings).predict(load_photo(photo, focal_px=given))
+        for settings in (BaseSettings(), BaseSettings(depth=load_photo_depth(portrait))):
+            prediction, _ = open_base(settings).predict(load_photo(portrait, focal_px=given))
             assert (prediction.camera.focal[0], prediction.lens_source) == (focal, source)
-            depths.append(prediction.gaussians.means[: WIDTH * HEIGHT, 2])
-    for one in depths:  # its metres depend on no lens
-        torch.testing.assert_close(one.median(), depths[0].median(), rtol=1e-3, atol=0)
+            middles.append(float(prediction.gaussians.means[: WIDTH * HEIGHT, 2].median()))
+    assert middles == pytest.approx(middles[:1] * 4, rel=1e-3)  # its metres depend on no lens
 
 
 # Auto falls back where a base cannot be used.
@@ -208,7 +201,8 @@ def test_focal_length_of_person_then_depth_in_the_photo(tmp_path: Path) -> None:
 def test_broken_depth_in_the_photo_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    photo, log = broken_portrait(tmp_path / "photo.jpg"), list[str]()
+    image, log = portraits.png(portraits.codes()), list[str]()
+    photo = portraits.write(tmp_path / "photo.jpg", portraits.gdepth_jpeg(image[:60] + bytes(30) + image[90:]))
     choice = pick(photo, log)[1]
     assert (choice.base, choice.why) == ("lite", f"the depth in the photo cannot be used, {NO_SHARP}")
     assert choice.failures[0].startswith(f"the depth in the photo: {photo}: ")
@@ -217,28 +211,21 @@ def test_broken_depth_in_the_photo_fails(
         pick(photo, name="rgbd")
     with caplog.at_level(logging.INFO, "spackle"):  # in Python
         spackle.predict(photo, network=None)
-    said = [(record.levelname, record.getMessage()) for record in caplog.records]
-    assert [level for level, _ in said] == ["WARNING", "INFO", "INFO"]
-    assert all(line.startswith("photo.jpg: ") for _, line in said)
-
-    def wrong(path: Path) -> DepthMap:
-        depth = torch.full((WIDTH, HEIGHT), 2.0)
-        return DepthMap(depth, depth > 0, None, None, "depth", path)
-
-    monkeypatch.setattr("spackle.bases.open.load_photo_depth", wrong)
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO", "INFO"]
+    assert all(record.getMessage().startswith("photo.jpg: ") for record in caplog.records)
+    depth = torch.full((WIDTH, HEIGHT), 2.0)
+    wrong = DepthMap(depth, depth > 0, None, None, "depth", photo)
+    monkeypatch.setattr("spackle.bases.open.load_photo_depth", lambda path: wrong)
     assert f"{HEIGHT}×{WIDTH} but photo {photo} is {WIDTH}×{HEIGHT}" in pick(photo)[1].failures[0]
     with pytest.raises(InputError, match=f"{HEIGHT}×{WIDTH}"):
         pick(photo, name="rgbd")
 
 
-def test_damaged_weights_of_sharp_fail_once_for_all_photos(
-    photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = sharp.read_bytes()
     publish(monkeypatch, "sharp", content)
     sharp.write_bytes(content[::-1])
-    said, log = "SHA-256 is not the published one", list[str]()
-    base = open_base(BaseSettings())
+    said, log, base = "SHA-256 is not the published one", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
     assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no Depth Anything here"] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
@@ -249,7 +236,7 @@ def test_damaged_weights_of_sharp_fail_once_for_all_photos(
 
 
 def test_what_fails_for_one_photo_is_tried_for_the_next(
-    tmp_path: Path, photo: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sharp: Path, quick: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     predict_box = StandIn.predict
 
@@ -257,40 +244,35 @@ def test_what_fails_for_one_photo_is_tried_for_the_next(
         found = predict_box(self, photo, progress)
         if photo.path.stem == "b":
             raise InputError(f"{photo.path}: not this one")
-        if photo.path.stem == "c":
-            far = dataclasses.replace(found.gaussians, means=found.gaussians.means * torch.inf)
-            return dataclasses.replace(found, gaussians=far)
-        return found
+        means = found.gaussians.means * (torch.inf if photo.path.stem == "c" else 1)
+        return dataclasses.replace(found, gaussians=dataclasses.replace(found.gaussians, means=means))
 
     monkeypatch.setattr(StandIn, "predict", picky)
-    log: list[str] = []
-    base, paths = open_base(BaseSettings()), [write_photo(tmp_path / f"{name}.png") for name in "abcd"]
+    log, base = list[str](), open_base(BaseSettings())
+    paths = [write_photo(tmp_path / f"{name}.png") for name in "abcd"]
     names = [base.predict(load_photo(path), log=log.append)[1].base for path in paths]
     assert names == ["sharp", "lite", "lite", "sharp"]
-    assert ("not this one" in log[0], "range of float32" in log[1]) == (True, True)
-    assert len(quick) == 1
-    for name in "bc":
-        with pytest.raises(InputError, match=rf"{name}\.png") as caught:
-            pick(tmp_path / f"{name}.png", name="sharp")
+    assert ("not this one" in log[0], "range of float32" in log[1], len(quick)) == (True, True, 1)
+    for path in paths[1:3]:
+        with pytest.raises(InputError, match=path.name) as caught:
+            pick(path, name="sharp")
         assert not isinstance(caught.value, BaseError)
 
 
 # What is named never gives way to another.
 
 
-def test_depth_that_is_given_or_named_has_no_fallback(tmp_path: Path, photo: Path) -> None:
-    inside = portrait(tmp_path / "a.jpg")
+def test_depth_that_is_given_or_named_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path) -> None:
     np.save(tmp_path / "bad.npy", np.zeros((HEIGHT, WIDTH), np.float32))
     (tmp_path / "depths").mkdir()
     for depth, named in ((tmp_path / "bad.npy", "bad.npy"), (tmp_path / "depths", "no depth map in")):
         with pytest.raises(InputError, match=named):
-            pick(inside, depth=depth)
+            pick(portrait, depth=depth)
     with pytest.raises(InputError, match="there is none in the photo") as caught:
         pick(photo, name="rgbd")
     assert not isinstance(caught.value, BaseError)
     ours = load_depth(write_depth(tmp_path / "depths" / "photo.npy"))
-    base = open_base(BaseSettings("rgbd"))
-    by_call, _ = base.predict(load_photo(photo), depth=ours)
+    by_call, _ = open_base(BaseSettings("rgbd")).predict(load_photo(photo), depth=ours)
     assert same_bits(by_call.gaussians, pick(photo, depth=tmp_path / "depths")[0].gaussians)
 
 
@@ -326,8 +308,7 @@ def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
     settings = BaseSettings(f"hf:{folder}")
     assert set(settings.files) == {"config.json", "model.safetensors"}
-    assert settings.public_name == "hf:small"
-    assert BaseSettings("hf:me/small").public_name == "hf:me/small"
+    assert (settings.public_name, BaseSettings("hf:me/small").public_name) == ("hf:small", "hf:me/small")
     prints = open_base(settings).fingerprints
     (folder / "README.md").write_text("more about it")
     assert open_base(settings).fingerprints == prints
@@ -335,7 +316,7 @@ def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
     assert open_base(settings).fingerprints != prints
 
 
-def test_tables_call_weights_apples_where_name_and_size_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_are_apples_by_name_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / SHARP_FILE
     file.write_bytes(b"weights")
     unknown = f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {SHARP_FILE}"
@@ -345,20 +326,14 @@ def test_tables_call_weights_apples_where_name_and_size_are(tmp_path: Path, monk
     assert BaseSettings("lite", checkpoint=file).description == KINDS["lite"][0]
 
 
-# In Python.
-
-
 def test_python_takes_depth_or_a_base_and_photos_without_file(tmp_path: Path, photo: Path) -> None:
     loaded = load_photo(photo)
-    drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
     scene = spackle.predict(loaded, network=None)
-    for again in (
-        spackle.predict(drawn, network=None),
-        spackle.predict(photo, base=spackle.LiteBase.load(), network=None),
-    ):
-        assert same_bits(again.base, scene.base)
+    drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
+    assert same_bits(spackle.predict(drawn, network=None).base, scene.base)
+    assert same_bits(spackle.predict(photo, base=LiteBase.load(), network=None).base, scene.base)
     with pytest.raises(ValueError, match="not both"):
-        spackle.predict(photo, write_depth(tmp_path / "d.npy"), base=spackle.LiteBase.load())
+        spackle.predict(photo, write_depth(tmp_path / "d.npy"), base=LiteBase.load())
     with pytest.raises(ValueError, match=r"base='lite': give a base that is loaded"):
         spackle.predict(photo, base="lite")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="gone"):

@@ -22,9 +22,8 @@ from scenes import (
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from spackle.bases.cleanup import COLOR_COST, MEDIAN, NEAR_COST, fill_missing
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import RgbdBase, lift
+from spackle.bases.lift import COLOR_COST, MEDIAN, NEAR_COST, RgbdBase, fill_missing, lift
 from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes, trajectory

@@ -11,7 +11,7 @@ from plain_cleanup import plain_flood
 from scenes import Scene, motorcycle_base, slanted_plane, texture
 from torch import Tensor
 
-from spackle.bases.cleanup import _flood, push_sky
+from spackle.bases.lift import _flood, push_sky
 from spackle.camera import Camera
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scenes import slanted_plane
 from torch import Tensor
 
-from spackle.bases.cleanup import attach_flying_pixels, undo_quantisation
+from spackle.bases.lift import attach_flying_pixels, undo_quantisation
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, surface_gaussians, surface_slope

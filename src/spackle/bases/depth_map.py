@@ -67,11 +67,7 @@ class DepthMap:
 
 
 def find_depth(depth: Path, photo: Path) -> Path:
-    """The depth map of a photo: the file itself, or the one in a folder that has the photo's name.
-
-    Raises:
-        InputError: a folder without such a file.
-    """
+    """The depth map of a photo: the file, or the one in a folder that has the photo's name; InputError without any."""
     if not os.path.isdir(depth):
         return depth
     for name in (photo.name, photo.stem):  # a.jpg.npy before a.npy, which a.png may mean too
@@ -165,11 +161,7 @@ def calibrations_beside(path: Path) -> tuple[Path, Path]:
 
 
 def read_calibration(path: StrPath) -> Calibration:
-    """A pair's calibration from a `scene.json`, or else from Middlebury's `calib.txt`.
-
-    Raises:
-        InputError: the file is missing, no calibration, or has numbers that make no sense.
-    """
+    """A pair's calibration from a `scene.json` or Middlebury's `calib.txt`; InputError for a file that is neither."""
     lens = _read_scene(path, None) if Path(path).suffix.lower() == ".json" else None
     return lens or _read_calib(path)
 
@@ -284,25 +276,14 @@ def _png_values(image: Image.Image, path: StrPath) -> Array:
 
 def _read_npy(file: IO[bytes], path: StrPath) -> Array:
     """One array, its header believed only as far as the bytes reach; nothing is unpickled."""
-    version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    else:
-        shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
+    old = np.lib.format.read_magic(file) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if old else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read_header(file)
     if dtype.kind not in "fiu":
         raise InputError(f"{path}: an array of {dtype} is not a depth map: give float32 metres")
     _check_size(shape, path)
-    data = _read_values(file, shape, dtype.itemsize, path)
-    values = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
-    return np.ascontiguousarray(values, dtype.newbyteorder("="))
-
-
-def _read_values(file: IO[bytes], shape: tuple[int, ...], item: int, path: StrPath) -> bytes:
-    """The bytes of an array of items of so many bytes each."""
-    data = file.read(shape[0] * shape[1] * item)
-    if len(data) < shape[0] * shape[1] * item:
-        raise InputError(f"{path}: cut off: {shape[1]}×{shape[0]} values are announced, {len(data)} bytes are there")
-    return data
+    values = np.frombuffer(file.read(math.prod(shape) * dtype.itemsize), dtype)
+    return np.ascontiguousarray(values.reshape(shape, order="F" if fortran else "C"), dtype.newbyteorder("="))
 
 
 def _read_npz(file: IO[bytes], path: StrPath) -> Array:
@@ -321,6 +302,5 @@ def _read_pfm(file: IO[bytes], path: StrPath) -> Array:
         raise InputError(f"{path}: a PFM with three channels is not a depth map: give one channel (Pf)")
     (width, height), endian = map(int, size), "<" if float(scale[0]) < 0 else ">"
     _check_size((height, width), path)
-    data = _read_values(file, (height, width), 4, path)
-    values = np.frombuffer(data, f"{endian}f4").reshape(height, width)[::-1]
-    return np.ascontiguousarray(values, np.float32)
+    values = np.frombuffer(file.read(4 * width * height), f"{endian}f4").reshape(height, width)
+    return np.ascontiguousarray(values[::-1], np.float32)

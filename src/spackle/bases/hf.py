@@ -31,10 +31,9 @@ _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it
 
 Meaning = Literal["metres", "relative disparity", "canonical disparity"]  # the last: focal length / width / metres
-Window = tuple[float, float, float, float]  # the photo in a padded picture: top, bottom, left, right, in its sides
+Window = tuple[float, ...]  # the photo in a padded picture: top, bottom, left, right, in its sides
 Prepare = Callable[[Tensor], tuple[Tensor, Window]]  # [H, W, 3] sRGB in 0..1 to pixel values [1, 3, h, w]
 WHOLE: Window = (0.0, 1.0, 0.0, 1.0)
-
 MEANINGS: dict[str, Meaning] = {  # by `model_type` of config.json; two kinds of model have both: see `meaning_of`
     "depth_anything": "relative disparity",
     "depth_pro": "canonical disparity",
@@ -67,11 +66,8 @@ class HfBase:
     ) -> HfBase:
         """Read a model in a folder, or owner/name of the hub, whose cache is asked first; nothing in it is executed.
 
-        Args:
-            model: the folder or name, also the base's name (after hf:) unless `name` is given.
-            device: cpu or a CUDA device; where None, CUDA if it is there.
-            precision: of the products of matrices; auto is bf16 where the hardware multiplies it natively.
-            name: of the base.
+        The products of matrices are bf16 at the precision auto where the hardware multiplies it natively. The base's
+        name is hf:MODEL where none is given.
 
         Raises:
             InputError: a device, package, model or file that is missing, broken or unknown, or too little memory.
@@ -79,9 +75,9 @@ class HfBase:
         """
         target = pick_device(device)
         dtype, name = pick_dtype(precision, target), name or f"hf:{model}"
-        is_folder = os.path.isdir(model) or model.startswith(("./", "../", "/", "~"))
-        source = os.path.expanduser(model) if is_folder else model
-        if is_folder and not os.path.isdir(source):
+        source = os.path.expanduser(model)
+        is_folder = os.path.isdir(source)
+        if not is_folder and model.startswith(("./", "../", "/", "~")):
             raise InputError(f"hf:{model}: no such folder: check the name")
         if not is_folder and not _HUB_NAME.fullmatch(model):
             raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
@@ -101,11 +97,8 @@ class HfBase:
     def predict(self, photo: Photo, progress: Progress | None = None) -> BasePrediction:
         """Gaussians of the pixels of the photo at its working size, as `lift` makes them.
 
-        A model that sees the lens gives it where neither the photo's file nor a person does. `progress` is called when
-        the depth is there, and when it is lifted.
-
-        Raises:
-            InputError: the model cannot work on this photo, or what it says is no depth; or too little memory.
+        A model that sees the lens gives it where neither the photo's file nor a person does. InputError where the model
+        cannot work on this photo, what it says is no depth, or memory is short.
         """
         photo = resize_photo(photo)
         problem = f"{self.name} fails ({{reason}}): give another photo or model"
@@ -113,15 +106,21 @@ class HfBase:
             raw, fov = self._ask(photo.rgb)
         camera, lens_source = photo.camera, ""
         if fov is not None and photo.focal_source.startswith("default"):
-            camera, lens_source = self._camera(photo, fov), "Depth Pro"  # the only kind that gives a lens
+            focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2) if 0 < fov < 180 else math.nan
+            shortest, longest = (lens * max(photo.width, photo.height) for lens in LENSES)
+            if not shortest <= focal <= longest:
+                seen = f"{self.name} sees a field of view of {fov:g}°, which no lens has"
+                raise InputError(f"{photo.path}: {seen}: give the focal length with --focal-mm")
+            camera = Camera.from_focal(focal, photo.width, photo.height)
+            lens_source = "Depth Pro"  # the only kind that gives a lens
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
         if progress:
             progress(1, 2)
         prediction = lift(photo.rgb, depth, camera)
         if progress:
             progress(2, 2)
-        scaled = f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m"
-        scale = scaled if self.meaning == "relative disparity" else "metric, by the model"
+        relative = self.meaning == "relative disparity"
+        scale = f"relative, scaled to {NEAREST_M:g}–{FARTHEST_M:g} m" if relative else "metric, by the model"
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": scale}
         if invalid := int((~depth.valid).sum()):
             notes["depth_invalid_pixels"] = invalid
@@ -141,33 +140,19 @@ class HfBase:
         top, bottom, left, right = (round(share * side) for share, side in zip(window, sides, strict=True))
         return raw[0, top:bottom, left:right], None if fov is None else float(fov)
 
-    def _camera(self, photo: Photo, fov: float) -> Camera:
-        """The photo's camera with a horizontal field of view in degrees."""
-        focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2) if 0 < fov < 180 else math.nan
-        shortest, longest = (lens * max(photo.width, photo.height) for lens in LENSES)
-        if not shortest <= focal <= longest:
-            what = f"{self.name} sees a field of view of {fov:g}°, which no lens has"
-            raise InputError(f"{photo.path}: {what}: give the focal length with --focal-mm")
-        return Camera.from_focal(focal, photo.width, photo.height)
-
 
 def meaning_of(settings: Mapping[str, Any], name: str) -> Meaning:
-    """What a model's output is, by its config.json.
-
-    InputError for one whose output is no depth, or is not known here: a guess would turn scenes inside out.
-    """
+    """What a model's output is, by its config.json; InputError where that is unknown: a guess could be wrong."""
     kind, stated = str(settings.get("model_type")), str(settings.get("depth_estimation_type", "relative"))
     if kind not in MEANINGS:
         known = ", ".join(MEANINGS)
         raise InputError(f"{name}: {kind[:40]!a} is no kind of depth model that is known here: give one of {known}")
-    if kind == "depth_anything" and stated != "relative":
-        if stated != "metric":
-            raise InputError(f"{name}: its depth is {stated[:40]!a}, neither relative nor metric: give another model")
-        return "metres"
+    if kind == "depth_anything" and stated not in ("relative", "metric"):
+        raise InputError(f"{name}: its depth is {stated[:40]!a}, neither relative nor metric: give another model")
     backbone = settings.get("backbone_config")
-    if kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2":
-        return "metres"  # DINOv2's own depth heads, for NYU and KITTI; MiDaS has other backbones
-    return MEANINGS[kind]
+    # DINOv2's own depth heads, for NYU and KITTI; MiDaS has other backbones.
+    dinov2 = kind == "dpt" and isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
+    return "metres" if dinov2 or (kind == "depth_anything" and stated == "metric") else MEANINGS[kind]
 
 
 def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: Path) -> DepthMap:
@@ -251,15 +236,15 @@ def _processed(processor: Any, kind: str) -> Prepare:
         pixels = torch.as_tensor(processor(images=image, return_tensors="pt")["pixel_values"])
         if not getattr(processor, "do_pad", False):
             return pixels, WHOLE
-        window: list[float] = []
-        for axis, (side, whole) in enumerate(zip(rgb.shape[:2], pixels.shape[2:], strict=True)):
+        window: Window = ()
+        bare = processor(images=image, return_tensors="pt", do_pad=False)["pixel_values"].shape[2:]
+        for side, whole, inside in zip(rgb.shape[:2], pixels.shape[2:], bare, strict=True):
             if kind == "zoedepth":  # reflects the photo beyond its borders, and resizes both together
-                margin = int(math.sqrt(side / 2) * 3)
-                window += [margin / (side + 2 * margin), (side + margin) / (side + 2 * margin)]
+                margin, whole, inside = int(math.sqrt(side / 2) * 3), side + 2 * int(math.sqrt(side / 2) * 3), side
             else:  # centred in a picture whose sides are multiples
-                bare = processor(images=image, return_tensors="pt", do_pad=False)["pixel_values"].shape[2 + axis]
-                window += [(whole - bare) // 2 / whole, ((whole - bare) // 2 + bare) / whole]
-        return pixels, (window[0], window[1], window[2], window[3])
+                margin = (whole - inside) // 2
+            window += (margin / whole, (margin + inside) / whole)
+        return pixels, window
 
     return prepare
 
@@ -269,12 +254,12 @@ def _stretched(settings: Mapping[str, Any], kind: str) -> Prepare:
     size = int(settings["size"]["height"]), int(settings["size"]["width"])
     if settings.get("resample", 2) != Image.Resampling.BILINEAR or not (1 <= min(size) <= max(size) <= 4096):
         raise ValueError(f"an input of {size[1]}×{size[0]}, or resized otherwise than bilinear")
-    normalize = settings.get("do_normalize", "image_mean" in settings)
-    mean = torch.tensor(settings["image_mean"] if normalize else [0.0] * 3).float().reshape(3, 1, 1)
-    std = torch.tensor(settings["image_std"] if normalize else [1.0] * 3).float().reshape(3, 1, 1)
+    mean, std = torch.zeros(3), torch.ones(3)
+    if settings.get("do_normalize", "image_mean" in settings):
+        mean, std = torch.tensor(settings["image_mean"]).float(), torch.tensor(settings["image_std"]).float()
 
     def prepare(rgb: Tensor) -> tuple[Tensor, Window]:
-        pixels = ((rgb.permute(2, 0, 1) - mean) / std)[None]
+        pixels = ((rgb - mean) / std).permute(2, 0, 1)[None]
         return interpolate(pixels, size=size, mode="bilinear", antialias=ANTIALIAS[kind]), WHOLE
 
     return prepare

@@ -5,9 +5,8 @@ Together they blend to what the photo shows.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -75,16 +74,14 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
         pixels = _split(layers, least, colors)
         rest = pixels.rest.pixels(pixels.mixed, camera)
         parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
-        samples = _Samples.cat(parts)
+        samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
         if len(samples.uv) <= MOST * single.numel():
             break
     corrected = _inner((ring == 0) | (ring > UNTOUCHED))[single]
-    fitted = _fitted(samples, colors, single, corrected, tiles)
-    return surface_gaussians(camera, *(getattr(fitted, f.name) for f in dataclasses.fields(fitted)))
+    return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Samples:
+class _Samples(NamedTuple):
     """N Gaussians, in the order of `surface_gaussians`."""
 
     uv: Tensor  # [N, 2] pixels
@@ -93,11 +90,6 @@ class _Samples:
     spread: Tensor  # [N, 2] pixels
     color: Tensor  # [N, 3] linear RGB
     opacity: Tensor  # [N]
-
-    @staticmethod
-    def cat(parts: Sequence[_Samples]) -> _Samples:
-        """All in order."""
-        return _Samples(*(torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(_Samples)))
 
 
 def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor, tiles: Sequence[Tiles]) -> _Samples:
@@ -113,11 +105,10 @@ def _fitted(samples: _Samples, colors: Tensor, single: Tensor, corrected: Tensor
         pixels = missing[single] * corrected[:, None]
         change = torch.cat([pixels, *(part.means(missing) for part in tiles)])
         fitted[: len(change)] = (fitted[: len(change)] + change).clamp(0, 1)
-    return dataclasses.replace(samples, color=fitted)
+    return samples._replace(color=fitted)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Surface:
+class _Surface(NamedTuple):
     """A surface in each pixel."""
 
     depth: Tensor  # [H, W] inverse
@@ -127,14 +118,13 @@ class _Surface:
 
     def instead(self, where: Tensor, other: _Surface) -> _Surface:
         """The other one at some pixels [H, W]."""
-        pairs = ((getattr(one, f.name) for one in (other, self)) for f in dataclasses.fields(self))
-        shaped = ((where if a.ndim == 2 else where[..., None], a, b) for a, b in pairs)
-        return _Surface(*(torch.where(*images) for images in shaped))
+        images = zip(other, self, strict=True)
+        return _Surface(*(torch.where(where if a.ndim == 2 else where[..., None], a, b) for a, b in images))
 
     def pixels(self, where: Tensor, camera: Camera) -> _Samples:
         """A Gaussian for each of some pixels [H, W], in row-major order."""
         uv = camera.pixel_centers()[where]
-        depth, slope, color, opacity = self.depth[where], self.slope[where], self.color[where], self.opacity[where]
+        depth, slope, color, opacity = (image[where] for image in self)
         return _Samples(uv, depth, slope, torch.full_like(uv, SPREAD_PX), color, opacity)
 
     def samples(self, tiles: Tiles, spread: float, pixels: int = 1) -> _Samples:
@@ -145,8 +135,7 @@ class _Surface:
         return _Samples(tiles.centers() * pixels, depth, slope, sides.expand(len(depth), 2), color, opacity)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pixels:
+class _Pixels(NamedTuple):
     """The surfaces of a photo's pixels."""
 
     most: _Surface  # the one that covers most of a pixel
@@ -206,7 +195,7 @@ def _receded(samples: _Samples, tiles: Tiles, slope_gap: float) -> _Samples:
     reach = 2 * slope_gap * torch.tensor([tiles.width, tiles.height])
     gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
     recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
-    return dataclasses.replace(samples, depth=samples.depth * recede, slope=samples.slope * recede[:, None])
+    return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
 def _inner(free: Tensor) -> Tensor:

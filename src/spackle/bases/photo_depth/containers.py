@@ -2,366 +2,247 @@
 
 from __future__ import annotations
 
-import dataclasses
+import io
 import math
 import re
 import struct
-from collections.abc import Iterator
-from mmap import mmap
-from typing import NoReturn
-from xml.parsers import expat
+from collections.abc import Iterable, Iterator, Mapping
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
-from spackle.bases.photo_depth.coded import BY_IMIR, BY_IROT, UPRIGHT, BrokenDepth, Turn
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
 from spackle.errors import reason_in_a_line
 
-Bytes = bytes | mmap
 
-SOI = b"\xff\xd8"
-APP1, APP2, SOS, EOI = 0xE1, 0xE2, 0xDA, 0xD9
-XMP, MORE_XMP, PICTURES = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0", b"MPF\0"
-GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
-MAX_SEGMENTS = 10_000  # 64 KiB each at most: a hundred times the largest depth map seen
+class BrokenDepth(Exception):
+    """A photo has a depth map that cannot be used; the message completes "the depth map in the photo …"."""
+
+
+XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+MAX_SCANS = 10_000
 MAX_PICTURES = 64
+_GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
 _PICTURE_LIST = 0xB002
-_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # in compressed data all others are data or restarts
+_MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])")  # in compressed data all others are data or restarts
+_END = b"\xd9"
 
 
-def segments(data: Bytes, start: int = 0) -> Iterator[tuple[int, int, int]]:
-    """(marker, begin, end) of the payloads from the head of the JPEG at `start` to its first scan, that included."""
-    at = start + 2
-    for _ in range(MAX_SEGMENTS):
-        if at + 4 > len(data) or data[at] != 0xFF:
-            return
-        marker = data[at + 1]
-        if marker == 0xFF:  # a fill byte
-            at += 1
-            continue
-        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
-        if marker == EOI or length < 2 or at + 2 + length > len(data):
-            return
-        yield marker, at + 4, at + 2 + length
-        if marker == SOS:
-            return
-        at += 2 + length
+def open_jpeg(data: bytes) -> JpegImageFile | None:
+    """A JPEG whose head is read; None where Pillow cannot."""
+    try:
+        return JpegImageFile(io.BytesIO(data))
+    except Exception:
+        return None
 
 
-def payloads(data: Bytes, start: int, marker: int, signature: bytes) -> Iterator[tuple[int, bytes]]:
-    """(place, bytes) of what follows the signature in each segment that has it."""
-    for found, begin, end in segments(data, start):
-        if found == marker and data[begin : min(end, begin + len(signature))] == signature:
-            yield begin + len(signature), data[begin + len(signature) : end]
+def xmp_of(image: JpegImageFile | None) -> bytes:
+    """The main XMP packet; empty where there is none."""
+    segments = [] if image is None else image.applist
+    return next((body[len(XMP) :] for name, body in segments if name == "APP1" and body.startswith(XMP)), b"")
 
 
-def xmp_of(data: Bytes, start: int = 0) -> bytes:
-    """The main XMP packet of the JPEG at `start`; empty where there is none."""
-    return next((body for _, body in payloads(data, start, APP1, XMP)), b"")
-
-
-def extended_xmp_of(data: Bytes, main: bytes) -> tuple[bytes, bool]:
+def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
     """The XMP that did not fit into the main packet, as far as it is there, and whether that is all."""
-    named = GUID.search(main)
-    if named is None:
+    if (named := _GUID.search(xmp_of(image))) is None:
         return b"", True
-    parts = [body for _, body in payloads(data, 0, APP1, MORE_XMP) if body[:32].lower() == named[1].lower()]
-    whole = [(*struct.unpack(">II", part[32:40]), part[40:]) for part in parts if len(part) >= 40]
-    joined, lengths = bytearray(), {length for length, _, _ in whole}
-    for _, offset, text in sorted(whole, key=lambda part: part[1]):
-        if offset != len(joined):
+    parts = [body.removeprefix(MORE_XMP) for name, body in image.applist if name == "APP1" and MORE_XMP in body[:40]]
+    parts = [part for part in parts if part[:32].lower() == named[1].lower() and len(part) >= 40]
+    joined, lengths = bytearray(), {part[32:36] for part in parts}
+    for part in sorted(parts, key=lambda part: part[36:40]):
+        if int.from_bytes(part[36:40], "big") != len(joined):
             break
-        joined += text
-    return bytes(joined), not whole or lengths == {len(joined)}
+        joined += part[40:]
+    return bytes(joined), lengths <= {len(joined).to_bytes(4, "big")}
 
 
-def end_of_picture(data: Bytes) -> int | None:
+def end_of_picture(data: bytes) -> int | None:
     """The first byte behind the JPEG that the file begins with; None where it has no end."""
-    at = next((end for marker, _, end in segments(data) if marker == SOS), None)
-    for _ in range(MAX_SEGMENTS):
-        found = None if at is None else _MARKER.search(data, at)
-        if found is None:
+    at = 2
+    for _ in range(MAX_SCANS):
+        if (found := _MARKER.search(data, at)) is None:
             return None
-        if data[found.start() + 1] == EOI:
+        if found[1] == _END:
             return found.end()
-        lengths = data[found.end() : found.end() + 2]  # tables between two scans, or the next scan's head
-        if len(lengths) < 2:
-            return None
-        at = found.end() + int.from_bytes(lengths, "big")
+        at = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
     return None
 
 
-def further_pictures(data: Bytes) -> list[tuple[int, int]]:
-    """(begin, end) of the pictures that the Multi-Picture Format lists behind the first, as far as they are there."""
-    for place, body in payloads(data, 0, APP2, PICTURES):
-        order = {b"II*\0": "<", b"MM\0*": ">"}.get(body[:4])
-        try:
-            entries = _picture_list(body, order) if order else b""
-            found = [struct.unpack_from(f"{order}4xII", entries, 16 * i) for i in range(len(entries) // 16)]
-        except struct.error:
-            return []
-        # The first entry is the photo; the offsets of the others count from the byte order mark.
-        spans = [(place + offset, place + offset + size) for size, offset in found[1:]]
-        return [(begin, end) for begin, end in spans if data[begin : begin + 2] == SOI]
-    return []
+def further_pictures(image: JpegImageFile) -> list[tuple[int, int]]:
+    """(begin, end) of the pictures that the Multi-Picture Format lists behind the first, wherever the file ends."""
+    try:
+        file = io.BytesIO(image.info["mp"])
+        directory = ImageFileDirectory_v2(file.read(8))
+        file.seek(directory.next)
+        directory.load(file)
+        order = "<" if image.info["mp"].startswith(b"II") else ">"
+        entries = list(struct.iter_unpack(f"{order}4xII4x", directory[_PICTURE_LIST]))[1:MAX_PICTURES]
+    except Exception:  # there is no list, or none that can be read
+        return []
+    # The offsets count from the list's byte order mark.
+    return [(image.info["mpoffset"] + offset, image.info["mpoffset"] + offset + size) for size, offset in entries]
 
 
-def _picture_list(body: bytes, order: str) -> bytes:
-    """The 16-byte entries of an MPF directory."""
-    (directory,) = struct.unpack_from(f"{order}I", body, 4)
-    (count,) = struct.unpack_from(f"{order}H", body, directory)
-    for index in range(count):
-        tag, _, size, at = struct.unpack_from(f"{order}HHII", body, directory + 2 + 12 * index)
-        if tag == _PICTURE_LIST:
-            return body[at : at + min(size, 16 * MAX_PICTURES)]
-    return b""
-
-
-DEPTH_TYPES = (
-    b"urn:mpeg:hevc:2015:auxid:2",
-    b"urn:mpeg:avc:2015:auxid:2",
-    b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth",
-)
-XMP_TYPE = b"application/rdf+xml"
+# Turns are steps: t swaps rows and columns, x left and right, y top and bottom.
+BY_ORIENTATION = {2: "x", 3: "xy", 4: "y", 5: "t", 6: "tx", 7: "txy", 8: "ty"}  # how EXIF's gets upright
+# `irot` holds so many quarter turns anticlockwise, `imir` 0 where top and bottom change places.
+_TURNS = {b"irot": ("", "ty", "xy", "tx"), b"imir": ("y", "x")}
+_DEPTH_TYPES = {b"urn:mpeg:hevc:2015:auxid:2", b"urn:mpeg:avc:2015:auxid:2"}
+_DEPTH_TYPES |= {b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"}
+_XMP_TYPE = b"application/rdf+xml"
 MAX_XMP_BYTES = 1 << 20
-
-Span = tuple[int, int]
-
-
-class MalformedBoxes(Exception):
-    """The file is no HEIF, or not as the standard has it."""
+_MALFORMED = (struct.error, KeyError, IndexError, ValueError)
+Boxes = Iterator[tuple[bytes, memoryview]]
 
 
-class _Cursor:
-    """Big-endian numbers one after the other; never beyond the end."""
-
-    def __init__(self, data: Bytes, span: Span) -> None:
-        self.data, (self.at, self.end) = data, span
-
-    def take(self, count: int) -> bytes:
-        if self.at + count > self.end:
-            raise MalformedBoxes
-        self.at += count
-        return self.data[self.at - count : self.at]
-
-    def number(self, count: int) -> int:
-        return int.from_bytes(self.take(count), "big")
-
-    def text(self) -> bytes:
-        """Up to the next zero byte."""
-        stop = self.data.find(b"\0", self.at, self.end)
-        found = self.take((self.end if stop < 0 else stop) - self.at)
-        self.at = min(self.at + 1, self.end)
-        return found
-
-    def full(self) -> tuple[int, int]:
-        """Version and flags of a full box."""
-        return self.number(1), self.number(3)
-
-    def boxes(self) -> Iterator[tuple[bytes, Span]]:
-        """(type, span of the content) of the boxes from here to the end."""
-        while self.at + 8 <= self.end:
-            begin = self.at
-            size, kind = self.number(4), self.take(4)
-            size = self.number(8) if size == 1 else size or self.end - begin
-            if size < self.at - begin or begin + size > self.end:
-                raise MalformedBoxes
-            yield kind, (self.at, begin + size)
-            self.at = begin + size
-
-
-def find_depth_item(data: Bytes) -> tuple[bytes, Turn, Turn] | None:
-    """The auxiliary depth map of the primary picture; None without any, MalformedBoxes where the boxes are broken.
+def find_depth_item(data: bytes) -> tuple[bytes, str, str] | None:
+    """The auxiliary depth map of the primary picture; None without any, or where the boxes are broken.
 
     Returns:
         Its XMP, empty if unreachable; its own rotation and mirroring, which a decoder applies; and those of the
         primary picture if it has none of its own.
     """
-    meta = next((span for kind, span in _Cursor(data, (0, len(data))).boxes() if kind == b"meta"), None)
-    if meta is None:
-        raise MalformedBoxes
-    found = dict(_Cursor(data, (meta[0] + 4, meta[1])).boxes())
-    if not {b"pitm", b"iinf", b"iref", b"iprp"} <= set(found):
+    try:
+        content = next(body for kind, body in _boxes(memoryview(data)) if kind == b"meta")
+        meta = dict(_boxes(content[4:]))
+        (primary,) = struct.unpack_from(">I" if meta[b"pitm"][0] else ">H", meta[b"pitm"], 4)
+        references, properties = list(_references(meta[b"iref"])), _properties(meta[b"iprp"])
+    except (*_MALFORMED, StopIteration):
         return None
-    cursor = _Cursor(data, found[b"pitm"])
-    primary = cursor.number(4 if cursor.full()[0] else 2)
-    references = list(_references(_Cursor(data, found[b"iref"])))
-    properties = _properties(data, found[b"iprp"])
-    auxiliary = [source for kind, source, targets in references if kind == b"auxl" and primary in targets]
-    depth = []
-    for item in auxiliary:
-        kinds = (_Cursor(data, (a + 4, b)).text() for kind, (a, b) in properties.get(item, []) if kind == b"auxC")
-        if any(kind in DEPTH_TYPES for kind in kinds):
-            depth.append(item)
+    auxiliary = [item for kind, item, targets in references if kind == b"auxl" and primary in targets]
+    depth = [item for item in auxiliary if _is_depth(properties.get(item, ()))]
     if not depth:
         return None
     if len(depth) > 1:  # whose XMP describes the one that the decoder picks is unknown
-        return b"", UPRIGHT, UPRIGHT
-    own, of_primary = (_turn(data, properties.get(item, [])) for item in (depth[0], primary))
-    describing = {source for kind, source, targets in references if kind == b"cdsc" and depth[0] in targets}
+        return b"", "", ""
+    own, of_primary = (_turn(properties.get(item, ())) for item in (depth[0], primary))
+    describing = {item for kind, item, targets in references if kind == b"cdsc" and depth[0] in targets}
     try:  # empty where there is none, or none that can be reached
-        describing &= set(_xmp_items(_Cursor(data, found[b"iinf"])))
-        xmp = next(_packets(data, found, describing), b"")
-    except MalformedBoxes:
+        xmp = next(_packets(data, meta, describing & set(_xmp_items(meta[b"iinf"]))), b"")
+    except _MALFORMED:
         xmp = b""
     # Apple rotates the picture and leaves the map as the sensor saw it.
-    return xmp, own or UPRIGHT, (own is None and of_primary) or UPRIGHT
+    return xmp, own or "", "" if own is not None else of_primary or ""
 
 
-def _references(cursor: _Cursor) -> Iterator[tuple[bytes, int, list[int]]]:
+def _boxes(body: memoryview) -> Boxes:
+    """(type, content) of boxes in a row."""
+    at = 0
+    while at + 8 <= len(body):
+        size, kind = struct.unpack_from(">I4s", body, at)
+        head = 16 if size == 1 else 8
+        size = struct.unpack_from(">Q", body, at + 8)[0] if size == 1 else size or len(body) - at
+        if not head <= size <= len(body) - at:
+            raise ValueError("a box beyond its box")
+        yield kind, body[at + head : at + size]
+        at += size
+
+
+def _references(iref: memoryview) -> Iterator[tuple[bytes, int, tuple[int, ...]]]:
     """(type, from, to) of each reference between items."""
-    width = 4 if cursor.full()[0] else 2
-    for kind, span in cursor.boxes():
-        inner = _Cursor(cursor.data, span)
-        source, count = inner.number(width), inner.number(2)
-        yield kind, source, [inner.number(width) for _ in range(count)]
+    number, head = ("I", 6) if iref[0] else ("H", 4)
+    for kind, body in _boxes(iref[4:]):
+        source, count = struct.unpack_from(f">{number}H", body)
+        yield kind, source, struct.unpack_from(f">{count}{number}", body, head)
 
 
-def _properties(data: Bytes, span: Span) -> dict[int, list[tuple[bytes, Span]]]:
+def _properties(iprp: memoryview) -> dict[int, list[tuple[bytes, memoryview]]]:
     """The property boxes of each item, in the order in which they apply."""
-    parts = list(_Cursor(data, span).boxes())
-    stored = [box for kind, inner in parts if kind == b"ipco" for box in _Cursor(data, inner).boxes()]
-    found: dict[int, list[tuple[bytes, Span]]] = {}
-    for cursor in (_Cursor(data, inner) for kind, inner in parts if kind == b"ipma"):
-        version, flags = cursor.full()
-        width = 2 if flags & 1 else 1
-        for _ in range(cursor.number(4)):
-            item, count = cursor.number(4 if version else 2), cursor.number(1)
-            indices = [cursor.number(width) & (0x7FFF if width == 2 else 0x7F) for _ in range(count)]
-            found.setdefault(item, []).extend(stored[i - 1] for i in indices if 1 <= i <= len(stored))
+    parts = list(_boxes(iprp))
+    stored = [box for kind, body in parts if kind == b"ipco" for box in _boxes(body)]
+    found: dict[int, list[tuple[bytes, memoryview]]] = {}
+    for table in (body for kind, body in parts if kind == b"ipma"):
+        entry, at = struct.Struct(">IB" if table[0] else ">HB"), 8
+        index, mask = ("H", 0x7FFF) if table[3] & 1 else ("B", 0x7F)
+        for _ in range(*struct.unpack_from(">I", table, 4)):
+            item, count = entry.unpack_from(table, at)
+            indices = struct.unpack_from(f">{count}{index}", table, at + entry.size)
+            at += entry.size + struct.calcsize(f">{count}{index}")
+            found.setdefault(item, []).extend(stored[(i & mask) - 1] for i in indices if 1 <= i & mask <= len(stored))
     return found
 
 
-def _turn(data: Bytes, properties: list[tuple[bytes, Span]]) -> Turn | None:
+def _is_depth(properties: Iterable[tuple[bytes, memoryview]]) -> bool:
+    types = {bytes(body[4:]).partition(b"\0")[0] for kind, body in properties if kind == b"auxC"}
+    return bool(types & _DEPTH_TYPES)
+
+
+def _turn(properties: Iterable[tuple[bytes, memoryview]]) -> str | None:
     """Rotations and mirrorings, in the order in which they apply; None where there is not one."""
-    tables, turn = {b"irot": BY_IROT, b"imir": BY_IMIR}, None
-    for kind, span in properties:
-        if kind in tables:
-            table = tables[kind]
-            turn = (turn or UPRIGHT).then(table[_Cursor(data, span).number(1) % len(table)])
-    return turn
+    turns = [_TURNS[kind][body[0] % len(_TURNS[kind])] for kind, body in properties if kind in _TURNS and body]
+    return "".join(turns) if turns else None
 
 
-def _xmp_items(cursor: _Cursor) -> Iterator[int]:
-    cursor.number(4 if cursor.full()[0] else 2)
-    for box, span in cursor.boxes():
-        entry = _Cursor(cursor.data, span)
-        version = entry.full()[0] if box == b"infe" else 0
-        if version not in (2, 3):
-            continue
-        item, _, kind = entry.number(version * 2 - 2), entry.take(2), entry.take(4)
-        _, content = entry.text(), entry.text()
-        if kind == b"mime" and content == XMP_TYPE:
-            yield item
+def _xmp_items(iinf: memoryview) -> Iterator[int]:
+    for kind, body in _boxes(iinf[8 if iinf[0] else 6 :]):
+        if kind == b"infe" and body[0] in (2, 3):
+            entry = struct.Struct(">I2x4s" if body[0] == 3 else ">H2x4s")
+            item, item_type = entry.unpack_from(body, 4)
+            _, content_type, *_ = bytes(body[4 + entry.size :]).split(b"\0")
+            if item_type == b"mime" and content_type == _XMP_TYPE:
+                yield item
 
 
-def _packets(data: Bytes, meta: dict[bytes, Span], items: set[int]) -> Iterator[bytes]:
+def _packets(data: bytes, meta: Mapping[bytes, memoryview], items: set[int]) -> Iterator[bytes]:
     """The bytes of these items, as far as they are in the file."""
-    if not items or b"iloc" not in meta:
-        return
-    cursor = _Cursor(data, meta[b"iloc"])
-    version, _ = cursor.full()
-    sizes = cursor.number(2)
+    iloc = meta[b"iloc"]
+    version, sizes = iloc[0], int.from_bytes(iloc[4:6], "big")
     of_offset, of_length, of_base, of_index = (sizes >> shift & 15 for shift in (12, 8, 4, 0))
-    of_index = of_index if version else 0
-    for _ in range(cursor.number(4 if version == 2 else 2)):
-        item = cursor.number(4 if version == 2 else 2)
-        method = cursor.number(2) & 15 if version else 0
-        cursor.number(2)  # which file: only this one is read
-        base, count = cursor.number(of_base), cursor.number(2)
-        if not of_length or method > 1:
-            raise MalformedBoxes
-        start = base if method == 0 else base + meta.get(b"idat", (len(data), 0))[0]
-        extents = []
-        for _ in range(count):
-            cursor.number(of_index)
-            offset, length = cursor.number(of_offset), cursor.number(of_length)
-            extents.append((start + offset, start + offset + length))
-        if item in items and extents and sum(end - begin for begin, end in extents) <= MAX_XMP_BYTES:
-            yield b"".join(data[begin:end] for begin, end in extents)
+    of_item, of_method, of_index = (4 if version == 2 else 2), (2 if version else 0), (of_index if version else 0)
+    head = struct.Struct(f">{of_item}s{of_method}s2x{of_base}sH")
+    extent = struct.Struct(f">{of_index}x{of_offset}s{of_length}s")
+    at = 6 + of_item
+    for _ in range(int.from_bytes(iloc[6:at], "big")):
+        *fields, count = head.unpack_from(iloc, at)
+        item, method, base = (int.from_bytes(field, "big") for field in fields)
+        if not of_length or method & 15 > 1:
+            raise ValueError("an item without a length, or made of others")
+        source = meta.get(b"idat", b"") if method & 15 else data
+        extents = [extent.unpack_from(iloc, at + head.size + k * extent.size) for k in range(count)]
+        spans = [(base + int.from_bytes(offset, "big"), int.from_bytes(length, "big")) for offset, length in extents]
+        if item in items and spans and sum(length for _, length in spans) <= MAX_XMP_BYTES:
+            yield b"".join(source[begin : begin + length] for begin, length in spans)
+        at += head.size + count * extent.size
 
 
-MAX_NODES = 20_000
-MAX_DEPTH = 64
-RDF_ITEM = "http://www.w3.org/1999/02/22-rdf-syntax-ns# li"
+MAX_TAGS = 40_000
+RDF_ITEM = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"
 
 
-@dataclasses.dataclass
-class Node:
-    """An element. Names are "namespace local"; a property is an attribute or a child element."""
-
-    name: str
-    attributes: dict[str, str]
-    children: list[Node] = dataclasses.field(default_factory=list)
-    texts: list[str] = dataclasses.field(default_factory=list)
-
-    def walk(self) -> Iterator[Node]:
-        """Itself and everything below, in the document's order."""
-        waiting = [self]
-        while waiting:
-            node = waiting.pop()
-            yield node
-            waiting.extend(reversed(node.children))
-
-    def get(self, name: str) -> str | None:
-        """A property of this very element."""
-        if name in self.attributes:
-            return self.attributes[name].strip()
-        found = next((child for child in self.children if child.name == name), None)
-        return None if found is None else "".join(found.texts).strip()
-
-    def find(self, name: str) -> str | None:
-        """A property of this element or the first one below that has it."""
-        return next((value for node in self.walk() if (value := node.get(name)) is not None), None)
-
-    def number(self, name: str) -> float | None:
-        """A property of this element or one below as a finite number; BrokenDepth where it is something else."""
-        text = self.find(name)
-        return None if text is None else to_number(text, name)
-
-    def numbers(self, name: str) -> list[float]:
-        """A list property, wherever it is; empty where it is missing or holds something else."""
-        lists = (node for node in self.walk() if node.name == name)
-        entries = [entry for found in lists for entry in found.walk() if entry.name == RDF_ITEM]
-        try:
-            return [float("".join(entry.texts)) for entry in entries]
-        except ValueError:
-            return []
+def parse_xmp(packet: bytes) -> Element:
+    """The root of a packet's elements; BrokenDepth where the text is no XML, or hostile."""
+    try:
+        text = packet.strip(b"\0").decode("utf-8-sig")
+        if "<!DOCTYPE" in text:
+            raise BrokenDepth("is described by XMP with a document type, which is not read")
+        if text.count("<") > MAX_TAGS:
+            raise BrokenDepth("is described by XMP that is too large")
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise BrokenDepth(f"is described by XMP that cannot be read ({reason_in_a_line(error)})") from error
 
 
-def to_number(text: str, name: str) -> float:
-    """A finite number; BrokenDepth with the property's name otherwise."""
+def get(node: Element, name: str) -> str | None:
+    """A property of this very element, an attribute or a child element, by "{namespace}name"."""
+    text = node.get(name)
+    text = node.findtext(name) if text is None else text
+    return None if text is None else text.strip()
+
+
+def find(tree: Element, name: str) -> str | None:
+    """A property of this element or the first one below that has it."""
+    return next((value for node in tree.iter() if (value := get(node, name)) is not None), None)
+
+
+def number(tree: Element, name: str) -> float | None:
+    """A property, see `find`, as a finite number; BrokenDepth where it is something else."""
+    if (text := find(tree, name)) is None:
+        return None
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition(' ')[2]}, which is no number")
+        raise BrokenDepth(f"has {text[:40]!r} for {name.rpartition('}')[2]}, which is no number")
     return value
-
-
-def parse_xmp(packet: bytes) -> Node:
-    """The tree under one root; BrokenDepth where the text is no XML, or hostile."""
-    root = Node("", {})
-    open_nodes, count = [root], 0
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        if count > MAX_NODES or len(open_nodes) > MAX_DEPTH:
-            raise BrokenDepth("is described by XMP that is too large or too deep")
-        node = Node(name, attributes)
-        open_nodes[-1].children.append(node)
-        open_nodes.append(node)
-
-    def refuse(*_: object) -> NoReturn:
-        raise BrokenDepth("is described by XMP with a document type, which is not read")
-
-    parser = expat.ParserCreate(namespace_separator=" ")
-    parser.buffer_text = True
-    parser.StartElementHandler = start
-    parser.EndElementHandler = lambda _: open_nodes.pop()
-    parser.CharacterDataHandler = lambda text: open_nodes[-1].texts.append(text)
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        parser.Parse(packet.strip(b"\0"), True)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: an encoding that is none
-        raise BrokenDepth(f"is described by XMP that cannot be read ({reason_in_a_line(error)})") from error
-    return root

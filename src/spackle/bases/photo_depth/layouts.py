@@ -3,50 +3,122 @@
 from __future__ import annotations
 
 import base64
-import binascii
-import mmap
-import os
-from itertools import accumulate
+import contextlib
+import dataclasses
+import io
+import math
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
-from spackle.bases.depth_map import ASPECT_TOLERANCE, DepthMap, Quantity, StrPath, is_depth
-from spackle.bases.photo_depth.coded import (
-    BY_ORIENTATION,
-    UPRIGHT,
-    Array,
-    BrokenDepth,
-    CodedDepth,
-    Lens,
-    Scale,
-    Turn,
-    decoding,
-    read_codes,
-)
+from spackle.bases.depth_map import ASPECT_TOLERANCE, DepthMap, Quantity, StrPath, grid_step, is_depth
 from spackle.bases.photo_depth.containers import (
-    Bytes,
-    MalformedBoxes,
-    Node,
+    BY_ORIENTATION,
+    RDF_ITEM,
+    BrokenDepth,
     end_of_picture,
     extended_xmp_of,
+    find,
     find_depth_item,
     further_pictures,
+    get,
+    number,
+    open_jpeg,
     parse_xmp,
-    to_number,
     xmp_of,
 )
 from spackle.camera import Camera
-from spackle.errors import InputError
+from spackle.errors import InputError, reading, reason_in_a_line
 from spackle.files import check_file
-from spackle.image import DEFAULT_FOCAL_MM, check_pixels, film_to_pixels, focal_from_exif, read_image
+from spackle.image import DEFAULT_FOCAL_MM, LENSES, check_pixels, film_to_pixels, focal_from_exif, read_image
+
+Array = NDArray[Any]
 
 _EXIF_IFD, _ORIENTATION = 0x8769, 0x0112
 PLAUSIBLE_M = (0.3, 30.0)  # a scene's middle, where the file does not say its unit
 USUAL_M = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """Codes to values, along a straight line."""
+
+    quantity: Quantity
+    first: float  # value of the lowest code: metres of depth, or 1/m of disparity
+    last: float  # value of the highest code
+    lowest: float = 0.0
+    highest: float | None = None  # None: the highest that the picture's format has
+
+    def decode(self, codes: Array, full: int) -> tuple[Array, float | None]:
+        """Depth of codes [H, W] in metres, not above zero where unknown, and the step between codes in use."""
+        highest = full if self.highest is None else self.highest
+        if not all(map(math.isfinite, (self.first, self.last, self.lowest, highest))) or highest <= self.lowest:
+            raise BrokenDepth("does not say what its values mean: a number of its range makes no sense")
+        if self.first == self.last or max(self.first, self.last) <= 0:
+            raise BrokenDepth(f"announces a {self.quantity} from {self.first:g} to {self.last:g}")
+        if int(codes.min()) == int(codes.max()):
+            raise BrokenDepth("has the same value everywhere")
+        slope = (self.last - self.first) / (highest - self.lowest)
+        grid = grid_step(codes)
+        step = None if grid is None else abs(slope) * grid
+        with np.errstate(all="ignore"):  # what comes out infinite is marked by the caller
+            values = self.first + slope * (codes.astype(np.float64) - self.lowest)
+            if self.quantity == "depth":
+                return values, step
+            # Not above zero is the horizon and what noise has pushed beyond it: far, but not unknown.
+            return 1 / np.maximum(values, abs(slope) / 2), step
+
+
+Lens = tuple[float, float, float, float, float, float]  # focal lengths, centre and size of a picture: x, y in pixels
+
+
+def _turned(values: Tensor, turn: str) -> Tensor:
+    """[H, W] to [H, W] or [W, H] by the steps of a turn, see `containers.BY_ORIENTATION`."""
+    for step in turn:
+        values = values.T if step == "t" else values.flip(1 if step == "x" else 0)
+    return values.contiguous()
+
+
+def _intrinsics(lens: Lens, width: int, height: int, turn: str) -> Tensor | None:
+    """[3, 3] for a width×height map, after its turn; None where the numbers cannot be this map's."""
+    focal, center, size = np.array(lens).reshape(3, 2)
+    if not np.isfinite(lens).all() or size.min() <= 0:
+        return None
+    shortest, longest = (side * size.max() for side in LENSES)
+    believable = shortest <= focal.min() and focal.max() <= longest and ((center > 0) & (center < size)).all()
+    if not believable or abs(size[0] * height / (size[1] * width) - 1) > ASPECT_TOLERANCE:
+        return None
+    scale = np.array([width, height]) / size
+    fx, fy, cx, cy = np.array([focal * scale, center * scale], np.float32).ravel().tolist()
+    for step in turn:
+        if step == "t":
+            fx, cx, fy, cy, width, height = fy, cy, fx, cx, height, width
+        cx = width - cx if step == "x" else cx
+        cy = height - cy if step == "y" else cy
+    return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclasses.dataclass(frozen=True)
+class CodedDepth:
+    """A depth map as it lies in the file."""
+
+    codes: Array  # [H, W] whole numbers
+    full: int  # the highest code of the picture's format
+    scale: Scale
+    source: str  # whose layout, of what quantity, how far to be trusted: for the report
+    lens: Lens | None = None
+    turned: str = ""  # what the decoder has done to the codes, but not to the lens
+    turn: str = ""  # what is still to do to get to the photo as Pillow opens it
+    along_ray: bool = False  # distances from the eye instead of z
+    unit_known: bool = True
 
 
 def load_photo_depth(path: StrPath) -> DepthMap | None:
@@ -59,34 +131,31 @@ def load_photo_depth(path: StrPath) -> DepthMap | None:
     Raises:
         InputError: a missing file, or a photo whose depth map is broken or of another crop.
     """
-    if check_file(path, "photo") < 12:
-        return None
+    check_file(path, "photo")
     try:
-        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            if data[:3] == b"\xff\xd8\xff":
-                coded = find_apple(data) or find_android(data)
-            else:
-                coded = find_in_heif(data, path) if data[4:8] == b"ftyp" else None
-        return None if coded is None else _depth_map(coded, path)
+        with reading(path, "cannot be read: {reason}", OSError), open(path, "rb") as file:
+            start = file.read(8)
+            jpeg = start.startswith(b"\xff\xd8\xff")
+            data = start + file.read() if jpeg or start.endswith(b"ftyp") else b""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what Pillow thinks of a stranger's bytes is not worth a line
+            coded = _find_in_jpeg(data) if jpeg else _find_in_heif(data) if data else None
+            return None if coded is None else _depth_map(coded, path)
     except BrokenDepth as error:
-        raise InputError(
-            f"{path}: the depth map in the photo {error}: give another one with --depth FILE, or use --base lite"
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
+        advice = "give another one with --depth FILE, or use --base lite"
+        raise InputError(f"{path}: the depth map in the photo {error}: {advice}") from error
 
 
 def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
     photo_width, photo_height, photo_turn, focal = read_image(path, _photo_header)
-    turn = coded.turn.then(photo_turn)
+    turn = coded.turn + photo_turn
     stored, quantum = coded.scale.decode(coded.codes, coded.full)
-    depth = turn.grid(torch.from_numpy(stored))
+    depth = _turned(torch.from_numpy(stored), turn)
     height, width = depth.shape
     if abs(width * photo_height / (height * photo_width) - 1) > ASPECT_TOLERANCE:
         raise BrokenDepth(f"has {width}×{height} pixels but the photo {photo_width}×{photo_height}, another crop")
-    before = coded.codes.shape[:: 1 if coded.turned.transpose else -1]
-    K = None if coded.lens is None else coded.lens.matrix(*before)
-    K = None if K is None else coded.turned.then(turn).matrix(K, *before)
+    columns, rows = coded.codes.shape[:: 1 if coded.turned.count("t") % 2 else -1]  # before the decoder's turn
+    K = None if coded.lens is None else _intrinsics(coded.lens, columns, rows, coded.turned + turn)
     if coded.along_ray:
         own = Camera.from_focal(focal, photo_width, photo_height).resized(width, height)
         camera = own if K is None else Camera(K, torch.eye(4), width, height)
@@ -106,128 +175,140 @@ def _depth_map(coded: CodedDepth, path: StrPath) -> DepthMap:
     return DepthMap(metres.where(valid, 0.0), valid, K, quantum, coded.scale.quantity, Path(path), f"{note})")
 
 
-def _photo_header(image: Image.Image) -> tuple[int, int, Turn, float]:
+def _photo_header(image: Image.Image) -> tuple[int, int, str, float]:
     """Upright width and height of the photo, the turn of its stored pixels, and its focal length in pixels."""
-    try:
+    turn, tags = "", {}
+    with contextlib.suppress(Exception):  # unreadable EXIF says nothing about the orientation
         exif = image.getexif()
-        orientation, tags = exif.get(_ORIENTATION, 1), {**exif, **exif.get_ifd(_EXIF_IFD)}
-        turn = BY_ORIENTATION.get(orientation, UPRIGHT)
-    except Exception:  # unreadable EXIF says nothing about the orientation
-        turn, tags = UPRIGHT, {}
-    width, height = image.size[::-1] if turn.transpose else image.size
+        tags = {**exif, **exif.get_ifd(_EXIF_IFD)}
+        turn = BY_ORIENTATION.get(exif.get(_ORIENTATION, 1), "")
+    width, height = image.size[:: -1 if "t" in turn else 1]
     focal = focal_from_exif(tags, width, height) or film_to_pixels(DEFAULT_FOCAL_MM, width, height)
     return width, height, turn, focal
 
 
-PIXELS, DEPTH = "http://ns.apple.com/pixeldatainfo/1.0/ ", "http://ns.apple.com/depthData/1.0/ "
+@contextlib.contextmanager
+def _decoding() -> Iterator[None]:
+    """BrokenDepth for whatever a decoder raises over a stranger's bytes."""
+    try:
+        yield
+    except BrokenDepth:
+        raise
+    except Exception as error:
+        raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
 
-# Core Video's formats of depth maps, half and full floats; any other is a matte, a gain map or a mask.
-_FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep": "depth", "fdep": "depth"}
+
+def _read_codes(picture: bytes) -> tuple[Array, int]:
+    """[H, W] values of a JPEG or PNG, and the highest value that its format has."""
+    with _decoding(), Image.open(io.BytesIO(picture), formats=("JPEG", "PNG")) as image:
+        check_pixels(*image.size, len(picture), "it")
+        if image.mode.startswith("I"):
+            return np.asarray(image).astype(np.uint16), 65535
+        return np.asarray(image.convert("L")), 255
 
 
-Description = tuple[Scale | None, Lens | None, str]  # the scale if XMP gives the range, the lens, the source
-
-
-def find_apple(data: Bytes) -> CodedDepth | None:
-    """The depth map among the further pictures of a JPEG, told from the others by its XMP."""
-    for begin, end in further_pictures(data):
-        if (described := describe(xmp_of(data, begin))) is None:
+def _find_in_jpeg(data: bytes) -> CodedDepth | None:
+    """Apple's depth map among the further pictures, told from the others by its XMP, or else Android's."""
+    if (image := open_jpeg(data)) is None:  # whoever decodes the photo will say what is wrong
+        return None
+    for begin, end in further_pictures(image):
+        if (described := describe(xmp_of(open_jpeg(data[begin:end])))) is None:
             continue
         scale, lens, source = described
         if scale is None:
             raise BrokenDepth("does not say its range: FloatMinValue or FloatMaxValue is missing")
         if end > len(data):
             raise BrokenDepth("is cut off: the file ends before it does")
-        codes, full = read_codes(data[begin:end])
-        return CodedDepth(codes, full, scale, source, lens)
-    return None
+        return CodedDepth(*_read_codes(data[begin:end]), scale, source, lens)
+    return _find_android(data, xmp_of(image), *extended_xmp_of(image))
 
 
-def describe(packet: bytes) -> Description | None:
-    """What an XMP packet says of a depth map; None where it is about something else."""
-    if PIXELS.encode().strip() not in packet:
+PIXELS, DEPTH = "{http://ns.apple.com/pixeldatainfo/1.0/}", "{http://ns.apple.com/depthData/1.0/}"
+# Core Video's formats of depth maps, half and full floats; any other is a matte, a gain map or a mask.
+_FORMATS: dict[str, Quantity] = {"hdis": "disparity", "fdis": "disparity", "hdep": "depth", "fdep": "depth"}
+
+
+def _is_about(packet: bytes, space: str) -> bool:
+    return space.strip("{}").encode() in packet
+
+
+def describe(packet: bytes) -> tuple[Scale | None, Lens | None, str] | None:
+    """The scale (None without a range), the lens and the source that an XMP packet says; None of something else."""
+    if not _is_about(packet, PIXELS):
         return None
     tree = parse_xmp(packet)
     if (quantity := _quantity(tree)) is None:
         return None
-    first, last = (tree.number(f"{PIXELS}Float{end}Value") for end in ("Min", "Max"))
-    lowest, highest = (tree.number(f"{PIXELS}Int{end}Value") for end in ("Min", "Max"))
+    first, last, lowest, highest = (
+        number(tree, f"{PIXELS}{name}Value") for name in ("FloatMin", "FloatMax", "IntMin", "IntMax")
+    )
     scale = None if first is None or last is None else Scale(quantity, first, last, lowest or 0.0, highest)
-    accuracy = tree.find(f"{DEPTH}Accuracy")
+    accuracy = find(tree, f"{DEPTH}Accuracy")
     source = f"Apple {quantity}, {accuracy if accuracy in ('absolute', 'relative') else 'of unknown accuracy'}"
     return scale, _apple_lens(tree), source
 
 
-def _quantity(tree: Node) -> Quantity | None:
-    native, kind = tree.find(f"{PIXELS}NativeFormat"), tree.find(f"{PIXELS}AuxiliaryImageType")
+def _quantity(tree: Element) -> Quantity | None:
+    native, kind = find(tree, f"{PIXELS}NativeFormat"), find(tree, f"{PIXELS}AuxiliaryImageType")
     if native is not None:
         if native.isascii() and native.isdigit() and len(native) <= 10:  # four characters, written as the number
             native = int(native).to_bytes(5, "big")[1:].decode("latin-1")
         return _FORMATS.get(native)
-    if tree.find(f"{PIXELS}AuxiliaryImageSubType") is not None:  # the mattes: they too are of type "depth"
+    if find(tree, f"{PIXELS}AuxiliaryImageSubType") is not None:  # the mattes: they too are of type "depth"
         return None
     return "disparity" if kind == "disparity" else "depth" if kind == "depth" else None
 
 
-def _apple_lens(tree: Node) -> Lens | None:
-    """The intrinsics, which are listed column by column."""
-    matrix = tree.numbers(f"{DEPTH}IntrinsicMatrix")
-    try:
-        size = [tree.number(f"{DEPTH}IntrinsicMatrixReference{side}") for side in ("Width", "Height")]
-    except BrokenDepth:  # the map can do without
-        return None
-    if len(matrix) != 9 or size[0] is None or size[1] is None:
-        return None
-    fx, _, _, _, fy, _, cx, cy, _ = matrix
-    return Lens((fx, fy), (cx, cy), (size[0], size[1]))
+def _apple_lens(tree: Element) -> Lens | None:
+    """The intrinsics, which are listed column by column; without them the map can do."""
+    entries = [entry.text or "" for matrix in tree.iter(f"{DEPTH}IntrinsicMatrix") for entry in matrix.iter(RDF_ITEM)]
+    size = [find(tree, f"{DEPTH}IntrinsicMatrixReference{side}") or "" for side in ("Width", "Height")]
+    with contextlib.suppress(ValueError):
+        fx, _, _, _, fy, _, cx, cy, _ = map(float, entries)
+        return fx, fy, cx, cy, float(size[0]), float(size[1])
+    return None
 
 
-GDEPTH = "http://ns.google.com/photos/1.0/depthmap/ "
-DYNAMIC = "http://ns.google.com/photos/dd/1.0/{}/ "
-MAP, MODEL, ITEM = (DYNAMIC.format(name) for name in ("depthmap", "imagingmodel", "item"))
-
+GDEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
+MAP, MODEL, ITEM = (f"{{http://ns.google.com/photos/dd/1.0/{name}/}}" for name in ("depthmap", "imagingmodel", "item"))
 _UNITS_M = {"m": 1.0, "meter": 1.0, "meters": 1.0, "mm": 0.001, "millimeters": 0.001}
 _PICTURE_STARTS = (b"\xff\xd8\xff", b"\x89PNG")
 
 
-def find_android(data: Bytes) -> CodedDepth | None:
-    """The depth map that a JPEG's XMP holds or points to."""
-    main = xmp_of(data)
-    extended, complete = extended_xmp_of(data, main)
-    if not any(name.encode().strip() in packet for name in (GDEPTH, MAP) for packet in (main, extended)):
+def _find_android(data: bytes, main: bytes, extended: bytes, complete: bool) -> CodedDepth | None:
+    """The depth map that a JPEG's XMP, the main packet and its `complete` extension, holds or points to."""
+    if not any(_is_about(packet, space) for space in (GDEPTH, MAP) for packet in (main, extended)):
         return None
     if not complete:
         raise BrokenDepth("is cut off: a part of the photo's extended XMP is missing")
     tree = parse_xmp(main)
     if extended:
-        tree.children.append(parse_xmp(extended))
-    for node in tree.walk():
-        uri = node.get(f"{MAP}DepthURI")
-        if uri is not None and (node.get(f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
+        tree.append(parse_xmp(extended))
+    for node in tree.iter():
+        uri = get(node, f"{MAP}DepthURI")
+        if uri is not None and (get(node, f"{MAP}ItemSemantic") or "Depth").lower() == "depth":
             return _coded(node, MAP, _item(data, tree, uri), "Dynamic Depth", _android_lens(tree))
-    text = tree.find(f"{GDEPTH}Data")
-    # Editors that drop the extended XMP leave the rest behind: a photo whose depth is gone has none.
-    return None if text is None else _coded(tree, GDEPTH, _decoded(text), "GDepth", None)
+    text = find(tree, f"{GDEPTH}Data")
+    if text is None:  # editors that drop the extended XMP leave the rest behind: a photo whose depth is gone has none
+        return None
+    squeezed = "".join(text.split())
+    try:
+        picture = base64.b64decode(squeezed + "=" * (-len(squeezed) % 4), validate=True)
+    except ValueError as error:
+        raise BrokenDepth(f"is not readable as base64 ({error})") from error
+    return _coded(tree, GDEPTH, picture, "GDepth", None)
 
 
-def _coded(node: Node, space: str, picture: bytes, layout: str, lens: Lens | None) -> CodedDepth:
-    near, far = node.number(f"{space}Near"), node.number(f"{space}Far")
+def _coded(node: Element, space: str, picture: bytes, layout: str, lens: Lens | None) -> CodedDepth:
+    """A picture whose codes run from near to far: evenly, or evenly in the inverse."""
+    near, far = number(node, f"{space}Near"), number(node, f"{space}Far")
     if near is None or far is None:
         raise BrokenDepth("does not say its range: Near or Far is missing")
-    unit = (node.find(f"{space}Units") or "").lower()
+    unit, style, measure = ((find(node, f"{space}{name}") or "").lower() for name in ("Units", "Format", "MeasureType"))
     # A Pixel says diopters of what grows from near to far, and so is none: the order counts, not the unit.
-    known = unit in _UNITS_M or (unit == "diopters" and near > far)
-    metre = _UNITS_M.get(unit, 1.0) if known else 1.0
-    style = (node.find(f"{space}Format") or "").lower()
-    scale = _scale(style, near * metre, far * metre, diopters=known and unit == "diopters")
-    along_ray = (node.find(f"{space}MeasureType") or "").lower() == "opticray"
-    source = f"{layout}, in {unit}" if known else f"{layout}, unit unknown"
-    codes, full = read_codes(picture)
-    return CodedDepth(codes, full, scale, source, lens, along_ray=along_ray, unit_known=known)
-
-
-def _scale(style: str, near: float, far: float, *, diopters: bool) -> Scale:
-    """Codes run from near to far: evenly, or evenly in the inverse."""
+    diopters = unit == "diopters" and near > far
+    known = unit in _UNITS_M or diopters
+    near, far = (value * _UNITS_M.get(unit, 1.0) for value in (near, far))
     if style not in ("rangeinverse", "rangelinear"):
         raise BrokenDepth(f"has the format {style[:40]!r}: RangeInverse and RangeLinear are read")
     inverse = style == "rangeinverse"
@@ -235,100 +316,78 @@ def _scale(style: str, near: float, far: float, *, diopters: bool) -> Scale:
         raise BrokenDepth(f"announces near {near:g} and far {far:g}, between which nothing can lie")
     if inverse:
         near, far = 1 / near, 1 / far
-    return Scale("disparity" if inverse != diopters else "depth", near, far)
+    scale = Scale("disparity" if inverse != diopters else "depth", near, far)
+    source = f"{layout}, in {unit}" if known else f"{layout}, unit unknown"
+    codes, full = _read_codes(picture)
+    return CodedDepth(codes, full, scale, source, lens, along_ray=measure == "opticray", unit_known=known)
 
 
-def _decoded(text: str) -> bytes:
-    squeezed = "".join(text.split())
-    try:
-        return base64.b64decode(squeezed + "=" * (-len(squeezed) % 4), validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise BrokenDepth(f"is not readable as base64 ({error})") from error
-
-
-def _item(data: Bytes, tree: Node, uri: str) -> bytes:
+def _item(data: bytes, tree: Element, uri: str) -> bytes:
     """The bytes of a directory entry; they are appended to the primary picture in the directory's order."""
-    entries = [node for node in tree.walk() if (node.get(f"{ITEM}Mime") or node.get(f"{ITEM}Length")) is not None]
-    index = next((i for i, node in enumerate(entries) if node.get(f"{ITEM}DataURI") == uri), None)
+    entries = [node for node in tree.iter() if (get(node, f"{ITEM}Mime") or get(node, f"{ITEM}Length")) is not None]
+    index = next((i for i, node in enumerate(entries) if get(node, f"{ITEM}DataURI") == uri), None)
     if index is None:
         raise BrokenDepth("is named by its XMP, but missing from the photo's directory of items")
     lengths, paddings = (
-        [int(to_number(node.get(f"{ITEM}{name}") or "0", f"{ITEM}{name}")) for node in entries]
-        for name in ("Length", "Padding")
+        [int(number(node, f"{ITEM}{name}") or 0) for node in entries] for name in ("Length", "Padding")
     )
     if min(lengths) < 0 or min(paddings) < 0:
         raise BrokenDepth("has a negative length in the photo's directory of items")
     length = lengths[index]
-    for begin in _places(data, lengths, paddings, index):
+    places = [len(data) - sum(lengths[index:])]  # counted from the end
+    if (end := end_of_picture(data)) is not None:
+        # Writers disagree on whether lengths include paddings, and on the primary's.
+        behind = [0, *lengths[1:]]
+        padded = [length + padding for length, padding in zip(behind, paddings, strict=True)]
+        places = [end + sum(sizes[:index]) for sizes in (padded, behind)] + places
+    for begin in places:
         end = begin + length if length else len(data)  # 0: to the end of the file
-        if begin > 0 and end <= len(data) and data[begin : begin + 4].startswith(_PICTURE_STARTS):
+        if begin > 0 and end <= len(data) and data.startswith(_PICTURE_STARTS, begin):
             return data[begin:end]
     raise BrokenDepth("is cut off, or not where the photo's directory of items has it")
 
 
-def _places(data: Bytes, lengths: list[int], paddings: list[int], index: int) -> list[int]:
-    """Where the item may begin: writers disagree on whether lengths include paddings, and on the primary's."""
-    places = [len(data) - sum(lengths[index:])]  # counted from the end
-    if (end := end_of_picture(data)) is not None:
-        behind = [0, *lengths[1:]]
-        padded = [length + padding for length, padding in zip(behind, paddings, strict=True)]
-        places = [end + list(accumulate(sizes, initial=0))[index] for sizes in (padded, behind)] + places
-    return places
-
-
-def _android_lens(tree: Node) -> Lens | None:
+def _android_lens(tree: Element) -> Lens | None:
     """The one imaging model, in pixels; its centre may be in shares of the picture, as the specification has it."""
-    models = [node for node in tree.walk() if node.get(f"{MODEL}FocalLengthX") is not None]
-    if len(models) != 1:
-        return None
+    models = [node for node in tree.iter() if get(node, f"{MODEL}FocalLengthX") is not None]
     names = ("FocalLengthX", "FocalLengthY", "PrincipalPointX", "PrincipalPointY", "ImageWidth", "ImageHeight")
     try:
-        found = [models[0].number(f"{MODEL}{name}") for name in names]
-    except BrokenDepth:  # the map can do without
+        fx, fy, cx, cy, width, height = (number(models[0], f"{MODEL}{name}") for name in names)
+    except (IndexError, BrokenDepth):  # the map can do without
         return None
-    fx, fy, cx, cy, width, height = found
-    if fx is None or fy is None or width is None or height is None:
+    if len(models) > 1 or fx is None or fy is None or width is None or height is None:
         return None
     cx, cy = 0.5 if cx is None else cx, 0.5 if cy is None else cy
-    center = (cx * width, cy * height) if max(cx, cy) <= 1 else (cx, cy)
-    return Lens((fx, fy), center, (width, height))
+    if max(cx, cy) <= 1:
+        cx, cy = cx * width, cy * height
+    return fx, fy, cx, cy, width, height
 
 
 FULL_CODES = {"L": 255, "I;10": 1023, "I;12": 4095}
 ASSUMED = Scale("disparity", 0.1, 1.0)  # 10 m to 1 m: a portrait's usual range, where a file says none
 
 
-def find_in_heif(data: Bytes, path: str | os.PathLike[str]) -> CodedDepth | None:
+def _find_in_heif(data: bytes) -> CodedDepth | None:
     """The auxiliary depth image of the primary picture, in any of the representations of HEVC's depth information."""
-    try:
-        item = find_depth_item(data)
-    except MalformedBoxes:  # whoever decodes the photo will say what is wrong
-        return None
-    if item is None:
-        return None
-    xmp, own_turn, turn = item
-    codes, full, stated = _decode(path)
-    scale, lens, source = describe(xmp) or (None, None, "")
-    if scale is None:  # Apple's words count more than HEVC's
-        scale, source = _meaning(stated)
-    return CodedDepth(codes, full, scale, source, lens, own_turn, turn)
-
-
-def _decode(path: str | os.PathLike[str]) -> tuple[Array, int, dict[str, Any]]:
-    """Codes [H, W] with the item's own rotation applied, the highest code, and HEVC's depth information."""
     import pillow_heif
 
-    with decoding():
-        images = pillow_heif.open_heif(os.fspath(path), hdr_to_16bit=False).info["depth_images"]
+    if (item := find_depth_item(data)) is None:
+        return None
+    xmp, turned, turn = item
+    with _decoding():
+        images = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"]
         if not images:
             raise BrokenDepth("is announced, but missing")
         width, height = images[0].size
-        check_pixels(width, height, os.path.getsize(path), "it")
-        codes = np.array(images[0])
-        return codes, FULL_CODES[images[0].mode], images[0].info.get("metadata") or {}
+        check_pixels(width, height, len(data), "it")
+        codes, full = np.array(images[0]), FULL_CODES[images[0].mode]  # its own rotation is applied
+    scale, lens, source = describe(xmp) or (None, None, "")
+    if scale is None:  # Apple's words count more than HEVC's
+        scale, source = _hevc_scale(images[0].info.get("metadata") or {})
+    return CodedDepth(codes, full, scale, source, lens, turned, turn)
 
 
-def _meaning(stated: dict[str, Any]) -> tuple[Scale, str]:
+def _hevc_scale(stated: dict[str, Any]) -> tuple[Scale, str]:
     """HEVC's range and its source, else a portrait's usual range."""
     kind = stated.get("representation_type")
     first, last = (stated.get(name) for name in (("d_min", "d_max") if kind == 1 else ("z_near", "z_far")))
