@@ -30,7 +30,7 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.device import Precision
 from spackle.errors import InputError
-from spackle.evaluation.timing import TOTAL, Task, measure
+from spackle.evaluation.bench import TOTAL, Task, measure
 from spackle.files import write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import Photo

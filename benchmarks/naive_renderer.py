@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.evaluation.timing import Lap
+from spackle.evaluation.bench import Lap
 from spackle.gaussians import Gaussians
 from spackle.render.cpu import BLEND_GRAIN, PROJECT_GRAIN
 from spackle.render.project import KernelCamera, covariance

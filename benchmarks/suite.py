@@ -35,8 +35,9 @@ from spackle.bases.sharp.base import to_metric, to_processor
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, trajectory
 from spackle.errors import InputError, check_name
+from spackle.evaluation.bench import CPU, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
 from spackle.evaluation.datasets.stereo import load_motorcycle
-from spackle.evaluation.timing import CPU, EXTRA, MS, TOTAL, Lap, Task, Values, complete_in_laps, measure
+from spackle.evaluation.rows import EXTRA
 from spackle.files import write_json, write_whole
 from spackle.folders import make_folder
 from spackle.formats import save_ply, save_video

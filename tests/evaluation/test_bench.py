@@ -23,13 +23,12 @@ from spackle.device import MemoryShort
 from spackle.errors import InputError
 from spackle.evaluation import bench
 from spackle.evaluation.case import Points
-from spackle.evaluation.efficiency import efficiency_tables
 from spackle.evaluation.folder import KINDS, load_run, open_folder
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import PAPER, Row
+from spackle.evaluation.rows import BASE_PATH, EXTRA, PAPER, STAGES, Row
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
-from spackle.evaluation.timing import BASE_PATH, EXTRA, STAGES
+from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.scene_fill import FillContext, fill_view
 
@@ -87,7 +86,7 @@ def test_times_are_medians_of_runs_that_add_up() -> None:
 
 
 def test_the_layouts_are_the_papers() -> None:
-    overhead, expanded, stages = efficiency_tables([results()])
+    overhead, expanded, stages = make_tables([results()])
     assert list(dict.fromkeys(group for group, _ in overhead.heads)) == [
         "",
         *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)),

@@ -477,7 +477,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--limit", "0"), "--limit must be between"),
         (("--direct-ft", "x.safetensors"), "no method takes it"),
         (("--residual", "none"), "--residual none"),
-        (("-c", "x.pt"), "no checkpoint"),
+        (("-c", "x.pt"), "-c x.pt: the rgbd base has no use for it"),
         (("--features", "gone.npz", "--protocol", "near-view"), "--features gone.npz"),
         (("--base", "sharp", "-c", __file__, "--methods", "direct-ft"), "give --direct-ft FILE"),
         (("--methods", "inpaint2d", "--metrics", "none"), "pip install 'spackle-nvs[opencv]'"),

@@ -17,7 +17,7 @@ from suite_scenes import find_view, holed_scene, photo_scene
 
 from spackle.bases.sharp import SharpBase
 from spackle.errors import InputError
-from spackle.evaluation.timing import complete_in_laps
+from spackle.evaluation.bench import complete_in_laps
 from spackle.image import Photo
 from spackle.render import CpuRenderer
 from spackle.residual import ResidualNet, hole_area_ratio

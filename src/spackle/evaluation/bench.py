@@ -5,35 +5,48 @@ from __future__ import annotations
 import dataclasses
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from spackle.bases.protocol import BasePrediction
 from spackle.bases.sharp.base import unused_shapes
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
+from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, Viewpoint, load_case
-from spackle.evaluation.efficiency import SIDE, efficiency_tables
 from spackle.evaluation.folder import ROWS, measure_images, open_folder, write_rows
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import NOTE, Row, Run
+from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row, Run
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
-from spackle.evaluation.tables import write_tables
-from spackle.evaluation.timing import BASE_PATH, EXTRA, MS, STAGES, TOTAL, Lap, complete_in_laps, measure
+from spackle.evaluation.tables import make_tables, write_tables
 from spackle.folders import results_folder
+from spackle.gaussians import Gaussians
 from spackle.machine import hardware, load_average, versions
 from spackle.progress import Reporter
+from spackle.render import Renderer
+from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet
-from spackle.scene_fill import FillContext
+from spackle.scene_fill import FillContext, fill_view
 
 FILES = ("bench.md", "bench.tex")
 SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
 MAX_RUNS = 1000
+TOTAL = "total"
+MS = 1000.0
+CPU = torch.device("cpu")
+SIDE = "right"  # the end of the swipe where the second camera of Middlebury's and Booster's pairs stands
+
+Lap = Callable[[str], None]
+Task = Callable[[Lap], Any]
+Values = npt.NDArray[np.float64]  # one a run
+Times = dict[tuple[str, str], Values]  # (task, stage) → milliseconds
 
 
 def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Path, reporter: Reporter) -> str:
@@ -72,7 +85,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         if rows is None:
             return "stopped"
         run = Run(config, rows, about)
-        write_tables(efficiency_tables([run]), output, FILES)
+        write_tables(make_tables([run]), output, FILES)
         write_rows(rows, output / ROWS)
     overheads = {s: statistics.median(run.numbers("overhead", s)) for s in run.settings}
     listed = ", ".join(f"{setting}: {100 * overhead:.2f} %" for setting, overhead in overheads.items())
@@ -165,3 +178,68 @@ def count_parameters() -> dict[str, float]:
         used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
     base = used + sum(map(math.prod, unused_shapes(FULL).values()))
     return {"base": base, "base_used": used, "residual": residual, "share": residual / base}
+
+
+# --- the clock
+
+
+def measure(runs: int, tasks: Mapping[str, Task], device: torch.device = CPU, *, warm: bool = False) -> Times:
+    """Milliseconds of each task (its stage "total") and of its stages, each of which it ends by calling its argument.
+
+    The tasks take turns, so a busy machine slows all of them alike. Laps of one name within a run add up. A stage ends
+    when the device has done its work. One run more, which compiles and warms up, comes first, unless they are `warm`.
+    """
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return MS * time.perf_counter()
+
+    times: dict[tuple[str, str], list[float]] = {}
+    for run in range(1 if warm else 0, runs + 1):
+        for name, task in tasks.items():
+            laps: dict[str, float] = {}
+            start = last = now()
+
+            def lap(stage: str, laps: dict[str, float] = laps) -> None:
+                nonlocal last
+                end = now()
+                laps[stage] = laps.get(stage, 0.0) + end - last
+                last = end
+
+            task(lap)
+            laps[TOTAL] = now() - start
+            for stage, milliseconds in laps.items() if run else ():
+                times.setdefault((name, stage), []).append(milliseconds)
+    return {key: np.array(values) for key, values in times.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class _LappedRenderer:
+    """A `Renderer` whose renders are laps, told apart from the completion around them."""
+
+    renderer: Renderer
+    lap: Lap
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.renderer, name)
+
+    def render(self, gaussians: Gaussians | Sequence[Gaussians], camera: Camera, **options: Any) -> Rendering:
+        self.lap("completion")
+        drawn = self.renderer.render(gaussians, camera, **options)
+        self.lap("rerender")
+        return drawn
+
+
+@torch.no_grad()
+def complete_in_laps(context: FillContext, camera: Camera, lap: Lap) -> Gaussians:
+    """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
+    context = context.placed
+    before = context.renderer.render(context.base, camera)
+    lap("view")
+    guard = context.photo_guard()
+    lap("photo")
+    inside = dataclasses.replace(context, renderer=_LappedRenderer(context.renderer, lap))
+    aux = fill_view(inside, camera, [guard], before).aux
+    lap("completion")
+    return aux

@@ -1,4 +1,4 @@
-"""The metrics of a picture: ours, and published ones by way of pyiqa.
+"""The metrics of a picture (metrics.json): ours, and published ones by way of pyiqa.
 
 pyiqa is optional (pip install 'spackle-nvs[eval]') and not for commercial use.
 """
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import reason_in_a_line
+from spackle.evaluation.rows import load_data
 from spackle.training.losses import dilate, hole_psnr
 
 OWN = "own"
@@ -46,58 +47,12 @@ class Figure:
         return f"{value:.{self.digits}f}"
 
 
-METRICS: dict[str, Figure] = {
-    "clipiqa": Figure(
-        "CLIPIQA ↑",
-        "CLIP RN50 without positional embedding at the picture's own size; mean over the prompt pairs Good/bad image, "
-        "Sharp/blurry image, sharp/blurry edges, High/low resolution image, Noise-free/noisy image",
-        lower=False,
-        options={"model_type": "clipiqa", "backbone": "RN50", "pos_embedding": False},
-    ),
-    "niqe": Figure(
-        "NIQE ↓",
-        "on the float render, of which pyiqa rounds the luma (YIQ) to 0..255; blocks of 96×96, "
-        "the pristine model of the authors' release",
-        lower=True,
-        options={"test_y_channel": True},
-    ),
-    "musiq": Figure(
-        "MUSIQ ↑",
-        "trained on KonIQ-10k; scales 224, 384 and the picture's own",
-        lower=False,
-        options={"pretrained": "koniq10k"},
-    ),
-    "psnr": Figure("PSNR ↑", "in dB over sRGB pixels and channels in 0..1", lower=False, digits=2, truth=True),
-    "ssim": Figure(
-        "SSIM ↑",
-        "Gaussian window of 11 pixels, σ 1.5, K 0.01 and 0.03, mean of the sRGB channels",
-        lower=False,
-        truth=True,
-    ),
-    "distance": Figure(
-        "distance ↓",
-        "masked perceptual distance in the hole: SqueezeNet 1.0 at conv1, fire4, fire8 and fire9, unit feature "
-        "vectors, 0 to 8 (spackle.training.losses.hole_distance); not LPIPS",
-        lower=True,
-        truth=True,
-    ),
-    "dists": Figure(
-        "DISTS ↓", "VGG16 with the authors' weights, at the picture's own size", lower=True, truth=True, options={}
-    ),
-    "lpips": Figure(
-        "LPIPS ↓",
-        "AlexNet, version 0.1, at the picture's own size (the paper does not say which network it took)",
-        lower=True,
-        truth=True,
-        options={"net": "alex", "version": "0.1"},
-    ),
-}
+METRICS = {name: Figure(**facts) for name, facts in load_data("metrics.json").items()}
 DEFINITIONS = {name: figure for name, figure in METRICS.items() if figure.options is not None}  # pyiqa's
 DEFAULT_METRICS = {
-    "large-view": ("clipiqa", "niqe", "musiq"),
-    "near-view": ("psnr", "ssim", "distance", "dists", "lpips"),
+    "large-view": [name for name, figure in METRICS.items() if not figure.truth],
+    "near-view": [name for name, figure in METRICS.items() if figure.truth],
 }
-SPLIT = ("psnr", "ssim")  # measured over the image, in the base's hole and outside of it
 
 
 def definitions(names: tuple[str, ...]) -> list[str]:

@@ -22,8 +22,8 @@ from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import TRUTH
 from spackle.evaluation.rows import IMAGES, NEAR, REMARK, Run, mean
 from spackle.evaluation.sheets import Ranking, column_title, columns, rank
-from spackle.evaluation.table import EMPTY, Table, count_text, write_table
-from spackle.evaluation.tables import make_tables, method_name, ratio_text
+from spackle.evaluation.table import EMPTY, TEXTS, Table, write_table
+from spackle.evaluation.tables import make_tables, method_name
 from spackle.files import atomic_path
 from spackle.formats.png import thumbnail
 
@@ -46,8 +46,8 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "psnr_hole": ("PSNR in the hole ↑", "{:.2f}".format),
     "ssim_hole": ("SSIM in the hole ↑", "{:.4f}".format),
     **{name: (figure.title, figure.text) for name, figure in METRICS.items() if name != "ssim"},
-    "har": ("HAR ↓", ratio_text),
-    "aux": ("added GS", count_text),
+    "har": ("HAR ↓", TEXTS["ratio"]),
+    "aux": ("added GS", TEXTS["count"]),
 }
 Source = tuple[Run, Path]  # an evaluation, and the folder with its pictures
 
@@ -120,7 +120,7 @@ def findings(run: Run) -> list[str]:
             before, after, share, added = (value or 0.0 for value in found)
             lines.append(
                 f"At disparity {setting} the base alone leaves {_percent(before)} of the pixels open, "
-                f"{METHODS[method][0]} {_percent(after)}, with {count_text(added)} added Gaussians a view "
+                f"{METHODS[method][0]} {_percent(after)}, with {TEXTS['count'](added)} added Gaussians a view "
                 f"({_percent(share)} of the base's)."
             )
     return lines

@@ -13,8 +13,26 @@ from typing import Any, NamedTuple
 
 NEAR = "near"  # the setting of views from where a second photo was taken
 PROBLEM, REMARK, NOTE = "problem", "remark", "note."  # metrics whose values are text; a note's name follows
+# Stages of a view in the order of the work, as the tables call them.
+STAGES = {
+    "base": "photo to base Gaussians",
+    "view": "render of the view",
+    "photo": "render at the photo's camera",
+    "completion": "mask, seeds, network, placing",
+    "rerender": "re-render of touched tiles, after each pass",
+}
+BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
+EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
 Value = float | str | None
-PAPER: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath("paper.json").read_text("utf-8"))
+
+
+def load_data(name: str) -> dict[str, Any]:
+    """A JSON file that lies beside this one."""
+    found: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath(name).read_text("utf-8"))
+    return found
+
+
+PAPER = load_data("paper.json")
 IMAGES: dict[str, int] = PAPER["images"]  # of each dataset, in the order of the tables
 SETTINGS: list[str] = PAPER["settings"]  # S1, S2, S3
 DISPARITIES = tuple(map(float, SETTINGS))

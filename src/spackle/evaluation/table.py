@@ -35,14 +35,23 @@ class Table:
             raise ValueError(f"table {self.label}: rows of different lengths: {sorted(widths)}")
 
 
-def count_text(value: float) -> str:
-    """With commas between thousands."""
-    return f"{value:,.0f}"
+def _ratio(value: float) -> str:
+    """Four digits, as in the paper; what would round to nothing keeps its first two."""
+    return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
 
 
-def percent_text(share: float) -> str:
-    """Without the sign."""
-    return f"{100 * share:.2f}"
+# Small overheads keep two digits: the question is whether they are below one percent.
+TEXTS: dict[str, Text] = {
+    "count": "{:,.0f}".format,
+    "hundredths": "{:,.2f}".format,
+    "tenths": "{:,.1f}".format,
+    "ratio": _ratio,
+    "share": lambda value: f"{100 * value:.2f}",
+    "percent": lambda value: f"{100 * value:.2f}%",
+    "tenths %": lambda value: f"{100 * value:.1f}%",
+    "overhead": lambda value: f"{100 * value:.2f}%" if value < 0.1 else f"{100 * value:.1f}%",
+    "rate": lambda value: f"{value:.3f}" if value >= 0.1 else f"{value:.3g}",
+}
 
 
 def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool) -> list[str]:

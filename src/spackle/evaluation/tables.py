@@ -1,60 +1,57 @@
-"""The paper's tables, and one of ours, as pivots of rows; the paper's figures in rows beside ours."""
+"""The paper's tables, and some of ours, as pivots of rows; the paper's figures in rows beside ours.
+
+tables.json has their titles, captions, columns (group, title, metric, and how a figure is written) and notes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from spackle.errors import InputError
-from spackle.evaluation.efficiency import efficiency_tables
 from spackle.evaluation.methods import METHODS
-from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, SPLIT, definitions, reduction
+from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, definitions, reduction
 from spackle.evaluation.rows import (
+    BASE_PATH,
+    EXTRA,
     IMAGES,
     NEAR,
+    NOTE,
     PAPER,
+    STAGES,
     Mean,
     Row,
     Run,
     datasets,
     images_text,
+    load_data,
     mean,
+    median,
     paper_rows,
     pivot,
     setting_title,
 )
-from spackle.evaluation.table import (
-    EMPTY,
-    NOT_RUN,
-    Cells,
-    Table,
-    Text,
-    count_text,
-    mark_best,
-    percent_text,
-    write_table,
-)
+from spackle.evaluation.table import EMPTY, NOT_RUN, TEXTS, Cells, Table, mark_best, write_table
 from spackle.files import write_whole
 
 FILES = ("tables.md", "tables.tex")
-LARGE_VIEWS = (
-    "Views: the two ends of a swipe at that disparity, where the eye is farthest left and farthest right and looks at "
-    "the focus point (spackle.camera_path.extremes), at the photo's working size with both sides even; means over views"
-)
-NEAR_VIEWS = (
-    "Views: the dataset's other photos of the scene, from their own cameras, at their working size; means over views"
-)
-HEAD = "{}: disparity {}"  # above the columns of a setting
-QUALITY = ("clipiqa", "niqe", "musiq")
-PAIR = ("dists", "lpips")
-PLACES = (("", "image"), ("_hole", "in the hole"), ("_outside", "outside"))
-ABLATED = {"dense": "Dense grid init", "spackle": "Mask guided init"}
+TABLES = load_data("tables.json")
+NOTES: dict[str, str] = TABLES["notes"]
+EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
+THEIRS = "SHARP (paper)"  # what the paper's figures come from
+FROM_PAPER = " (paper)"  # ends the method of the paper's rows
 # Relative decreases: of which method (None: the row's own) which figure, and by which of the row's it is replaced.
 REDUCED: dict[str, tuple[str | None, str, str]] = {
     "reduction": (None, "har_before", "har"),
     "aux_reduction": ("dense", "aux", "aux"),
 }
+TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # medians, where all others are means
+ODD = {("Middlebury", "0.3", metric) for metric in ("base_ms", "overhead", "base_fps")}  # figures that do not agree
+ODD_MARK = NOTES["odd"][0]
 
 
 class Column(NamedTuple):
@@ -64,7 +61,7 @@ class Column(NamedTuple):
     title: str
     setting: str
     metric: str
-    text: Text
+    text: Callable[[float], str]
     lower: bool | None = None  # is better; None: no best one is set off
 
 
@@ -76,14 +73,15 @@ def make_tables(runs: Sequence[Run]) -> list[Table]:
         if key in seen:
             raise InputError(f"two results for {run.title} under {key[0]} with the base {run.base}: give one of them")
         seen.add(key)
-    timed, measured = [run for run in runs if run.timed], [run for run in runs if not run.timed]
-    large, near = [run for run in measured if not run.near], [run for run in measured if run.near]
-    for kind in (large, timed):
+    kinds: dict[str, list[Run]] = {"large": [], "near": [], "bench": []}
+    for run in runs:
+        kinds["bench" if run.timed else "near" if run.near else "large"].append(run)
+    for kind in (kinds["large"], kinds["bench"]):
         if any(run.settings != kind[0].settings for run in kind):
             raise InputError("the results have different disparities: make their tables apart")
-    tables = [make(large) for make in (_quality_table, _holes_table, _gaussians_table)] if large else []
-    tables += [make(near) for make in (_near_table, _detail_table, _ablation_table)] if near else []
-    return tables + (efficiency_tables(timed) if timed else [])
+    return [
+        _table(label, spec, name, own) for name, own in kinds.items() if own for label, spec in TABLES[name].items()
+    ]
 
 
 def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES) -> None:
@@ -93,47 +91,49 @@ def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = F
     write_whole(folder / files[1], (head + "\n".join(write_table(table, "tex") for table in tables)).encode())
 
 
-# --- texts of figures, and of rows
-
-
 def method_name(run: Run, method: str) -> str:
     """What a row is called; the base's name is always in it."""
     return f"{run.base} alone" if method == "base" else f"{METHODS[method][0]} ({run.base})"
 
 
-def ratio_text(value: float) -> str:
-    """Four digits, as in the paper; what would round to nothing keeps its first two."""
-    return f"{value:.1e}" if 0 < value < 0.5e-4 else f"{value:.4f}"
+def _table(label: str, spec: Mapping[str, Any], kind: str, runs: Sequence[Run]) -> Table:
+    make, words = {
+        "tab:near_view": (_near_table, 1),
+        "tab:efficiency_gaussian_overhead": (_overhead_table, 2),
+        EXPANDED: (_expanded_table, 3),
+        "tab:efficiency_stages": (_stages_table, 1),
+    }.get(label, (_dataset_table, 2))
+    heads, bodies = make({"label": spec.get("paper", label), **spec}, runs)
+    facts = {"views": TABLES["views"][kind], "base_gaussians": f"{PAPER['base_gaussians']:,}"}
+    facts["datasets"] = ", ".join(dict.fromkeys(run.title for run in runs))
+    facts["images"] = ", ".join(f"{run.title} {images_text(run)}" for run in runs)
+    facts |= _timed_facts(runs) if kind == "bench" else _measured_facts(runs)
+    notes = _timed_notes(runs) if kind == "bench" else _measured_notes(spec, runs)
+    if label == EXPANDED:
+        notes.append(_parameters_note(runs[0]))
+        notes += [NOTES["odd"]] if any(ODD_MARK in cell for rows in bodies for cells in rows for cell in cells) else []
+    return Table(label, spec["title"], spec["caption"].format(**facts), heads, bodies, words=words, notes=notes)
 
 
-def _text(found: Mean | None, text: Text) -> str:
-    """A mean; views without a finite value are counted behind it."""
-    if found is None:
-        return EMPTY
-    return f"{EMPTY if found.value is None else text(found.value)} {f'({found.bad} NaN)' if found.bad else ''}".strip()
+# --- captions and notes
 
 
-def _bases(runs: Sequence[Run]) -> str:
-    """Which base the rows stand on, for a caption."""
+def _measured_facts(runs: Sequence[Run]) -> dict[str, str]:
+    """Which base the rows stand on, what they are, and whose weights the residual has."""
     bases = dict.fromkeys(f"{run.base}: {run.config['base']['says']}" for run in runs)
-    return f"Base {'; '.join(bases)}."
-
-
-def _rows_of(runs: Sequence[Run]) -> str:
-    """What the rows are, and whose weights the residual has."""
     names = dict.fromkeys(method for run in runs for method in run.methods)
-    rows = "; ".join(": ".join(METHODS[name]) for name in names)
     residuals = [run.config["residual"] for run in runs]
     weights = dict.fromkeys(
         f"{one['weights']} weights {one['sha256'][:8]}" if one["sha256"] else "no weights, seeds alone"
         for one in residuals
     )
-    return f"Rows: {rows}. Residual: {' and '.join(weights)}."
+    rows = "; ".join(": ".join(METHODS[name]) for name in names)
+    return {"bases": f"Base {'; '.join(bases)}.", "rows": f"Rows: {rows}. Residual: {' and '.join(weights)}."}
 
 
-def _notes(runs: Sequence[Run], metrics: Iterable[str] = ()) -> list[str]:
-    """Notes under a table: definitions, what was not run and why, what was passed over, terms of pyiqa."""
-    names = tuple(metrics)
+def _measured_notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
+    """Definitions, what was not run and why, images without figures, terms of pyiqa."""
+    names = tuple(dict.fromkeys(name for name in (_metric(column[2]) for column in spec["columns"]) if name))
     notes = definitions(names)
     for run in runs:
         state = run.config["metrics"]
@@ -148,17 +148,80 @@ def _notes(runs: Sequence[Run], metrics: Iterable[str] = ()) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
+def _timed_facts(runs: Sequence[Run]) -> dict[str, str]:
+    """The view, the bases, the weights and the machines."""
+    texts = []
+    for run in runs:
+        base, residual = run.config["base"], run.config["residual"]
+        hardware, versions = run.config["hardware"], run.config["versions"]
+        precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
+        network = f"network in {precision} on {base['device']}" if precision else "no network"
+        weights = "seeds, no weights"
+        if residual["sha256"]:
+            weights = f"{residual['weights']} weights {residual['sha256'][:8]} in {residual['precision']}"
+            weights += ", on the processor"
+        place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
+        place += f", {hardware['gpu']} for the base, the rest on the processor" if "gpu" in hardware else ""
+        named = ", ".join(f"{name} {version}" for name, version in versions.items())
+        texts.append(
+            f"Base {base['title']}: {base['says']} ({network}). Residual: {weights}. Machine: {place}; {named}."
+        )
+    return {"setup": " ".join([f"{TABLES['views']['bench']}.", *dict.fromkeys(texts)])}
+
+
+def _timed_notes(runs: Sequence[Run]) -> list[str]:
+    """How the times were taken, and what disturbed them."""
+    notes = []
+    for run in runs:
+        notes.append(NOTES["runs"].format(**run.config))
+        if cold := [row.image for row in run.rows if row.metric == "warm" and not row.value]:
+            notes.append(NOTES["cold"].format(images=", ".join(cold)))
+        if loads := run.numbers("load"):
+            notes.append(NOTES["load"].format(median=statistics.median(loads), least=min(loads), most=max(loads)))
+        if failed := list(run.problems):
+            notes.append(f"{len(failed)} of {len(run.images)} images gave no figures: {', '.join(failed[:5])}.")
+    return list(dict.fromkeys(notes))
+
+
+def _parameters_note(run: Run) -> str:
+    """How large the networks are, and how large the paper says they are."""
+    counted = run.about["parameters"]
+    base, residual = counted["base"] / 1e6, counted["residual"] / 1e6
+    sizes = {"base": base, "used": counted["base_used"] / 1e6, "residual": residual, "merged": base + residual}
+    return NOTES["parameters"].format(**sizes, share=100 * counted["share"], **PAPER["parameters"])
+
+
 # --- the pivots
+
+
+def _metric(figure: str) -> str | None:
+    """The metric that a figure of the image, the hole or its outside is of; None of counts and shares."""
+    name = figure.partition("_")[0]
+    return name if name in METRICS else None
+
+
+def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
+    """A table's columns at each setting, whose name stands above them by the pattern `over`."""
+    columns = []
+    for setting in settings:
+        for group, title, figure, *text in spec["columns"]:
+            name, group = _metric(figure), setting_title(setting, over) if over else group
+            best = METRICS[name].lower if name and spec.get("best") else None
+            columns.append(
+                Column(group, title, setting, figure, TEXTS[text[0]] if text else METRICS[str(name)].text, best)
+            )
+    return columns
 
 
 def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str]) -> list[list[str]]:
     """A row of figures for each method, the best of a column set off."""
-    values_of = pivot(rows, "method", "setting", "metric")
+    rows = list(rows)
+    values_of, dataset = pivot(rows, "method", "setting", "metric"), rows[0].dataset if rows else ""
 
     def find(method: str, setting: str, metric: str) -> Mean | None:
         """Derived figures, too; what is known of images alone is all methods'."""
         if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
-            return mean(values)
+            return (median if metric in TIMES else mean)(values)
         if metric in REDUCED:
             of, figure, after = REDUCED[metric]
             base, left = find(of or method, setting, figure), find(method, setting, after)
@@ -166,172 +229,156 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
                 return Mean(reduction(base.value, left.value), 0)
         return None
 
+    def text(found: Mean | None, column: Column, method: str) -> str:
+        """Views without a finite value are counted behind it; the paper's percentages are printed as it has them."""
+        if found is None:
+            return EMPTY
+        paper = method.endswith(FROM_PAPER)
+        write = TEXTS["tenths %"] if paper and column.metric == "overhead" else column.text
+        mark = ODD_MARK if paper and (dataset, column.setting, column.metric) in ODD else ""
+        bad = f"({found.bad} NaN)" if found.bad else ""
+        return f"{EMPTY if found.value is None else write(found.value)}{mark} {bad}".strip()
+
     texts = []
     for column in columns:
         found = [find(method, column.setting, column.metric) for method in methods]
-        cells = [_text(one, column.text) for one in found]
+        cells = [text(one, column, method) for one, method in zip(found, methods, strict=True)]
         values = [None if one is None else one.value for one in found]
         texts.append(cells if column.lower is None else mark_best(values, cells, column.lower))
     return [list(cells) for cells in zip(*texts, strict=True)]
 
 
-def _dataset_table(
-    label: str,
-    title: str,
-    caption: str,
-    runs: Sequence[Run],
-    columns: Sequence[Column],
-    names: Callable[[Run], dict[str, str]],
-    metrics: Iterable[str] = (),
-) -> Table:
-    """For each dataset a row for each method of `names` (and what it is called), and the paper's rows."""
-    heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
+Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of a `Table`
+
+
+def _grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
+    """Rows whose first one is preceded by the name of all of them."""
+    return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
+
+
+def _of(label: str, dataset: str) -> list[Row]:
+    """The paper's figures for a dataset in a table."""
+    return [row for row in paper_rows(label) if row.dataset == dataset]
+
+
+def _dataset_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+    """For each dataset a row for each method, and the paper's rows; the columns repeat for each disparity."""
+    columns = _columns(spec, runs[0].settings, "" if runs[0].near else "{}: disparity {}")
     bodies = []
     for dataset in datasets(runs):
         rows: list[Cells] = []
         for run in (run for run in runs if run.title == dataset):
-            methods = names(run)
-            for name, cells in zip(methods.values(), _cells(run.rows, columns, methods), strict=True):
+            names = _row_names(spec, run)
+            for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
                 rows.append((name, images_text(run), *cells))
         rows = rows or [(NOT_RUN, *[EMPTY] * (1 + len(columns)))]
-        papers = [row for row in paper_rows(label) if row.dataset == dataset]
+        papers = _of(spec["label"], dataset)
         for name in dict.fromkeys(row.method for row in papers):
             rows.append((name, str(IMAGES[dataset]), *_cells(papers, columns, [name])[0]))
-        bodies.append([(EMPTY if k else dataset, *cells) for k, cells in enumerate(rows)])
-    return Table(label, title, caption, heads, bodies, words=2, notes=_notes(runs, metrics))
+        bodies.append(_grouped(dataset, rows))
+    return [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)], bodies
 
 
-def _named(run: Run, metric: str = "") -> dict[str, str]:
-    """The methods of a run, or those that fill holes and have a figure, and what they are called."""
-    having = {row.method for row in run.rows if row.metric == metric} - {"base"} if metric else run.methods
-    return {method: method_name(run, method) for method in run.methods if method in having}
+def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
+    """The methods of a run that a table shows (all, those named by it, or those having a figure), and their names."""
+    if "rows" in spec:
+        return {method: f"{title} ({run.base})" for method, title in spec["rows"].items() if method in run.methods}
+    having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
+    return {method: method_name(run, method) for method in run.methods if having is None or method in having}
 
 
-# --- large views
-
-
-def _quality_table(runs: Sequence[Run]) -> Table:
-    """No-reference metrics (tab:large_view_nr_iqa)."""
-    return _dataset_table(
-        "tab:large_view_nr_iqa",
-        "Quality of large views, without a truth",
-        f"No-reference quality under controlled large views. {LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
-        "n: images, of those in the paper. Bold: best of a run's rows.",
-        runs,
-        [
-            Column(setting_title(setting, HEAD), figure.title, setting, name, figure.text, figure.lower)
-            for setting in runs[0].settings
-            for name, figure in ((name, METRICS[name]) for name in QUALITY)
-        ],
-        _named,
-        QUALITY,
-    )
-
-
-def _holes_table(runs: Sequence[Run]) -> Table:
-    """Hole Area Ratio before and after (paper, eq. 11; tab:controlled_disocclusion)."""
-    figures = (("base HAR ↓", "har_before", ratio_text), ("HAR ↓", "har", ratio_text))
-    return _dataset_table(
-        "tab:controlled_disocclusion",
-        "Hole Area Ratio before and after",
-        "Hole Area Ratio (HAR), 1 − coverage: the share of pixels whose rendered opacity is below 0.95. Reduction: of "
-        f"the mean HAR, 1 − after / before. {LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
-        "n: images, of those in the paper.",
-        runs,
-        _threes(runs, *figures, ("Reduction ↑", "reduction", lambda share: f"{percent_text(share)}%")),
-        lambda run: _named(run, "har"),
-    )
-
-
-def _gaussians_table(runs: Sequence[Run]) -> Table:
-    """Added and merged Gaussians (tab:expanded_efficiency_gaussian_overhead, without its times)."""
-    figures = (("Added GS", "aux", count_text), ("Added GS (%)", "aux_share", percent_text))
-    return _dataset_table(
-        "tab:expanded_efficiency_gaussian_overhead",
-        "Gaussians added and merged",
-        "Gaussians added for a view, their share of the base's and both together; means over views. "
-        f"{LARGE_VIEWS}. {_bases(runs)} {_rows_of(runs)} The paper's base has {PAPER['base_gaussians']:,} Gaussians.",
-        runs,
-        _threes(runs, *figures, ("Merged GS", "merged", count_text)),
-        lambda run: _named(run, "aux"),
-    )
-
-
-def _threes(runs: Sequence[Run], *figures: tuple[str, str, Text]) -> list[Column]:
-    groups = {setting: setting_title(setting, HEAD) for setting in runs[0].settings}
-    return [Column(group, title, key, name, text) for key, group in groups.items() for title, name, text in figures]
-
-
-# --- near views
-
-
-def _near_table(runs: Sequence[Run]) -> Table:
-    """DISTS and LPIPS, a row for each method (tab:near_view)."""
-    columns, titles = [Column("", "", NEAR, m, METRICS[m].text) for m in PAIR], datasets(runs)
+def _near_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+    """A row for each method, columns for each dataset (tab:near_view)."""
+    columns, titles = _columns(spec, [NEAR]), datasets(runs)
     bodies: list[list[Cells]] = []
-    found: dict[str, dict[str, list[str]]] = {}
+    ours: dict[str, dict[str, list[str]]] = {}
     for run in runs:
-        names = _named(run)
+        names = _row_names(spec, run)
         for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
-            found.setdefault(name, {})[run.title] = cells
-    papers = paper_rows("tab:near_view")
+            ours.setdefault(name, {})[run.title] = cells
+    methods = dict.fromkeys(row.method for row in paper_rows(spec["label"]))
     theirs = {
-        name: {title: _cells((r for r in papers if r.dataset == title), columns, [name])[0] for title in IMAGES}
-        for name in dict.fromkeys(row.method for row in papers)
+        name: {title: _cells(_of(spec["label"], title), columns, [name])[0] for title in IMAGES} for name in methods
     }
-    for rows in (found, theirs):
-        empty = [EMPTY] * len(PAIR)
-        bodies.append([(n, *(c for title in titles for c in by.get(title, empty))) for n, by in rows.items()])
-    return Table(
-        "tab:near_view",
-        "Distance from true second photos",
-        f"Distance from true second photos; lower is better. {NEAR_VIEWS}. {_bases(runs)} {_rows_of(runs)} "
-        f"Images: {_images(runs)}. Empty: not run.",
-        [("", "Method"), *((title, name.upper()) for title in titles for name in PAIR)],
-        bodies,
-        notes=_notes(runs, PAIR),
-    )
+    for found in (ours, theirs):
+        empty = [EMPTY] * len(columns)
+        bodies.append([(name, *(cell for t in titles for cell in by.get(t, empty))) for name, by in found.items()])
+    return [("", "Method"), *((title, column.title) for title in titles for column in columns)], bodies
 
 
-def _detail_table(runs: Sequence[Run]) -> Table:
-    """PSNR and SSIM over the image, in the hole and outside; the masked distance. Not in the paper."""
-    places = [(name, f"{name}{place}", where) for name in SPLIT for place, where in PLACES]
-    columns = [
-        Column(METRICS[name].title, where, NEAR, figure, METRICS[name].text, METRICS[name].lower)
-        for name, figure, where in (*places, ("distance", "distance", "in the hole"))
-    ]
-    return _dataset_table(
-        "tab:near_view_holes",
-        "Against true second photos, in the hole and outside",
-        "Against true second photos, where it matters. The hole is where the base's opacity is below 0.95. HAR: its "
-        f"share of the pixels. {NEAR_VIEWS}. {_bases(runs)} {_rows_of(runs)} Bold: best of a run's rows. "
-        "n: images, of those in the paper, which has no such table.",
-        runs,
-        [Column("", "base HAR", NEAR, "har_before", ratio_text), *columns],
-        _named,
-        (*SPLIT, "distance"),
-    )
+def _overhead_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+    """Added Gaussians of each dataset, their average, and median times."""
+    settings, label = runs[0].settings, spec["label"]
+    counts = _columns(spec, settings, "{}: disparity {}")
+    bases = {base: [run for run in runs if run.base == base] for base in dict.fromkeys(run.base for run in runs)}
+    (summary,) = dict.fromkeys(row.method for row in paper_rows(label))
+    bodies: list[list[Cells]] = []
+    for dataset in datasets(runs):
+        rows: list[Cells] = [
+            (run.base, *_cells(run.rows, counts, run.methods)[0]) for run in runs if run.title == dataset
+        ]
+        if theirs := _of(EXPANDED, dataset):
+            rows.append((THEIRS, *_cells(theirs, counts, [theirs[0].method])[0]))
+        bodies.append(_grouped(dataset, rows))
+    averages: list[Cells] = []
+    for base, own in bases.items():
+        if len(own) > 1:  # of the datasets' means, as the paper's
+            means = [
+                Row(run.title, "", setting, "", base, metric, mean(values).value)
+                for run in own
+                for (setting, metric), values in pivot(run.rows, "setting", "metric").items()
+                if metric in ("aux", "aux_share")
+            ]
+            averages.append((base, *_cells(means, counts, [base])[0]))
+    averages.append((THEIRS, *_cells(paper_rows(label), counts, [summary])[0]))
+    bodies.append(_grouped("Average", averages))
+    times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
+    pools = {base: ([row for run in own for row in run.rows], own[0].methods[0]) for base, own in bases.items()}
+    pools[THEIRS] = (list(paper_rows(label)), summary)
+    for column in spec["runtime"]:
+        rows = []
+        for name, (pool, method) in pools.items():
+            cells = _cells(pool, _columns({"columns": [column]}, settings), [method])[0]
+            rows.append((name, *(part for cell in cells for part in (cell, EMPTY))))
+        times += _grouped(column[1], rows)
+    return [("", "Dataset"), ("", "From"), *((column.group, column.title) for column in counts)], [*bodies, times]
 
 
-def _ablation_table(runs: Sequence[Run]) -> Table:
-    """A Gaussian for every cell against those of the mask (tab:mask_guided_init)."""
-    return _dataset_table(
-        "tab:mask_guided_init",
-        "Dense grid against mask guided",
-        "Dense grid initialisation against mask guided one. Dense: an aux Gaussian for each cell of 2×2 pixels, in "
-        "one pass; mask guided: for the masked cells, with a second pass where that leaves holes. The same network for "
-        f"both. Reduction: of the mean count. {NEAR_VIEWS}. {_bases(runs)} n: images, of those in the paper.",
-        runs,
-        [
-            Column("", "Base GS", NEAR, "base_gaussians", count_text),
-            Column("", "Aux. GS ↓", NEAR, "aux", lambda count: f"{count:,.2f}"),
-            Column("", "Reduction ↑", NEAR, "aux_reduction", lambda share: f"{percent_text(share)}%"),
-            *(Column("", METRICS[name].title, NEAR, name, METRICS[name].text) for name in PAIR),
-        ],
-        lambda run: {m: f"{title} ({run.base})" for m, title in ABLATED.items() if m in run.methods},
-        PAIR,
-    )
+def _expanded_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+    """Counts, times and rates, a row for each setting."""
+    bodies = []
+    for dataset in datasets(runs):
+        rows: list[Cells] = []
+        theirs = _of(EXPANDED, dataset)
+        for setting in runs[0].settings:
+            name, columns = setting_title(setting), _columns(spec, [setting])
+            for run in (run for run in runs if run.title == dataset):
+                rows.append((name, run.base, *_cells(run.rows, columns, run.methods)[0], images_text(run)))
+            if any(row.setting == setting for row in theirs):
+                figures = _cells(theirs, columns, [theirs[0].method])[0]
+                rows.append((name, THEIRS, *figures, str(IMAGES[dataset])))
+        bodies.append(_grouped(dataset, rows))
+    return [("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")], bodies
 
 
-def _images(runs: Sequence[Run]) -> str:
-    return ", ".join(f"{run.title} {images_text(run)}" for run in runs)
+def _stages_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+    """Where the time goes: stages, and what they come to; a column for each run and setting."""
+    base = [(STAGES[name], f"{name}_stage_ms", "tenths") for name in BASE_PATH]
+    extra = [(STAGES[name], f"{name}_stage_ms", "tenths") for name in EXTRA]
+    sums = [(f"base path: the first {len(base)}", "base_ms", "tenths")]
+    sums += [(f"Spackle's own: the other {len(extra)}", "extra_ms", "tenths")]
+    sums += [(title, figure, text) for _, title, figure, text in spec["columns"]]
+    places = [(run, setting) for run in runs for setting in run.settings]
+    bodies = []
+    for group in (base, extra, sums):
+        rows: list[Cells] = []
+        for title, metric, text in group:
+            cells = []
+            for run, setting in places:
+                low, middle, high = map(TEXTS[text], np.quantile(run.numbers(metric, setting), [0.25, 0.5, 0.75]))
+                cells.append(f"{middle} [{low}, {high}]")
+            rows.append((title, *cells))
+        bodies.append(rows)
+    over = [f"{run.title}, {run.base}" if len(runs) > 1 else "" for run, _ in places]
+    titles = [setting_title(setting, "{}: disparity {}") for _, setting in places]
+    return [("", "Stage"), *zip(over, titles, strict=True)], bodies
