@@ -60,7 +60,8 @@ from spackle.bases.silhouettes import Layers
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import GREY, sharpness
 from spackle.fill import FAR_BIAS, far_fill
-from spackle.training.losses import FeatureNet, covered, dilate, hole_psnr, load_features
+from spackle.filters import greatest_around
+from spackle.training.losses import FeatureNet, covered, hole_psnr, load_features
 from spackle.training.sources import load_pair
 
 Row = dict[str, float]  # a scene's figures
@@ -208,7 +209,7 @@ class Pair:
         self.depth = smaller(depth, small) if small > 1 else depth
         prediction = lift(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
-        self.near = dilate(self.hole[None], 2 * BAND_PX + 1)[0]
+        self.near = greatest_around(self.hole, BAND_PX)
         seeds = spackle.complete(prediction, [self.beside], exact=True, network=None, fill="network")
         self.crossings = crossings(seeds.render(self.beside).depth, self.beside, self.camera)
 

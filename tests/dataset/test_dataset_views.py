@@ -11,8 +11,8 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
-from spackle.dataset.views import APART, ViewStack, open_completion, paint, path_cameras, render_views
-from spackle.inpaint import InpainterOptions
+from spackle.dataset.views import APART, ViewStack, complete_views, paint, path_cameras, render_views
+from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter
 from spackle.render import get_renderer
 
 
@@ -30,7 +30,8 @@ def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind
 
 
 def completed(name: str, stack: ViewStack) -> Tensor:
-    return open_completion(name, InpainterOptions(), get_renderer()).complete(stack)
+    inpainter = get_inpainter(name, InpainterOptions()) if name in INPAINTERS else None
+    return complete_views(stack, name, inpainter, get_renderer())
 
 
 def stack_of(*rights: float) -> ViewStack:

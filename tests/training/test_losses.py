@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from spackle.errors import InputError
-from spackle.training import losses
 from spackle.training.losses import (
     PAPER_WEIGHTS,
     ResNet50,
@@ -139,16 +138,6 @@ def test_perceptual_resizes_and_looks_only_near_the_hole(size: int | None, seen:
     assert sizes == [(1, 3, *seen)] * 2
     assert grad(rgb).abs().sum((0, 1, 3)).bool().tolist() == [False] + 5 * [True] + 2 * [False]
     assert perceptual_loss(Pixels(1), target, target, hole, size=size).item() == 0
-
-
-def test_dilation_is_a_square_and_a_mask_is_pooled_by_area() -> None:
-    mask = torch.zeros(1, 5, 5, dtype=torch.bool)
-    mask[0, 1, 2] = True
-    assert losses.dilate(mask, 3)[0].int().tolist() == [[0, 1, 1, 1, 0]] * 3 + [[0] * 5] * 2
-    with pytest.raises(ValueError, match="odd"):
-        losses.dilate(mask, 4)
-    mask = torch.tensor([[[True, True, False, False], [True, False, False, False]]])
-    assert losses.covered(mask, torch.zeros(1, 7, 1, 2)).flatten().tolist() == [0.75, 0]
 
 
 LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {

@@ -18,12 +18,12 @@ from spackle.camera_path import MAX_DISPARITY, DepthRange, TrajectoryKind
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.sample import pack_sample
 from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
-from spackle.dataset.views import COMPLETIONS, Completion, draw_path, open_completion, path_cameras, render_views
+from spackle.dataset.views import COMPLETIONS, complete_views, draw_path, path_cameras, render_views
 from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
 from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
-from spackle.inpaint import INPAINTERS, InpainterOptions, inpainter_class
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
 from spackle.progress import Reporter, asked_to_stop, counted, timed
 from spackle.render import get_renderer
 from spackle.residual import MASK_THRESHOLD
@@ -62,6 +62,13 @@ class DatasetOptions:
     def processes(self) -> Workers:
         network = self.base.network or self.inpaints_by_network
         return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
+
+    def open_inpainter(self) -> Inpainter | None:
+        """None where the targets are rendered or left open; InputError where a package or weights are missing."""
+        if self.inpainter not in INPAINTERS:
+            return None
+        device = None if self.base.device == "auto" else self.base.device
+        return get_inpainter(self.inpainter, InpainterOptions(self.inpainter_weights, self.inpainter_side, device))
 
     def check(self) -> None:
         """InputError for options that contradict each other; inpainters check theirs themselves."""
@@ -102,14 +109,16 @@ class DatasetOptions:
             return [photo.name, photo.sha256, "none"]
 
 
-def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completion: Completion) -> dict[str, Any]:
+def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], inpainter: Inpainter | None) -> dict[str, Any]:
     """Everything that decides the shards' bytes, ready for JSON, without folders of this machine.
 
     The number of threads is part of it, because SHARP's last bits depend on it; the number of workers is not.
     """
     base = options.base
     inputs = digest_of([options.inputs_of(photo) for photo in photos])
-    weights = {name: weights_digest(file) for name, file in completion.files.items()}
+    completion: dict[str, Any] = _completion(options, inpainter)
+    if inpainter is not None and inpainter.files:
+        completion["weights"] = {name: weights_digest(file) for name, file in inpainter.files.items()}
     return {
         "spackle": spackle.__version__,
         "photos": {"count": len(photos), "sample": options.sample, "sha256": inputs},
@@ -126,11 +135,14 @@ def configuration(options: DatasetOptions, photos: Sequence[PhotoFile], completi
             "disparity": list(options.disparity),
             "threshold": MASK_THRESHOLD,
         },
-        "inpainter": {"name": completion.name, "version": completion.version}
-        | ({"weights": weights} if weights else {}),
+        "inpainter": completion,
         "shard_size": options.shard_size,
         "threads": options.threads,
     }
+
+
+def _completion(options: DatasetOptions, inpainter: Inpainter | None) -> dict[str, str]:
+    return {"name": options.inpainter, "version": "1" if inpainter is None else inpainter.version}
 
 
 def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter: Reporter) -> str:
@@ -144,8 +156,8 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
     """
     options.check()
     maker = Maker(options)  # fails before long work
-    if maker.completion.notice:
-        reporter.log(maker.completion.notice)
+    if maker.inpainter is not None and maker.inpainter.notice:
+        reporter.log(maker.inpainter.notice)
     with cluster(options.processes) as ray:
         root, names = find_photos(source, options.images, reporter.log)
         if options.sample is None and len(names) > MAX_PHOTOS:
@@ -155,7 +167,7 @@ def build_dataset(source: Path, output: Path, options: DatasetOptions, reporter:
             )
         with reporter.stage("photos") as step:
             photos = choose(root, names, options.sample, options.seed, reporter.log, step)
-        config = configuration(options, photos, maker.completion)
+        config = configuration(options, photos, maker.inpainter)
         with results_folder(output, (NAME,), alone=True):
             return _Build(photos, output, options, reporter, config).run(ray)
 
@@ -176,15 +188,12 @@ class Maker:
     def __init__(self, options: DatasetOptions) -> None:
         """Open base and inpainter, whose networks are loaded with the first photo; InputError where that fails."""
         self.options, self.base = options, open_base(options.base)
-        self.renderer = get_renderer(options.base.device)
-        device = None if options.base.device == "auto" else options.base.device
-        inpainter = InpainterOptions(options.inpainter_weights, options.inpainter_side, device)
-        self.completion = open_completion(options.inpainter, inpainter, self.renderer)
+        self.renderer, self.inpainter = get_renderer(options.base.device), options.open_inpainter()
 
     @property
     def setup(self) -> dict[str, Any]:
         """The manifest's configuration without the photos."""
-        return configuration(self.options, (), self.completion)
+        return configuration(self.options, (), self.inpainter)
 
     def inputs(self, photo: PhotoFile) -> list[str]:
         """Digests of a photo and of its depth map on this machine."""
@@ -217,7 +226,7 @@ class Maker:
                 cameras = path_cameras(kind, disparity, prediction.camera.even(), depth_range, options.views)
             stack = render_views(prediction, cameras, self.renderer)
         with timed("inpaint", seconds):
-            targets = self.completion.complete(stack)
+            targets = complete_views(stack, options.inpainter, self.inpainter, self.renderer)
         with timed("encode", seconds):
             facts = {
                 "photo": {
@@ -228,7 +237,7 @@ class Maker:
                     "focal_source": prediction.lens_source or photo.focal_source,
                 },
                 "base": {"gaussians": len(prediction.gaussians), **prediction.notes},
-                "inpainter": {"name": self.completion.name, "version": self.completion.version},
+                "inpainter": _completion(options, self.inpainter),
                 "threshold": MASK_THRESHOLD,
                 "trajectory": {"kind": kind, "disparity": disparity},
             }

@@ -7,10 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -20,7 +17,7 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.fill import far_fill
-from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, known_inverse_depth
+from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
 from spackle.render import Renderer
 from spackle.render.protocol import Rendering
@@ -88,24 +85,14 @@ def render_views(prediction: BasePrediction, cameras: Sequence[Camera], renderer
     return ViewStack(prediction, cameras, rgb, depth, alpha, hole_mask(alpha))
 
 
-class Completion(NamedTuple):
-    """A way to targets [V, H, W, 3] sRGB: new colours where a stack's mask is, elsewhere its rgb, bit for bit."""
+def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | None, renderer: Renderer) -> Tensor:
+    """Targets [V, H, W, 3] sRGB: new colours in the holes, elsewhere the views bit for bit.
 
-    name: str
-    version: str  # another version may give other pixels
-    complete: Callable[[ViewStack], Tensor]
-    notice: str = ""  # as of `Inpainter`
-    files: Mapping[str, Path] = {}
-
-
-def open_completion(name: str, options: InpainterOptions, renderer: Renderer) -> Completion:
-    """One of `COMPLETIONS`; InputError where its package or its weights are missing."""
-    if name == "none":  # for somebody else to complete
-        return Completion(name, "1", lambda views: views.rgb)
-    if name == "geometry":
-        return Completion(name, "1", partial(render_completed, renderer=renderer))
-    inpainter = get_inpainter(name, options)
-    return Completion(name, inpainter.version, partial(paint, inpainter), inpainter.notice, inpainter.files)
+    `completion` is one of `COMPLETIONS`; "none" leaves the holes to somebody else.
+    """
+    if inpainter is not None:
+        return paint(inpainter, views)
+    return views.rgb if completion == "none" else render_completed(views, renderer)
 
 
 @torch.no_grad()

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from spackle.errors import reason_in_a_line
 from spackle.evaluation.rows import load_data
-from spackle.training.losses import dilate, hole_psnr
+from spackle.filters import greatest_around
+from spackle.training.losses import hole_psnr
 
 OWN = "own"
 NOTICE = "pyiqa: PolyForm Noncommercial licence 1.0.0; several of the networks that it fetches are for research only"
@@ -80,7 +81,7 @@ def sharpness(image: Tensor, truth: Tensor, mask: Tensor) -> float:
     It counts within `mask` [H, W] bool, 3 pixels from its border and farther; NaN where that is nothing. `image` and
     `truth` are [H, W, 3] sRGB 0..1.
     """
-    inner = ~dilate(~mask[None], INNER)[0]
+    inner = ~greatest_around(~mask, INNER // 2)
     ours, theirs = (torch.hypot(*torch.gradient(picture @ GREY))[inner].mean() for picture in (image, truth))
     return float(ours / theirs)
 

@@ -216,11 +216,8 @@ def perceptual_loss(
         sum(w |F - T|) / (C sum(w))  +  gram · mean |G(F) - G(T)|,    G(F) = (F w) F^T / sum(w),  [C, C].
 
     `size` is the longer side of the images that the network sees; None leaves them as they are.
-
-    Raises:
-        ValueError: an even dilation.
     """
-    near = dilate(hole, dilation)
+    near = greatest_around(hole, dilation // 2)
     if near.device.type == "cpu" and not near.any():  # a GPU would be waited for
         return rgb[:0].sum()  # 0, and a gradient of zeros, without the network
     ours = features(_resized(torch.where(near[..., None], rgb, target), size))
@@ -295,13 +292,6 @@ def hole_psnr(rgb: Tensor, target: Tensor, hole: Tensor) -> float:
         return math.nan
     error = float((rgb - target)[hole].double().square().mean())
     return math.inf if error == 0 else -10 * math.log10(error)
-
-
-def dilate(mask: Tensor, side: int) -> Tensor:
-    """[B, H, W] bool, grown by a square of `side` pixels around each; ValueError where that is even."""
-    if side % 2 != 1:
-        raise ValueError(f"a dilation of {side} has no centre: give an odd number")
-    return greatest_around(mask, side // 2)
 
 
 def covered(mask: Tensor, features: Tensor) -> Tensor:

@@ -31,17 +31,13 @@ from spackle.render.project import KernelCamera
 from spackle.render.protocol import TILE, Rendering
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.network import Rim, find_rim
-from spackle.residual.view_features import CELL, ViewFeatures, hole_mask
+from spackle.residual.view_features import CELL, ViewFeatures, cell_centers, hole_mask
 from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
-# Half precision is enough for these, and halves what is read at every step. Not for positions.
-HALVED = (
-    "base.quats", "base.scales", "base.opacities", "base.colors", "rendering.rgb", "rendering.depth",
-    "rendering.alpha", "cues.rgb", "cues.inverse_depth", "cues.alpha", "seeds.slope", "seeds.rgb", "rim.rgb",
-    "rim.mirrored", "rim.distance", "rim.exemplar", "rim.mismatch",
-)  # fmt: skip
+# Half precision is enough for all but these, and halves what is read at every step.
+EXACT = ("camera.K", "camera.world_to_camera", "base.means", "seeds.uv", "seeds.inverse_depth")
 PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
 SAMPLES_VERSION = 4  # goes up whenever the same recipe would make other samples
@@ -93,19 +89,16 @@ class Sample:
         top, left = CELL * row, CELL * column
         pixels = (slice(top, top + CELL * height), slice(left, left + CELL * width))
         cells = (slice(row, row + height), slice(column, column + width))
-        K = self.camera.K.clone()
-        K[0, 2] -= left
-        K[1, 2] -= top
+        camera = self.camera.cropped(left, top, CELL * width, CELL * height)
 
         def cut(grid: Tensor) -> Tensor:
             return grid[cells].clone()
 
-        seeds = _mapped(self.seeds, cut)
         return Sample(
-            camera=dataclasses.replace(self.camera, K=K, width=CELL * width, height=CELL * height),
+            camera=camera,
             base=self.base,
             rendering=_mapped(self.rendering, lambda t: t[pixels].clone()),
-            seeds=dataclasses.replace(seeds, uv=seeds.uv - torch.tensor([left, top]).to(seeds.uv)),
+            seeds=dataclasses.replace(_mapped(self.seeds, cut), uv=cell_centers(camera)),
             cues=_mapped(self.cues, cut),
             rim=_mapped(self.rim, cut),
             target=self.target[pixels].clone(),
@@ -151,7 +144,8 @@ def save_sample(sample: Sample, path: Path) -> None:
     for part in PARTS:
         tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
-    tensors |= {name: tensors[name].half() for name in HALVED}
+    halved = [name for name, tensor in tensors.items() if tensor.dtype == torch.float32 and name not in EXACT]
+    tensors |= {name: tensors[name].half() for name in halved}
     write_whole(path, save({name: tensor.contiguous() for name, tensor in tensors.items()}))
 
 
@@ -161,7 +155,7 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
         parts: dict[str, dict[str, Any]] = {}
         for name, tensor in load_file(path).items():
             part, _, field = name.partition(".")
-            parts.setdefault(part, {})[field] = tensor.float() if name in HALVED else tensor
+            parts.setdefault(part, {})[field] = tensor.float() if tensor.dtype == torch.float16 else tensor
         lens, unit = parts["camera"], float(parts["seeds"].pop("unit"))
         return Sample(
             camera=Camera(lens["K"], lens["world_to_camera"], *lens["size"].tolist()),

@@ -170,13 +170,13 @@ def _learn(
     # Gradients are averaged over the processes while they are computed.
     wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
     optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
-    progress, on_disk = Progress(), -1  # the step of the newest checkpoint
+    progress, stopped = Progress(), False
     if found:
         with reading(folder, "its checkpoint is of another network ({reason}): choose another with -o, or --overwrite"):
             network.load_state_dict(found.network)
             average.load_state_dict(found.average)
             optimizer.load_state_dict(found.optimizer)
-        progress, on_disk = found.progress, found.progress.step
+        progress = found.progress
     facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
     facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
 
@@ -184,17 +184,15 @@ def _learn(
         states = network.state_dict(), average.state_dict(), optimizer.state_dict()
         return Checkpoint(progress, *states, facts["recipe"], task.digest, task.name)
 
+    def ended() -> str:
+        """Why the run is at its end; empty where it goes on."""
+        if progress.step >= optim.steps:
+            return "steps"
+        return "patience" if progress.stale >= run.patience else "stopped" if stopped else ""
+
     def report(ended: str | None = None) -> None:
         if rank() == 0:
             write_json(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
-
-    def save() -> None:
-        nonlocal on_disk
-        if rank() == 0 and on_disk != progress.step:
-            task.export(average, folder / LAST)
-            save_checkpoint(state(), folder)  # at the end: a run that is killed before it exports again
-            on_disk = progress.step
-            report()
 
     def parts(step: int) -> list[list[int]]:
         """This process's items of a step, as they go through the network."""
@@ -214,8 +212,8 @@ def _learn(
         reporter.steps("train", progress.step, optim.steps) as tell,
         asked_to_stop(alone=rank_count() == 1) as asked,
     ):
-        begun, before, stopped, recent = time.perf_counter(), progress.seconds, False, list[dict[str, float]]()
-        while progress.step < optim.steps and progress.stale < run.patience and not stopped:
+        begun, before, recent = time.perf_counter(), progress.seconds, list[dict[str, float]]()
+        while not ended():
             step = progress.step
 
             # Forward and backward: a step's parts add up their gradients, its last one joins those of the processes.
@@ -284,12 +282,12 @@ def _learn(
                     report()
 
             # Save
-            if progress.step % run.save_every == 0:
-                save()
-        save()
-    why = "steps" if progress.step >= optim.steps else "patience" if progress.stale >= run.patience else "stopped"
-    report(why)
-    return why, progress.step
+            if rank() == 0 and (progress.step % run.save_every == 0 or ended()):
+                task.export(average, folder / LAST)
+                save_checkpoint(state(), folder)  # at the end: a run that is killed before it exports again
+                report()
+    report(ended())
+    return ended(), progress.step
 
 
 @torch.no_grad()
