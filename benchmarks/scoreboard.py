@@ -59,8 +59,7 @@ from spackle.bases.lift import lift
 from spackle.bases.silhouettes import Layers
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import GREY, sharpness
-from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import greatest_around
+from spackle.filters import FAR_BIAS, far_fill, greatest_around
 from spackle.training.losses import FeatureNet, covered, hole_psnr, load_features
 from spackle.training.sources import load_pair
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -67,14 +66,10 @@ class Ply:
     count: int
     body: bytes
 
-    @property
-    def row_bytes(self) -> int:
-        return 4 * len(self.names)
-
     def row(self, index: int) -> dict[str, float]:
-        """One vertex, unpacked by hand."""
-        numbers = struct.unpack_from(f"<{len(self.names)}f", self.body, index * self.row_bytes)
-        return dict(zip(self.names, numbers, strict=True))
+        """One vertex."""
+        numbers = np.frombuffer(self.body, "<f4").reshape(self.count, -1)[index]
+        return dict(zip(self.names, numbers.tolist(), strict=True))
 
 
 def read_ply(path: Path) -> Ply:
@@ -87,7 +82,7 @@ def read_ply(path: Path) -> Ply:
     assert rest[0][:2] == ["element", "vertex"]
     assert all(words[:2] == ["property", "float"] for words in rest[1:])
     ply = Ply(comments, [words[2] for words in rest[1:]], int(rest[0][2]), body)
-    assert len(body) == ply.count * ply.row_bytes
+    assert len(body) == 4 * ply.count * len(ply.names)
     return ply
 
 

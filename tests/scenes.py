@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from photos import box
 from torch import Tensor
 
 from spackle.bases.depth_map import DepthMap
@@ -73,9 +74,7 @@ def wall(depth: float = 4.0, width: int = 64, height: int = 48, focal: float = 6
 
 def box_mask(width: int, height: int) -> Tensor:
     """[H, W] bool: the pixels of the box in `box_before_wall`, the middle third each way."""
-    mask = torch.zeros(height, width, dtype=torch.bool)
-    mask[height // 3 : height - height // 3, width // 3 : width - width // 3] = True
-    return mask
+    return torch.from_numpy(box(width, height))
 
 
 def box_before_wall(near: float = 2.0, far: float = 6.0, width: int = 96, height: int = 72, focal: float = 80) -> Scene:
@@ -158,8 +157,7 @@ def psnr(a: Tensor, b: Tensor) -> float:
 
 def same_bits(a: Rendering | Gaussians, b: Rendering | Gaussians) -> bool:
     """Whether two values of one type hold the same tensors, bit for bit."""
-    fields = [field.name for field in dataclasses.fields(a)]
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in fields)
+    return all(torch.equal(*pair) for pair in zip(tensors_of(a), tensors_of(b), strict=True))
 
 
 @dataclasses.dataclass(frozen=True)

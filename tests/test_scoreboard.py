@@ -33,9 +33,8 @@ def pairs(tmp_path: Path) -> Path:
     facts |= {"focal_px": 100.0, "cx": width / 2, "cy": height / 2, "doffs_px": 0.0, "baseline_m": 0.2}
     (folder / "scene.json").write_text(json.dumps(facts))
     torch.manual_seed(0)
-    names = {".weight": ".w", ".bias": ".b"}
-    state = {key.replace(".conv", "/conv"): value.numpy() for key, value in SqueezeNet().state_dict().items()}
-    for ours, theirs in names.items():
+    state = {key: value.numpy() for key, value in SqueezeNet().state_dict().items()}
+    for ours, theirs in {".conv": "/conv", ".weight": ".w", ".bias": ".b"}.items():
         state = {key.replace(ours, theirs): value for key, value in state.items()}
     np.savez(tmp_path / "squeezenet.npz", **state)
     return tmp_path

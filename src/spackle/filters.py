@@ -1,4 +1,4 @@
-"""Filters of pictures: Gaussian blur, the greatest value in a window, and a distance transform."""
+"""Filters of pictures: blur, the greatest value in a window, a distance transform, and values propagated into holes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,20 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from spackle._numba import kernel
+from spackle.device import run_chunks
 
 FAR = 1 << 14  # cells to a place that is not there
+FAR_BIAS = 80.0  # how sharply the far side of a rim wins: a sample 5 % nearer than the fill counts 1/50
+SWEEPS = 12  # relaxation sweeps at each resolution; more gain nothing
+
+MIN_TRUST = 1e-6  # a hole whose whole rim is near still gets its colour from there
+MAX_EXPONENT = 30.0  # keeps weights within single precision
+LIGHTEST, HEAVIEST = (np.float32(np.exp(sign * MAX_EXPONENT)) for sign in (-1, 1))
+AROUND = 4  # neighbours of a pixel
+GRAIN = 32  # coarse rows that a thread takes at a time
+
+Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
@@ -96,3 +108,189 @@ def _propagate_nearest(hole: Any, near: Any) -> None:
                         apart = (near[0, y, x] - y) ** 2 + (near[1, y, x] - x) ** 2
                         if (row - y) ** 2 + (column - x) ** 2 < apart:
                             near[0, y, x], near[1, y, x] = row, column
+
+
+def far_fill(
+    inverse_depth: Tensor, values: Tensor, known: Tensor, *, far_bias: Tensor | float = FAR_BIAS
+) -> tuple[Tensor, Tensor]:
+    """Fill the unknown part of an inverse depth image and of the values that go with it.
+
+    What a moving camera uncovers lies behind what covered it, so a hole between a near and a far
+    surface extends the far one. A fill from coarse to fine gives the first guess; at every resolution
+    a relaxation turns it into a membrane over the rim, in which a rim sample counts the less the nearer
+    it is than the fill: min(1, fill / sample)^far_bias. The work grows with the hole, not the image.
+
+    Args:
+        inverse_depth: [H, W], positive where known.
+        values: [C, H, W], what is propagated along with it, colour for instance.
+        known: [H, W] bool. Elsewhere the input is ignored.
+        far_bias: one number, or one for each pixel [H, W]; 0 treats both sides of the rim alike.
+
+    Returns:
+        Inverse depth [H, W] and values [C, H, W], float32, on the input's device; known pixels as they were.
+
+    Raises:
+        ValueError: nothing is known.
+    """
+    if not bool(known.any()):
+        raise ValueError("nothing to fill from: no pixel is known")
+    # Pixel by pixel what belongs together lies together: the hole's pixels are scattered through memory.
+    depths = inverse_depth.detach().cpu().float().clone(memory_format=torch.contiguous_format)
+    others = values.detach().cpu().float().permute(1, 2, 0).clone(memory_format=torch.contiguous_format)
+    bias = torch.as_tensor(far_bias, dtype=torch.float32).cpu().expand(inverse_depth.shape).contiguous()
+    _fill_level(depths.numpy(), others.numpy(), known.cpu().contiguous().numpy(), bias.numpy())
+    return depths.to(inverse_depth.device), others.permute(2, 0, 1).to(inverse_depth.device)
+
+
+def _fill_level(depths: Floats, values: Floats, known: Bools, bias: Floats) -> None:
+    """Fill one level's inverse depths [H, W] and values [H, W, C] in place: from the next coarser one, then relaxed."""
+    count, channels = known.size - np.count_nonzero(known), values.shape[-1]
+    if count == 0:
+        return
+    reference = np.float32(torch.from_numpy(depths[known]).median() if bias.any() else 1)  # the lower one
+    size = [-(-side // 2) for side in known.shape]
+    coarse = (np.empty(size, np.float32), np.empty((*size, channels), np.float32))
+    masks = (np.empty(size, np.bool_), np.empty(size, np.float32))
+    fine = (depths, values, known, bias, reference)
+    run_chunks(lambda start, stop: _coarsen(start, stop, *fine, *coarse, *masks), size[0], GRAIN)
+    _fill_level(*coarse, *masks)
+    holes, links, rim = _find_holes(known, count)
+    flat, pixels = depths.reshape(-1), values.reshape(known.size, channels)
+    samples = np.empty((count + len(rim), 1 + channels), np.float32)  # of the holes, and after those of the rim
+    _guess(known.shape[1], *coarse, holes, samples)
+    samples[count:, 0], samples[count:, 1:] = flat[rim], pixels[rim]
+    samples = _relax(samples, samples.copy(), links, bias.ravel()[holes], SWEEPS)
+    flat[holes], pixels[holes] = samples[:count, 0], samples[:count, 1:]
+
+
+@kernel
+def _coarsen(
+    start: int, stop: int, depths: Any, values: Any, known: Any, bias: Any, reference: Any,
+    coarse_depths: Any, coarse_values: Any, coarse_known: Any, coarse_bias: Any,
+) -> None:  # fmt: skip
+    """Rows start..stop of means of 2×2 pixels over the known ones, the far ones counting most; flags; mean bias."""
+    height, width = depths.shape
+    channels = values.shape[2]
+    weights = np.empty(4, np.float32)
+    for row in range(start, stop):
+        for column in range(coarse_depths.shape[1]):
+            top, left = 2 * row, 2 * column
+            bottom, right = min(top + 1, height - 1), min(left + 1, width - 1)
+            corners = (bias[top, left], bias[top, right], bias[bottom, left], bias[bottom, right])
+            coarse_bias[row, column] = corners[0] / 4 + corners[1] / 4 + corners[2] / 4 + corners[3] / 4
+            mass, depth = np.float32(0), np.float32(0)
+            for k in range(4):
+                y, x = top + k // 2, left + k % 2
+                weights[k] = 0
+                if y < height and x < width and known[y, x]:
+                    weights[k] = _far_weight(depths[y, x] / reference, bias[y, x])
+                    mass += weights[k]
+                    depth += weights[k] * depths[y, x]
+            coarse_known[row, column] = mass > 0
+            if not mass > 0:
+                continue
+            coarse_depths[row, column] = depth / mass
+            for channel in range(channels):
+                total = np.float32(0)
+                for k in range(4):
+                    if weights[k] > 0:
+                        total += weights[k] * values[top + k // 2, left + k % 2, channel]
+                coarse_values[row, column, channel] = total / mass
+
+
+@kernel
+def _far_weight(relative: Any, bias: Any) -> Any:
+    """relative^−bias, kept within single precision."""
+    if bias == 0:
+        return np.float32(1)
+    exponent = -bias * np.log(max(relative, np.float32(1e-6)))
+    if abs(exponent) < MAX_EXPONENT:
+        return np.float32(np.exp(np.float64(exponent)))
+    return HEAVIEST if exponent > 0 else LIGHTEST
+
+
+@kernel
+def _find_holes(known: Any, count: int) -> Any:
+    """Flat positions of the holes [n], links [n, 4] to neighbours (holes, then the rim; itself outside), the rim."""
+    height, width = known.shape
+    holes, links = np.empty(count, np.int32), np.empty((count, AROUND), np.int32)
+    rim = np.empty(min(AROUND * count, height * width - count), np.int32)
+    numbers = np.empty((height, width), np.int32)
+    n = 0
+    for y in range(height):
+        for x in range(width):
+            if known[y, x]:
+                numbers[y, x] = -1
+            else:
+                numbers[y, x] = n
+                holes[n] = y * width + x
+                n += 1
+    met = 0
+    for n in range(count):
+        y, x = holes[n] // width, holes[n] % width
+        for k in range(AROUND):
+            v = min(max(y + (k == 1) - (k == 0), 0), height - 1)
+            u = min(max(x + (k == 3) - (k == 2), 0), width - 1)
+            if numbers[v, u] < 0:
+                numbers[v, u] = count + met
+                rim[met] = v * width + u
+                met += 1
+            links[n, k] = numbers[v, u]
+    return holes, links, rim[:met]
+
+
+@kernel
+def _guess(width: int, coarse_depths: Any, coarse_values: Any, holes: Any, samples: Any) -> None:
+    """Samples [holes, 1 + C] of the coarser level, interpolated bilinearly."""
+    rows, columns, channels = coarse_values.shape
+    for n in range(len(holes)):
+        y, x = holes[n] // width, holes[n] % width
+        # A fine pixel lies a quarter of a coarse one beside its parent's centre.
+        y0, x0 = (y - 1) // 2, (x - 1) // 2
+        fy = np.float32(0.75) if y % 2 == 0 else np.float32(0.25)
+        fx = np.float32(0.75) if x % 2 == 0 else np.float32(0.25)
+        top, bottom = max(y0, 0), min(y0 + 1, rows - 1)
+        left, right = max(x0, 0), min(x0 + 1, columns - 1)
+        upper = coarse_depths[top, left] * (1 - fx) + coarse_depths[top, right] * fx
+        lower = coarse_depths[bottom, left] * (1 - fx) + coarse_depths[bottom, right] * fx
+        samples[n, 0] = upper * (1 - fy) + lower * fy
+        for channel in range(channels):
+            upper = coarse_values[top, left, channel] * (1 - fx) + coarse_values[top, right, channel] * fx
+            lower = coarse_values[bottom, left, channel] * (1 - fx) + coarse_values[bottom, right, channel] * fx
+            samples[n, 1 + channel] = upper * (1 - fy) + lower * fy
+
+
+@kernel
+def _relax(samples: Any, copy: Any, links: Any, bias: Any, sweeps: int) -> Any:
+    """Samples after Jacobi sweeps on the holes, the first of them; nothing flows across the image's border."""
+    count, channels = len(links), samples.shape[1]
+    old, new = samples, copy
+    for _ in range(sweeps):
+        for n in range(count):
+            up, down, left, right = links[n]
+            if bias[n] == 0 or max(up, down, left, right) < count:
+                for channel in range(channels):
+                    both = old[up, channel] + old[down, channel] + old[left, channel] + old[right, channel]
+                    new[n, channel] = both / AROUND
+                continue
+            here, mass = old[n, 0], np.float32(0)
+            new[n] = 0
+            for k in range(AROUND):
+                link = links[n, k]
+                conductance = np.float32(1) if link < count else _conductance(here, old[link, 0], bias[n])
+                mass += conductance
+                for channel in range(channels):
+                    new[n, channel] += conductance * old[link, channel]
+            for channel in range(channels):
+                new[n, channel] /= mass
+        old, new = new, old
+    return old
+
+
+@kernel
+def _conductance(here: Any, there: Any, bias: Any) -> Any:
+    """How much a sample of the rim counts: the less the nearer it is."""
+    if there <= here:
+        return np.float32(1)
+    ratio = max(here / max(there, np.float32(1e-12)), np.float32(1e-6))
+    return np.float32(max(np.exp(bias * np.log(np.float64(ratio))), MIN_TRUST))

@@ -13,8 +13,8 @@ guess, blurred. The mean counts a cell of the hole the less the deeper it lies.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,9 @@ GRAIN = 256  # cells that a thread takes at a time
 Floats = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int32]
+# The best patch so far of each of the n cells of a level's hole: the cells' numbers [h, w], -1 outside of the hole;
+# source, row and column of the patch's centre [n, 3]; costs [n].
+Matches = tuple[Ints, Ints, Floats]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +73,8 @@ def match_patches(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> Patches
         matches = _match(levels[number], matches, number)
     mismatch, places = np.zeros(hole.shape, np.float32), np.full((*hole.shape, 3), -1, np.int32)
     if matches is not None:
-        mismatch[levels[0].hole], places[levels[0].hole] = np.sqrt(matches.costs), matches.places
+        _, places[levels[0].hole], costs = matches
+        mismatch[levels[0].hole] = np.sqrt(costs)
     return Patches(*(torch.from_numpy(grid) for grid in (levels[0].rgb, mismatch, places)))
 
 
@@ -84,45 +88,26 @@ class _Level:
     weights: Floats  # [h + 6, w + 6] of a cell in a patch; 0 beyond the picture
 
 
-@dataclasses.dataclass(frozen=True)
-class _Matches:
-    """The best patch so far of each of the n cells of a level's hole."""
-
-    numbers: Ints  # [h, w] of each cell in the lists below; -1 outside of the hole
-    places: Ints  # [n, 3] source, row, column of the patch's centre
-    costs: Floats  # [n]
-
-
 def _pyramid(guess: Tensor, hole: Tensor, inverse_depth: Tensor) -> list[_Level]:
     """The finest level first. The hole starts as what is mirrored at its rim, where that is the same surface."""
-    log = inverse_depth.clamp_min(1e-9).log()
-    depth = log / max(float(log[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
-    levels: list[_Level] = []
-    rgb, tone = guess, guess
-    for number in itertools.count():
-        near = nearest_known(hole.numpy())
-        if not number:
-            mirrored = rgb.numpy().copy()
-            _mirror(mirrored, hole.numpy(), depth.numpy(), near)
-            rgb = torch.from_numpy(mirrored)
-        tones = TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2**number, 0.5))
-        traits = torch.cat([tones, DEPTH_WEIGHT * depth[..., None]], dim=-1)
+    depth = inverse_depth.clamp_min(1e-9).log()[..., None]
+    depth = depth / max(float(depth[~hole].std(correction=0)) if bool((~hole).any()) else 0.0, LEAST_SPREAD)
+    rgb, tone, levels = guess.clone(memory_format=torch.contiguous_format), guess, list[_Level]()
+    _mirror(rgb.numpy(), hole.numpy(), depth[..., 0].numpy(), nearest_known(hole.numpy()))
+    while True:
+        traits = [TONE_WEIGHT * blurred(tone, max(TONE_CELLS / 2 ** len(levels), 0.5)), DEPTH_WEIGHT * depth]
         weights = np.zeros([size + 2 * RADIUS for size in hole.shape], np.float32)
-        inside = np.hypot(*(near - np.indices(hole.shape)).astype(np.float32))
+        inside = np.hypot(*(nearest_known(hole.numpy()) - np.indices(hole.shape)).astype(np.float32))
         weights[RADIUS:-RADIUS, RADIUS:-RADIUS] = np.maximum(np.float32(FADING) ** inside, FAINTEST_CELL)
-        levels.append(_Level(rgb.numpy().copy(), np.ascontiguousarray(traits.numpy()), hole.numpy(), weights))
+        picture, marks = (image.contiguous().numpy() for image in (rgb, torch.cat(traits, dim=-1)))
+        levels.append(_Level(picture, marks, hole.numpy(), weights))
         coarse_hole = avg_pool2d(hole[None].float(), 2, ceil_mode=True)[0] > 0
         if min(hole.shape) < 2 * COARSEST or bool(coarse_hole.all()) or not bool(hole.any()):
             return levels
-        rgb, tone, depth = _halved(rgb), _halved(tone), _halved(depth[..., None])[..., 0]
+        planes = (image.permute(2, 0, 1) for image in (rgb, tone, depth))
+        means = (avg_pool2d(plane, 2, ceil_mode=True, count_include_pad=False) for plane in planes)
+        rgb, tone, depth = (mean.permute(1, 2, 0) for mean in means)
         hole = coarse_hole
-    raise AssertionError
-
-
-def _halved(image: Tensor) -> Tensor:
-    """Means of 2×2 cells of [h, w, c]."""
-    planes = image.permute(2, 0, 1)
-    return avg_pool2d(planes, 2, ceil_mode=True, count_include_pad=False).permute(1, 2, 0)
 
 
 @kernel
@@ -138,7 +123,7 @@ def _mirror(rgb: Any, hole: Any, depth: Any, near: Any) -> None:
                     rgb[y, x] = rgb[v, u]
 
 
-def _match(level: _Level, coarse: _Matches | None, number: int) -> _Matches | None:
+def _match(level: _Level, coarse: Matches | None, number: int) -> Matches | None:
     """Search and vote in turn, the level's colours in place; None where there is no hole, or no patch for it."""
     usable = ~greatest_around(torch.from_numpy(level.hole), RADIUS).numpy()
     usable[:RADIUS] = usable[-RADIUS:] = False
@@ -146,42 +131,33 @@ def _match(level: _Level, coarse: _Matches | None, number: int) -> _Matches | No
     if not usable.any() or not level.hole.any():
         return None
     height, width = level.hole.shape
-    cells = np.argwhere(level.hole).astype(np.int32)
+    cells, pool = (np.argwhere(mask).astype(np.int32) for mask in (level.hole, usable))
     numbers = np.full((height, width), -1, np.int32)
     numbers[level.hole] = np.arange(len(cells))
-    pool = np.argwhere(usable).astype(np.int32)
-    both = (level.rgb, level.traits, usable)
-    sources, traits, valid = (np.ascontiguousarray(np.stack([grid, grid[:, ::-1]])) for grid in both)
+    grids = (level.rgb, level.traits, usable)
+    sources, traits, valid = (np.ascontiguousarray(np.stack([grid, grid[:, ::-1]])) for grid in grids)
     places, costs = np.empty((len(cells), 3), np.int32), np.zeros(len(cells), np.float32)
-    parents = (coarse.numbers, coarse.places) if coarse else (numbers, places)
-    _begin(cells, coarse is not None, *parents, valid, pool, places)
+    parents = coarse or (numbers, places, costs)
+    _begin(cells, coarse is not None, *parents[:2], valid, pool, places)
     padded = np.pad(level.rgb, ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
-    shown = padded[RADIUS:-RADIUS, RADIUS:-RADIUS]
     target = (padded, level.weights, level.traits, sources, traits, np.float32(OFFSET_WEIGHT / max(height, width) ** 2))
 
+    def run(function: Callable[..., None], *given: Any) -> None:
+        run_chunks(lambda start, stop: function(start, stop, cells, *given), len(cells), GRAIN)
+
     def vote(mean: float) -> None:
-        limit = np.float32(max(mean, LEAST_COST))
-        run_chunks(
-            lambda start, stop: _vote(start, stop, cells, numbers, places, costs, limit, sources, level.rgb),
-            len(cells),
-            GRAIN,
-        )
-        shown[:] = level.rgb
+        run(_vote, numbers, places, costs, np.float32(max(mean, LEAST_COST)), sources, level.rgb)
+        padded[RADIUS:-RADIUS, RADIUS:-RADIUS] = level.rgb
 
     if coarse is not None:
         vote(1.0)  # of costs that are all zero
     for turn in range(ROUNDS):
-        run_chunks(lambda start, stop: _score(start, stop, cells, places, *target, costs), len(cells), GRAIN)
+        run(_score, places, *target, costs)
         for jump in JUMPS:
             seed = np.uint32(((number * ROUNDS + turn) * len(JUMPS) + jump) * 7919)
-            before = (numbers, places.copy(), costs.copy(), valid, pool, jump, seed)
-            run_chunks(
-                lambda start, stop, before=before: _search(start, stop, cells, *before, *target, places, costs),  # type: ignore[misc]
-                len(cells),
-                GRAIN,
-            )
+            run(_search, numbers, places.copy(), costs.copy(), valid, pool, jump, seed, *target, places, costs)
         vote(float(costs.mean()))
-    return _Matches(numbers, places, costs)
+    return numbers, places, costs
 
 
 @kernel
@@ -191,16 +167,15 @@ def _begin(cells: Any, refine: bool, coarse_numbers: Any, coarse: Any, valid: An
     height, width = valid.shape[1:]
     for n in range(len(cells)):
         y, x = cells[n]
-        k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
         pick = pool[_hash(np.uint32(n)) % np.uint32(len(pool))]
-        m, v, u = np.int64(0), np.int64(pick[0]), np.int64(pick[1])
+        places[n, 0], places[n, 1], places[n, 2] = 0, pick[0], pick[1]
+        k = coarse_numbers[min(y // 2, rows - 1), min(x // 2, columns - 1)] if refine else -1
         if k >= 0:
             # A mirrored picture's cells begin at the other side.
-            side = width - 2 * columns if coarse[k, 0] else 0
+            m, side = coarse[k, 0], width - 2 * columns if coarse[k, 0] else 0
             row, column = 2 * coarse[k, 1] + y % 2, 2 * coarse[k, 2] + x % 2 + side
-            if 0 <= row < height and 0 <= column < width and valid[coarse[k, 0], row, column]:
-                m, v, u = np.int64(coarse[k, 0]), np.int64(row), np.int64(column)
-        places[n, 0], places[n, 1], places[n, 2] = m, v, u
+            if 0 <= row < height and 0 <= column < width and valid[m, row, column]:
+                places[n, 0], places[n, 1], places[n, 2] = m, row, column
 
 
 @kernel

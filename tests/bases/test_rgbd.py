@@ -28,7 +28,7 @@ from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
-from spackle.fill import far_fill
+from spackle.filters import far_fill
 from spackle.image import Photo
 from spackle.photo_frame import PhotoFrame
 from spackle.render import CpuRenderer

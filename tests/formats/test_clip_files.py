@@ -12,7 +12,7 @@ import pytest
 import torch
 from clips import moving, write_clip
 from command import report_of, run
-from photos import metres, picture, write_depth
+from photos import picture, write_depth
 from PIL import Image
 from scenes import psnr
 
@@ -22,24 +22,19 @@ from spackle.errors import InputError
 pytest.importorskip("cv2")
 
 
-@pytest.mark.parametrize(
-    ("name", "codec", "pix_fmt"),
-    [
-        ("a.mp4", "libx264", "yuv420p"),
-        ("a.mkv", "libx264", "yuv444p"),
-        ("a.webm", "libvpx-vp9", "yuv420p"),
-        ("a.gif", "gif", "rgb8"),
-    ],
-)
-def test_frames_come_as_they_were(tmp_path: Path, name: str, codec: str, pix_fmt: str) -> None:
-    given = moving(5, 47, 65) if pix_fmt == "yuv444p" else moving(5)
-    clip = read_clip(write_clip(tmp_path / name, given, codec, pix_fmt))
+KINDS = {".mp4": ("libx264", "yuv420p"), ".mkv": ("libx264", "yuv444p"), ".webm": ("libvpx-vp9", "yuv420p")}
+
+
+@pytest.mark.parametrize(("suffix", "coding"), [*KINDS.items(), (".gif", ("gif", "rgb8"))])
+def test_frames_come_as_they_were(tmp_path: Path, suffix: str, coding: tuple[str, str]) -> None:
+    given = moving(5, 47, 65) if suffix == ".mkv" else moving(5)
+    clip = read_clip(write_clip(tmp_path / f"a{suffix}", given, *coding))
     assert is_clip(clip.path)
     assert (len(clip), clip.width, clip.height) == (5, given[0].shape[1], given[0].shape[0])
     assert float(clip.rate) == pytest.approx(10, rel=0.01)
     assert [float(t) for t in clip.times] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4], abs=0.002)
     for sent, got in zip(given, clip_frames(clip), strict=True):
-        assert psnr(got, torch.from_numpy(sent).float() / 255) > (18 if name.endswith("gif") else 24)
+        assert psnr(got, torch.from_numpy(sent).float() / 255) > (18 if suffix == ".gif" else 24)
 
 
 def test_uneven_times_are_kept_and_the_first_frames_may_be_all(tmp_path: Path) -> None:
@@ -122,12 +117,9 @@ def test_a_bad_clip_is_one_line(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
-# The command -------------------------------------------------------------------------------------
-
-
 def depths(folder: Path, count: int) -> Path:
     for index in range(count):
-        write_depth(folder / f"{index:06d}.npy", metres())
+        write_depth(folder / f"{index:06d}.npy")
     return folder
 
 
@@ -160,22 +152,19 @@ def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None
     assert not (tmp_path / "out").exists()
 
 
-NOT_FOR_CLIPS = "--cameras v.json, --mode view, --no-render, --depth a.npy, --stereo sbs, --format gif"
+REFUSED = ["--cameras v.json", "--mode view", "--no-render", "--depth a.npy", "--stereo sbs", "--format gif", "no cv2"]
 
 
-@pytest.mark.parametrize("option", NOT_FOR_CLIPS.split(", "))
-def test_an_option_that_a_clip_has_no_use_for_is_one_line(tmp_path: Path, option: str) -> None:
-    done = run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out", *option.split())
+@pytest.mark.parametrize("option", REFUSED)
+def test_what_a_clip_cannot_have_is_one_line(tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words, says = option.split(), option.split()[0]
+    if option == "no cv2":
+        monkeypatch.setitem(sys.modules, "cv2", None)
+        words, says = [], "pip install 'spackle-nvs[opencv]'"
+    done = run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out", *words)
     assert (done.code, len(done.lines)) == (2, 1), done.err
-    assert option.split()[0] in done.err
+    assert says in done.err
     assert not (tmp_path / "out").exists()
-
-
-def test_without_opencv_a_clip_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    done = run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out")
-    assert (done.code, len(done.lines)) == (2, 1)
-    assert "pip install 'spackle-nvs[opencv]'" in done.err
 
 
 def test_a_damaged_frame_is_named(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.residual import Seeds
 from spackle.residual.complete import OPACITY, compose
-from spackle.residual.network import ALPHA, COLOR, COLOR_MARGIN, DELTA_CHANNELS, INVERSE_DEPTH, XY
+from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS
 
 CAMERA = shifted(Camera.from_focal(60, 64, 48), 0.4)
 DRAWN = torch.rand(20, 8, generator=torch.Generator().manual_seed(0))
@@ -40,12 +40,12 @@ def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
 @pytest.mark.parametrize("by", [-1e4, -20.0, -1.0, 1.0, 20.0, 1e4])
 def test_deltas_move_what_their_channels_say_and_keep_bounds(by: float) -> None:
     deltas = torch.zeros(3, 20, DELTA_CHANNELS)
-    deltas[0, :, XY] = torch.tensor([by, -2 * by])
-    deltas[1, :, INVERSE_DEPTH] = by
-    deltas[2, :, COLOR] = deltas[2, :, ALPHA] = by
+    deltas[0, :, :2] = torch.tensor([by, -2 * by])
+    deltas[1, :, 2] = by
+    deltas[2, :, 10:] = by
     on_image, along_ray, looks = (compose(SEEDS, part, CAMERA) for part in deltas)
     uv, z = CAMERA.project(on_image.means)
-    torch.testing.assert_close(uv, SEEDS.uv + deltas[0, :, XY], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(uv, SEEDS.uv + deltas[0, :, :2], rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(z, 1 / SEEDS.inverse_depth, rtol=1e-2, atol=0)
     uv, z = CAMERA.project(along_ray.means)
     assert float(z.min()) > 0  # never behind the eye

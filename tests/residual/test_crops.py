@@ -14,8 +14,8 @@ from scenes import Scene, texture
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
+from spackle.crop import Crop, crops_around
 from spackle.residual import hole_area_ratio
-from spackle.residual.crops import Crop, crops_around
 from spackle.residual.network import STRIDE, predict_deltas
 from spackle.scene_fill import fill_scene
 from spackle.scene_fill.fill import SEEDS_HAR

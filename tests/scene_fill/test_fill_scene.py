@@ -21,8 +21,7 @@ from spackle.render import CpuRenderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, ViewFeatures, hole_area_ratio, hole_mask, make_seeds
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
-from spackle.scene_fill.fill import COARSE, REACH_CELLS, WIDEST, rim_underlay
-from spackle.scene_fill.view_order import farthest_first
+from spackle.scene_fill.fill import COARSE, REACH_CELLS, WIDEST, farthest_first, rim_underlay
 
 FRAMES = 60
 

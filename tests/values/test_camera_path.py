@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import box_before_wall
+from scenes import box_before_wall, random_gaussians
 from torch import Tensor
 
 from spackle.camera import Camera
@@ -113,9 +113,7 @@ def test_what_happens_between_keys_is_looked_at_too() -> None:
 
 def points_of(depths: Tensor) -> Gaussians:
     """Gaussians on the optical axis."""
-    n = len(depths)
-    means = torch.stack([torch.zeros(n), torch.zeros(n), depths], dim=1)
-    return Gaussians(means, torch.ones(n, 4), torch.ones(n, 3), torch.ones(n), torch.ones(n, 3))
+    return dataclasses.replace(random_gaussians(len(depths)), means=depths[:, None] * torch.tensor([0.0, 0.0, 1.0]))
 
 
 def test_depths_are_quantiles_and_the_focus_is_two_metres_away_at_least() -> None:

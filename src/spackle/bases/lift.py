@@ -23,8 +23,7 @@ from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera
 from spackle.color import bright_or_blue, srgb_to_linear
 from spackle.errors import InputError
-from spackle.fill import far_fill
-from spackle.filters import greatest_around
+from spackle.filters import far_fill, greatest_around
 from spackle.image import Photo, resize_photo
 from spackle.surface import EDGE
 

@@ -11,7 +11,6 @@ from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, view_at
 from spackle.clips.temporal import (
-    CompletedFrame,
     DepthAlignment,
     Flow,
     FrameMemory,
@@ -109,8 +108,11 @@ class ClipCompleter:
         if self.fill:
             with timed("carry", self.seconds):
                 memory_before = None if past is None else past.memory
-                frame = propagate_colors(base, aux, camera, self.renderer, (before, alone), memory_before, self.flow)
-                drawn, memory = _carried(drawn, frame, past), frame.memory
+                views = (before, alone)
+                aux, memory, flow = propagate_colors(base, aux, camera, self.renderer, views, memory_before, self.flow)
+                drawn = dataclasses.replace(drawn, gaussians=(base, aux), view=memory.view)
+                if past is not None and past.drawn is not None and flow is not None:
+                    drawn = dataclasses.replace(drawn, flicker=_flicker(drawn, past.drawn, flow))
         self._past = dataclasses.replace(now, memory=memory, drawn=drawn)
         self._count += 1
         return drawn
@@ -137,18 +139,11 @@ class ClipCompleter:
         return base, guard, _Past(rgb, inverse_depth, alignment, depths), past
 
 
-def _carried(drawn: CompletedView, frame: CompletedFrame, past: _Past | None) -> CompletedView:
-    """What was drawn, with the colours of the past."""
-    drawn = dataclasses.replace(drawn, gaussians=(drawn.gaussians[0], frame.aux), view=frame.view)
-    if past is None or past.drawn is None or frame.flow is None:
-        return drawn
-    earlier, hole = past.drawn, drawn.hole
-    was = sample(earlier.hole[..., None].float(), pixel_grid(frame.flow) + frame.flow)[..., 0]
+def _flicker(drawn: CompletedView, earlier: CompletedView, flow: Tensor) -> dict[str, float]:
+    """What can be told of FIGURES."""
+    hole = drawn.hole
+    was = sample(earlier.hole[..., None].float(), pixel_grid(flow) + flow)[..., 0]
     both, neither = hole & (was > 0.999), ~hole & (was < 0.001)
-    pairs = {
-        "seen": (drawn.view, earlier.view, neither),
-        "alone": (drawn.alone, earlier.alone, both),
-        "carried": (drawn.view, earlier.view, both),
-    }
-    figures = {name: flicker(one.rgb, other.rgb, frame.flow, chosen) for name, (one, other, chosen) in pairs.items()}
-    return dataclasses.replace(drawn, flicker={name: value for name, value in figures.items() if value is not None})
+    pairs = ((drawn.view, earlier.view, neither), (drawn.alone, earlier.alone, both), (drawn.view, earlier.view, both))
+    values = (flicker(one.rgb, other.rgb, flow, chosen) for one, other, chosen in pairs)
+    return {name: value for name, value in zip(FIGURES, values, strict=True) if value is not None}

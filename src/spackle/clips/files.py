@@ -26,10 +26,8 @@ from spackle.files import check_file
 from spackle.formats.video import BT709, H264, StreamEncoder, VideoWriter
 from spackle.image import check_pixels
 
-SUFFIXES = (
-    *(".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
-    *(".wmv", ".flv", ".3gp", ".ogv"),
-)
+SUFFIXES = {".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".gif", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".wmv"}
+SUFFIXES |= {".flv", ".3gp", ".ogv"}
 UNSPECIFIED, BT601 = 2, 5  # FFmpeg's numbers of matrices
 HD_ROWS = 720  # a video that says nothing of its colours has BT.709's from this height on, as players take it
 LISTS = {"concat", "dash", "hls", "rtsp", "sdp", "webm_dash_manifest"}  # FFmpeg opens what they name
@@ -79,17 +77,10 @@ def is_clip(path: Path) -> bool:
 def read_clip(
     path: str | os.PathLike[str], first: int | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Clip:
-    """Decode a clip from beginning to end and keep nothing of it but its shape and its times.
+    """Decode a clip from beginning to end, so that what is wrong with its last frame is known at once.
 
-    That takes little beside what is done with each frame later, and what is wrong with the last frame is known at once.
-
-    Args:
-        path: the file.
-        first: how many frames count; all where None.
-        progress: called with (frames read, how many the file says there are).
-
-    Raises:
-        InputError: no clip, or one that is cut off, damaged, without a picture, or of unknown coding.
+    `first` is how many frames count, all where None; `progress` is called with (frames read, frames that the file says
+    there are). InputError for what is no clip, or cut off, damaged, without a picture, or of unknown coding.
     """
     check_file(path, "clip")
     ticks: list[Fraction | None] = []
@@ -115,11 +106,7 @@ def read_clip(
 
 
 def clip_frames(clip: Clip) -> Iterator[Tensor]:
-    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1, one at a time.
-
-    Raises:
-        InputError: the file has changed since it was read.
-    """
+    """The frames of a clip, [H, W, 3] float32 sRGB in 0..1; InputError where the file has changed since it was read."""
     with _opened(clip.path) as (container, stream):
         aspect, count = stream.sample_aspect_ratio or Fraction(1), 0
         for frame in _decoded(clip.path, container, stream, len(clip)):
@@ -219,11 +206,7 @@ class ClipWriter(VideoWriter):
     """Writes as many frames as a clip has, at its times, with its sound; the file appears when the block ends well."""
 
     def __init__(self, path: str | os.PathLike[str], clip: Clip) -> None:
-        """Prepare to write an .mp4.
-
-        Raises:
-            InputError: no file can be written there.
-        """
+        """Prepare to write an .mp4; InputError where no file can be written."""
         super().__init__(path)
         self.clip = clip
 

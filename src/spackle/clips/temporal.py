@@ -1,15 +1,15 @@
-"""Frames of a clip that do not flicker: flow from frame to frame, colours that are carried along it, aligned depth.
+"""Frames of a clip that do not flicker: flow from frame to frame, colours propagated along it, aligned depth.
 
-The paper has no clips. Each frame's completion knows nothing of the others. Here its aux Gaussians keep their places
-but take on the colours that stood there a frame ago, followed back by the motion of what is behind. Where an earlier
-frame has seen what is hidden now, that is the truth, and it is carried as such. All blending is of linear light.
+The paper has no clips: each frame's completion knows nothing of the others. Here its aux Gaussians keep their places
+but take on the colours that stood there a frame ago, followed back by the motion of what is behind. What an earlier
+frame has seen there is the truth, and outlives what a completion made up. All blending is of linear light.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
-from spackle.fill import far_fill
+from spackle.filters import far_fill
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, touched_tiles
 from spackle.render.protocol import Rendering
@@ -93,11 +93,8 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 def extend_flow(found: Track, inverse_depth: Tensor, known: Tensor, camera: Camera) -> Tensor:
     """The flow [H, W, 2], guessed where nothing was seen: as the camera moved, and as the far rim differs from that.
 
-    Args:
-        found: what could be followed; it stays as found wherever it is known and sure.
-        inverse_depth: [H, W] positive everywhere, in the holes that of what is to stand there.
-        known: [H, W] bool, where the flow is one of the scene's content.
-        camera: whose picture it is.
+    `found` stays as it is wherever it is sure and `known` [H, W] bool; `inverse_depth` [H, W] is positive everywhere,
+    in the holes that of what is to stand there; `camera` took the picture.
     """
     trusted = known & found.sure
     if not bool(trusted.any()):
@@ -150,20 +147,10 @@ def _fit(basis: Tensor, flow: Tensor, trusted: Tensor) -> Tensor:
 class FrameMemory:
     """What is known of a view once its frame is done."""
 
-    shown: Tensor  # [H, W, 3] sRGB of the completed view
+    view: Rendering  # completed
     light: Tensor  # [H, W, 3] linear: what was seen, and in the holes the light behind their veil
     inverse_depth: Tensor  # [H, W] of the same, positive
     trust: Tensor  # [H, W] in 0..1: 1 where it was seen, about KEEP^n where that was n frames ago
-
-
-@dataclasses.dataclass(frozen=True)
-class CompletedFrame:
-    """A completed view whose holes keep the colours of the view before, where it showed them."""
-
-    aux: Gaussians
-    view: Rendering
-    memory: FrameMemory
-    flow: Tensor | None  # [H, W, 2] into the view before, holes included; None without one
 
 
 def propagate_colors(
@@ -171,11 +158,11 @@ def propagate_colors(
     aux: Gaussians,
     camera: Camera,
     renderer: Renderer,
-    views: Sequence[Rendering],
+    views: tuple[Rendering, Rendering],
     past: FrameMemory | None,
     flow: Flow,
-) -> CompletedFrame:
-    """Give the aux Gaussians of a frame the colours of the past.
+) -> tuple[Gaussians, FrameMemory, Tensor | None]:
+    """Give the aux Gaussians of a frame the colours that the view before showed in its holes.
 
     Args:
         base: the frame's own Gaussians.
@@ -185,18 +172,22 @@ def propagate_colors(
         views: the view of the base alone, and with `aux`.
         past: of the view before; None at the start. A view of another shot is ignored, see `Track.same_shot`.
         flow: finds the motion between two pictures.
+
+    Returns:
+        The aux Gaussians, what is known of the view with them, and the flow [H, W, 2] into the view before, holes
+        included; None without one.
     """
     before, own = views
     hole = hole_mask(before.alpha)
     made_up, inverse_depth = behind(before, own, hole)
     share = torch.where(hole, own.alpha - before.alpha, 1.0).clamp_min(0)
-    start = FrameMemory(own.rgb, made_up, inverse_depth, _trust(hole, share, torch.zeros_like(share)))
-    found = None if past is None else track(own.rgb, past.shown, flow)
+    start = FrameMemory(own, made_up, inverse_depth, _trust(hole, share, torch.zeros_like(share)))
+    found = None if past is None else track(own.rgb, past.view.rgb, flow)
     if past is None or found is None or not found.same_shot(~hole):
-        return CompletedFrame(aux, own, start, None)
+        return aux, start, None
     motion = extend_flow(found, inverse_depth, ~hole, camera)
     if not bool(hole.any()):
-        return CompletedFrame(aux, own, start, motion)
+        return aux, start, motion
     recalled, weight = _recall(past, pixel_grid(motion) + motion, inverse_depth)
     # How much brighter the frame is than the one before, where both show the same.
     same = found.sure & ~hole
@@ -210,9 +201,7 @@ def propagate_colors(
     # In what is faint, a cell's own colour is all noise: no change can be told from it.
     changed = _recoloured(aux, camera, light - made_up, torch.where(hole & (share >= FAINT), share, 0.0))
     view = renderer.render([base, changed], camera, tiles=touched_tiles(aux, camera), onto=own)
-    return CompletedFrame(
-        changed, view, FrameMemory(view.rgb, light, inverse_depth, _trust(hole, share, weight)), motion
-    )
+    return changed, FrameMemory(view, light, inverse_depth, _trust(hole, share, weight)), motion
 
 
 def _trust(hole: Tensor, share: Tensor, weight: Tensor) -> Tensor:
@@ -279,16 +268,11 @@ def _recoloured(aux: Gaussians, camera: Camera, change: Tensor, share: Tensor) -
 def flicker(view: Tensor, earlier: Tensor, flow: Tensor, chosen: Tensor) -> float | None:
     """Mean absolute difference of a view [H, W, 3] from an earlier one, both sRGB, that is warped by a flow [H, W, 2].
 
-    Args:
-        view, earlier: of the same size.
-        flow: from the view's pixels to the earlier one's.
-        chosen: [H, W] bool, the pixels that count; none of them: None.
+    The flow leads from the view's pixels to the earlier one's; pixels `chosen` [H, W] bool count, without any: None.
     """
     uv = pixel_grid(flow) + flow
     chosen = chosen & inside(uv, *chosen.shape)
-    if not bool(chosen.any()):
-        return None
-    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean())
+    return float((view - sample(earlier, uv)).abs().mean(-1)[chosen].mean()) if bool(chosen.any()) else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,14 +310,9 @@ class DepthAlignment:
 
 
 def align_depth(inverse_depth: Tensor, earlier: Tensor, found: Track) -> DepthAlignment:
-    """What brings the inverse depth of a frame to that of the one before, where it shows the same.
+    """What brings a frame's inverse depth [H, W], 0 where unknown, to that of the one before, where both show the same.
 
     Robust least squares: what moves by itself, and where the two disagree in shape, is outvoted.
-
-    Args:
-        inverse_depth: [H, W], 0 where unknown.
-        earlier: [H, W], of the frame before.
-        found: where the frame's pixels were in that one.
     """
     was = sample(earlier[..., None], pixel_grid(earlier) + found.flow)[..., 0]
     chosen = _thinned(found.sure & (inverse_depth > 0) & (was > 0), FEWEST)

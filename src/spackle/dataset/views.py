@@ -16,7 +16,7 @@ from torch import Tensor
 from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
-from spackle.fill import far_fill
+from spackle.filters import far_fill
 from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
 from spackle.render import Renderer

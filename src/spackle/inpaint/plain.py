@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spackle.errors import InputError
-from spackle.fill import far_fill
+from spackle.filters import far_fill
 from spackle.inpaint import InpainterOptions
 from spackle.patches import match_patches
 

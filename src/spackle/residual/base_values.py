@@ -15,8 +15,7 @@ from torch.nn.functional import avg_pool2d
 
 from spackle.camera import Camera, beside
 from spackle.color import bright_or_blue
-from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import broadly_blurred, distance_to, greatest_around, nearest_known
+from spackle.filters import FAR_BIAS, broadly_blurred, distance_to, far_fill, greatest_around, nearest_known
 from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers
 from spackle.surface import surface_slope

@@ -18,18 +18,7 @@ from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual.base_values import Seeds, make_seeds
-from spackle.residual.network import (
-    ALPHA,
-    COLOR,
-    INVERSE_DEPTH,
-    QUAT,
-    SCALE,
-    XY,
-    ResidualNet,
-    color_logit,
-    find_rim,
-    predict_deltas,
-)  # fmt: skip
+from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim, predict_deltas
 from spackle.residual.view_features import MASK_THRESHOLD, ViewFeatures
 from spackle.surface import surface_gaussians
 
@@ -86,17 +75,16 @@ def compose(seeds: Seeds, deltas: Tensor | None, camera: Camera, spread_px: floa
     """
     uv, inverse_depth, rgb = seeds.uv, seeds.inverse_depth, seeds.rgb
     opacities = torch.full_like(inverse_depth, OPACITY)
-    if deltas is not None:
-        uv = uv + deltas[:, XY]
-        shift = INVERSE_DEPTH_GAIN * deltas[:, INVERSE_DEPTH].squeeze(1)
-        inverse_depth = _shift_positive(inverse_depth, shift, seeds.unit)
-        rgb = torch.sigmoid(color_logit(rgb) + deltas[:, COLOR])
-        opacities = torch.sigmoid(color_logit(opacities) + deltas[:, ALPHA].squeeze(1))
-    surfels = surface_gaussians(camera, uv, inverse_depth, seeds.slope, spread_px, srgb_to_linear(rgb), opacities)
     if deltas is None:
-        return surfels
-    quats = surfels.quats + QUAT_GAIN * deltas[:, QUAT]
-    return dataclasses.replace(surfels, quats=quats, scales=surfels.scales * _scale_factor(deltas[:, SCALE]))
+        colors = srgb_to_linear(rgb)
+        return surface_gaussians(camera, uv, inverse_depth, seeds.slope, spread_px, colors, opacities)
+    shift, nearer, scale, turn, color, opacity = torch.split(deltas, DELTAS, dim=1)
+    inverse_depth = _shift_positive(inverse_depth, INVERSE_DEPTH_GAIN * nearer.squeeze(1), seeds.unit)
+    colors = srgb_to_linear(torch.sigmoid(color_logit(rgb) + color))
+    opacities = torch.sigmoid(color_logit(opacities) + opacity.squeeze(1))
+    surfels = surface_gaussians(camera, uv + shift, inverse_depth, seeds.slope, spread_px, colors, opacities)
+    scales, quats = surfels.scales * _scale_factor(scale), surfels.quats + QUAT_GAIN * turn
+    return dataclasses.replace(surfels, quats=quats, scales=scales)
 
 
 def _shift_positive(base: Tensor, delta: Tensor, unit: float) -> Tensor:

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from spackle.camera import Camera
+from spackle.crop import crops_around
 from spackle.device import Precision, own_arithmetic, pick_dtype
 from spackle.filters import broadly_blurred
 from spackle.network_file import channels_last, load_strict, read_tensors
 from spackle.patches import TONE_CELLS, Patches, match_patches
 from spackle.residual.base_values import Seeds, inside_photo
-from spackle.residual.crops import crops_around
 from spackle.residual.epipolar_walk import WIDENING, walk, widened
 from spackle.residual.view_features import ViewFeatures
 
@@ -31,18 +31,16 @@ ALIKE = 1.4  # factor by which the inverse depths of a line's far rim and of the
 CRISP = 0.12  # of a view's width: so far the network sees a rim as it is
 
 # Channels of the features.
-CUE_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
-FAR_RIM = slice(CUE_CHANNELS, CUE_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
+VIEW_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
+FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
 MIRRORED = slice(FAR_RIM.stop, FAR_RIM.stop + 3)  # and into the one mirrored at the rim
 EXEMPLAR = slice(MIRRORED.stop + 1, MIRRORED.stop + 4)  # after the distance to the rim: and into the patches'
 IN_CHANNELS = EXEMPLAR.stop + 1  # and the patch distance
 COPIES = 3  # channels that say how much of each to copy
-# Channels of the deltas: three of geometry, eleven of texture, as in SHARP.
-XY, INVERSE_DEPTH, SCALE, QUAT, COLOR, ALPHA = (
-    slice(0, 2), slice(2, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 14),
-)  # fmt: skip
-GEOMETRY_CHANNELS, TEXTURE_CHANNELS = 3, 11
-DELTA_CHANNELS = GEOMETRY_CHANNELS + TEXTURE_CHANNELS
+# Channels of the deltas, as in SHARP: geometry (pixel, inverse depth), texture (scales, quaternion, colour, opacity).
+DELTAS = [2, 1, 3, 4, 3, 1]
+GEOMETRY_CHANNELS, TEXTURE_CHANNELS, DELTA_CHANNELS = sum(DELTAS[:2]), sum(DELTAS[2:]), sum(DELTAS)
+COLOR = slice(10, 13)
 COLOR_MARGIN = 1.0 / 512  # keeps the inverse sigmoid finite, below 8-bit resolution
 
 TYPICAL_DISTANCE = 16.0  # of a cell to the rim
@@ -97,16 +95,16 @@ def find_rim(features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera:
 
 def network_input(view: ViewFeatures, seeds: Seeds, rim: Rim) -> Tensor:
     """Features [1, 21, h, w], centred around zero; depths as log inverse depth over the view's median."""
-    cue_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
+    view_depth = torch.where(view.inverse_depth > 0, (view.inverse_depth / seeds.unit).clamp_min(1e-4).log(), 0.0)
     seed_depth = (seeds.inverse_depth / seeds.unit).clamp_min(1e-4).log()
-    maps = [cue_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
+    maps = [view_depth, view.alpha, view.mask.to(view.alpha), seed_depth]
     grids = (seeds.rgb, rim.rgb, rim.mirrored, rim.exemplar, rim.distance[..., None], rim.mismatch[..., None])
     *colors, distance, mismatch = (grid[view.mask] for grid in grids)  # elsewhere the rim is the cell itself
-    own, near, mirrored, patches = map(color_logit, colors)
+    seed, near, mirrored, patches = map(color_logit, colors)
     distance, mismatch = (distance / TYPICAL_DISTANCE).log1p(), mismatch / TYPICAL_MISMATCH
-    there = torch.cat([near - own, mirrored - own, distance, patches - own, mismatch], dim=-1)
-    far = there.new_zeros(*view.mask.shape, IN_CHANNELS - CUE_CHANNELS)
-    far[view.mask] = there
+    at_rim = torch.cat([near - seed, mirrored - seed, distance, patches - seed, mismatch], dim=-1)
+    far = at_rim.new_zeros(*view.mask.shape, IN_CHANNELS - VIEW_CHANNELS)
+    far[view.mask] = at_rim
     channels = [view.rgb - 0.5, torch.stack(maps, dim=-1), seeds.rgb - 0.5, far]
     return torch.cat(channels, dim=-1).permute(2, 0, 1)[None].detach()
 
@@ -187,7 +185,7 @@ def predict_deltas(
 ) -> Tensor:
     """Deltas [h, w, 14] float32 of a view's masked cells, on the processor; 0 elsewhere.
 
-    The network looks only around the masked cells, see `spackle.residual.crops`.
+    The network looks only around the masked cells, see `crops_around`.
 
     Args:
         network: a `ResidualNet`; its features travel to the device where it lies.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -17,8 +18,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.device import Precision
-from spackle.fill import far_fill
-from spackle.filters import greatest_around
+from spackle.filters import far_fill, greatest_around, greatest_in_windows
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, place_of, touched_tiles
 from spackle.render.protocol import Rendering
@@ -28,7 +28,6 @@ from spackle.residual.network import ResidualNet, find_rim, predict_deltas
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, PROCESSOR, ViewFeatures, hole_area_ratio
 from spackle.scene_fill.occlusion_guard import OcclusionGuard, free_factors, moved_away, push_behind, without_pits
 from spackle.scene_fill.texture import HoleView, Texture, exemplar_texture, in_cells, sharpened
-from spackle.scene_fill.view_order import QUIET_HAR, farthest_first, mark_checked, skipped_gap
 from spackle.surface import surface_slope
 
 PASSES = 2  # a second look closes what the first one's blobs left thin
@@ -38,6 +37,9 @@ OPPOSITE = 2  # views that are completed before anything goes beneath the rims o
 PAINTED_VIEWS = 2  # of a scene that get the chosen texture, the exemplar's after them: they show nearly all holes
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
+QUIET_HAR = 1e-3  # fewer holes may stay open in a frame that is checked; in between up to twice as many were seen
+SURE_HAR = QUIET_HAR / 4  # so few that more of the frames beside it may be skipped
+SPECK_PX = 4  # a square of holes as wide as this is seen, however little else is open
 FINE_SPREAD_PX = 0.5  # standard deviation of one blob a pixel, which a wide one for its cell backs
 REACH_CELLS = 6  # how far beneath a rim an underlay goes
 COARSE = 3  # an underlay has one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
@@ -146,6 +148,13 @@ def fill_scene(
     checked, pictures, filled = [False] * len(cameras), dict[int, Tensor](), 0
     aux = [Gaussians.empty()]
     waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
+
+    def others(index: int) -> list[OcclusionGuard]:
+        return [guard for of, guard in guards.items() if of != index]
+
+    def underlays() -> list[Gaussians]:
+        return [push_behind(rims, cameras[index].position, others(index)) for index, rims in waiting]
+
     for count, index in enumerate(order):
         camera = cameras[index]
         if exact or not checked[index]:
@@ -156,19 +165,18 @@ def fill_scene(
             if gap > 0:
                 pictures[index] = to_bytes(view.rgb)
             else:
-                others = [guard for of, guard in guards.items() if of != index]
                 means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
                 if filled >= PAINTED_VIEWS and means.texture is not None:
                     means = dataclasses.replace(means, texture=exemplar_texture)
                 enough = CLOSED_HAR if exact else QUIET_HAR
-                new, rims, view = _fill(means, stage, view, camera, others, enough, beneath=len(cameras) > 1)
+                new, rims, view = _fill(means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1)
                 aux += new
                 waiting += [(index, part) for part in rims]
                 filled += 1
                 pictures.clear()
                 guards[index] = OcclusionGuard.of(view, camera, threshold)
                 if filled >= OPPOSITE:
-                    hidden = _behind_others(waiting, cameras, guards)
+                    hidden = underlays()
                     stage.add(*hidden)
                     aux += hidden
                     waiting.clear()
@@ -177,7 +185,52 @@ def fill_scene(
             progress(count + 1, len(order))
     if waiting:
         pictures.clear()
-    return FilledScene(Gaussians.cat([*aux, *_behind_others(waiting, cameras, guards)]).to(device), pictures)
+    return FilledScene(Gaussians.cat([*aux, *underlays()]).to(device), pictures)
+
+
+def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]:
+    """An order that visits the widest view first and then always the one farthest from all visited.
+
+    Any beginning of it is spread evenly over the path.
+    """
+    if not cameras:
+        return []
+    eyes = torch.stack([camera.position.double() for camera in cameras])
+    distance = (eyes - photo_camera.position.double()).norm(dim=-1)
+    order: list[int] = []
+    for _ in cameras:
+        pick = int(distance.argmax())
+        order.append(pick)
+        distance = torch.minimum(distance, (eyes - eyes[pick]).norm(dim=-1))
+        distance[pick] = -1.0
+    return order
+
+
+def skipped_gap(holes: float, alpha: Tensor, threshold: float) -> float:
+    """Fraction of the gap to the nearest checked frames that may be skipped beside a frame; 0: complete it.
+
+    `holes` is the hole area ratio of the frame, alpha its opacity [H, W]. Holes that lie close together are seen,
+    however few they are.
+    """
+    if holes > QUIET_HAR:
+        return 0.0
+    if min(alpha.shape) >= SPECK_PX:
+        covered = greatest_in_windows(alpha >= threshold, SPECK_PX)
+        if not bool(covered[:: SPECK_PX // 2, :: SPECK_PX // 2].all()):
+            return 0.0
+    return 0.75 if holes <= SURE_HAR else 0.5
+
+
+def mark_checked(checked: list[bool], index: int, gap: float) -> None:
+    """Mark a frame as checked, and of the frames to the nearest checked ones on both sides the fraction `gap`.
+
+    Towards an end of the path without a checked frame none is marked.
+    """
+    for frames in (range(index - 1, -1, -1), range(index + 1, len(checked))):
+        between = next((count for count, frame in enumerate(frames) if checked[frame]), 0)
+        for frame in frames[: math.ceil(gap * between)]:
+            checked[frame] = True
+    checked[index] = True
 
 
 def _fill(
@@ -286,16 +339,6 @@ def rim_underlay(mask: Tensor, seeds: Seeds, camera: Camera) -> Gaussians:
     slope = surface_slope(placed) / (COARSE * CELL)
     beneath = compose(Seeds(seeds.uv[EVERY], placed, slope, rgb.permute(1, 2, 0), seeds.unit).select(rim), None, camera)
     return dataclasses.replace(beneath, scales=COARSE * beneath.scales)
-
-
-def _behind_others(
-    waiting: Sequence[tuple[int, Gaussians]], cameras: Sequence[Camera], guards: Mapping[int, OcclusionGuard]
-) -> list[Gaussians]:
-    """What lies beneath the rims of some views, each behind what the guards of all other views show."""
-    return [
-        push_behind(rims, cameras[index].position, [guard for of, guard in guards.items() if of != index])
-        for index, rims in waiting
-    ]
 
 
 class _Stage:

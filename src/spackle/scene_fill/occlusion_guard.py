@@ -57,14 +57,13 @@ def moved_away(aux: Gaussians, eye: Tensor, factors: Tensor) -> Gaussians:
     """
     eye, factor = beside(eye, aux.means), factors[:, None]
     moved = dataclasses.replace(aux, means=eye + factor * (aux.means - eye), scales=aux.scales * factor)
-    free = factors > 0
-    return moved if bool(free.all()) else moved.select(free)
+    return moved.select(factors > 0)
 
 
 def free_factors(aux: Gaussians, eye: Tensor, guards: Sequence[OcclusionGuard]) -> Tensor:
-    """Factors [N] ≥ 1 by which Gaussians have to move away from an eye until no guard is blocked.
+    """Factors [N] ≥ 1 by which Gaussians have to move away from an eye until no guard is blocked; 0 where none does.
 
-    Far enough out everything is behind everything, so a place is found for nearly all; 0 is of those that have none.
+    Far enough out everything is behind everything, so nearly all find a place.
 
     Args:
         aux: N Gaussians in the world's frame.

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.fill import FAR_BIAS, far_fill
-from spackle.filters import blurred, broadly_blurred, distance_to, nearest_known
+from spackle.filters import FAR_BIAS, blurred, broadly_blurred, distance_to, far_fill, nearest_known
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.patches import Patches
 from spackle.render.protocol import Rendering
@@ -35,7 +34,7 @@ EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyon
 CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
 LEAST_ENERGY = 1e-7
 OVERLAP_PX = 0.8  # standard deviation of what a pixel shows of the blobs: more than theirs, for votes blur as well
-STEPS = 2
+STEPS = 2  # of `sharpened`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,13 +156,13 @@ def extended(view: HoleView) -> Tensor:
     return torch.lerp(view.structure, features.rgb[row, column], (fading * view.rim.beyond)[..., None])
 
 
-def sharpened(wanted: Tensor, steps: int = STEPS) -> Tensor:
+def sharpened(wanted: Tensor) -> Tensor:
     """Colours [H, W, c] of blobs that show the wanted ones [H, W, c] where they overlap, by Jacobi steps.
 
     A pixel shows about the mean of the blobs around it under their profile, a Gaussian of OVERLAP_PX.
     """
     colors = wanted
-    for _ in range(steps):
+    for _ in range(STEPS):
         colors = colors + wanted - blurred(colors, OVERLAP_PX)
     return colors
 
