@@ -24,21 +24,9 @@ from spackle.residual import Seeds, ViewFeatures, hole_mask
 from spackle.residual.complete import compose
 from spackle.residual.network import Rim, find_rim
 from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view, painted_texture
+from spackle.scene_fill import texture as room
 from spackle.scene_fill.fill import FINE_SPREAD_PX, PAINTED_VIEWS
-from spackle.scene_fill.texture import (
-    BLOCK_CHOICE,
-    BROAD,
-    SHARE,
-    TEXTURE_PX,
-    HoleView,
-    _in_proportion,
-    extended,
-    from_cells,
-    in_cells,
-    patch_blocks,
-    repeat_counts,
-    sharpened,
-)
+from spackle.scene_fill.texture import HoleView
 
 
 @pytest.mark.parametrize("period", [4.0, 6.0, 8.0])  # pixels
@@ -57,7 +45,7 @@ def test_sharpened_blobs_make_up_for_their_overlap(period: float) -> None:
         return float(((shown - shown.mean((0, 1))) * truth).sum() / truth.square().sum())
 
     assert strength(wanted) < 0.96
-    assert 1.05 < strength(sharpened(wanted)) < 1.6  # more than one: for what votes have blurred
+    assert 1.05 < strength(room.sharpened(wanted)) < 1.6  # more than one: for what votes have blurred
 
 
 class Paint(PlainInpainter):
@@ -127,9 +115,9 @@ def test_the_texture_leaves_low_frequencies_to_the_structure() -> None:
         exemplar_texture(dataclasses.replace(view, rim=rim, patches=patches)) for patches in (view.patches, bad)
     )
     fine, mask = found - plain, view.features.mask
-    assert float(in_cells(fine)[mask].abs().mean()) > 1e-3
-    assert float(blurred(fine, 4 * TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
-    assert torch.equal(in_cells(plain)[~mask], in_cells(view.rendering.rgb)[~mask])
+    assert float(room.in_cells(fine)[mask].abs().mean()) > 1e-3
+    assert float(blurred(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
+    assert torch.equal(room.in_cells(plain)[~mask], room.in_cells(view.rendering.rgb)[~mask])
 
 
 def test_beyond_the_border_patches_get_a_share_but_nothing_broad() -> None:
@@ -143,12 +131,12 @@ def test_beyond_the_border_patches_get_a_share_but_nothing_broad() -> None:
     inner = slice(24, 72), slice(144, 176)
     amplitudes, means = [], []
     for beyond in (mask, torch.zeros_like(mask)):
-        view = flat_view(mask, in_cells(stripes).mean((2, 3)), stripes, beyond, matches)
+        view = flat_view(mask, room.in_cells(stripes).mean((2, 3)), stripes, beyond, matches)
         found = exemplar_texture(view)[inner]
         amplitudes.append(float((found - found.mean()).abs().mean() / (stripes[inner] - 0.5).abs().mean()))
         means.append(float(found.mean()))
-    fine, broad = (1 - math.exp(-2 * (math.pi * width / 16) ** 2) for width in (TEXTURE_PX, BROAD * 192))
-    assert amplitudes == pytest.approx([(1 - SHARE) * fine + SHARE * broad, fine], rel=0.1)
+    fine, broad = (1 - math.exp(-2 * (math.pi * width / 16) ** 2) for width in (room.TEXTURE_PX, room.BROAD * 192))
+    assert amplitudes == pytest.approx([(1 - room.SHARE) * fine + room.SHARE * broad, fine], rel=0.1)
     assert means == pytest.approx([0.5, 0.5], abs=0.02)
 
 
@@ -158,7 +146,7 @@ def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
     uv, z = context.photo_camera.project(camera.unproject(seeds.uv, 1 / seeds.inverse_depth))
     outside = (uv < 0).any(-1) | (uv[..., 0] > 96) | (uv[..., 1] > 72) | (z <= 0)
     assert torch.equal(beyond, outside & features.mask)
-    found = extended(view)
+    found = room.extended(view)
     assert torch.equal(found[~beyond], view.structure[~beyond])
     cells, known = beyond.nonzero(), (~features.mask).nonzero()
     apart, nearest = torch.cdist(cells.float(), known.float()).min(1)
@@ -173,10 +161,10 @@ def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
     mask = torch.zeros(48, 96, dtype=torch.bool)
     mask[16:32, 12:36] = mask[16:32, 60:84] = True
     noise = 0.1 * torch.randn(96, 192, 3, generator=torch.Generator().manual_seed(0))
-    calm = ~from_cells(mask[..., None, None, None].expand(48, 96, 2, 2, 1))[..., 0]
+    calm = ~room.from_cells(mask[..., None, None, None].expand(48, 96, 2, 2, 1))[..., 0]
     calm[:, 96:] = False
     view = flat_view(mask, torch.ones(48, 96, 3), noise, mask, mask.long())
-    factors = _in_proportion(torch.where(calm[..., None], 0.1 * noise, noise), view)
+    factors = room._in_proportion(torch.where(calm[..., None], 0.1 * noise, noise), view)
     assert float(factors[20:28, 16:32].mean()) == pytest.approx(0.1, abs=0.04)
     assert float(factors[20:28, 64:80].mean()) > 0.85
     assert float(factors.max()) <= 1
@@ -190,7 +178,7 @@ def test_repeats_are_counted_by_squares_of_picture_and_mirror() -> None:
     expected = torch.zeros(8, 10)
     expected[0, :3] = expected[1, 0] = 4 / 16
     expected[7, 9] = 1 / 16
-    assert torch.equal(repeat_counts(Patches(torch.zeros(8, 10, 3), torch.zeros(8, 10), matches)), expected)
+    assert torch.equal(room.repeat_counts(Patches(torch.zeros(8, 10, 3), torch.zeros(8, 10), matches)), expected)
 
 
 def test_blocks_are_those_of_the_matches_around_a_cell() -> None:
@@ -199,12 +187,12 @@ def test_blocks_are_those_of_the_matches_around_a_cell() -> None:
     places[tuple(subject.cells.T)], costs[tuple(subject.cells.T)] = subject.places, subject.costs
     blocks = rng.random((24, 31, 2, 3, 1)).astype(np.float32)
     grids = [torch.from_numpy(grid) for grid in (subject.level.rgb, np.sqrt(costs), places)]
-    found = patch_blocks(Patches(*grids), torch.from_numpy(blocks)).numpy()
+    found = room.patch_blocks(Patches(*grids), torch.from_numpy(blocks)).numpy()
     assert np.array_equal(found[~subject.level.hole], blocks[~subject.level.hole])
     sources = (blocks, blocks[:, ::-1, :, ::-1])
     for cell in subject.cells:
         over = np.abs(subject.cells - cell).max(1) <= 1
         moved = subject.places[over] + np.pad(cell - subject.cells[over], [(0, 0), (1, 0)])
-        weights = np.exp(-BLOCK_CHOICE * subject.costs[over] / subject.costs.mean()) + 1e-6
+        weights = np.exp(-room.BLOCK_CHOICE * subject.costs[over] / subject.costs.mean()) + 1e-6
         expected = np.average([sources[m][v, u] for m, v, u in moved], axis=0, weights=weights)
         np.testing.assert_allclose(found[tuple(cell)], expected, rtol=1e-4)
