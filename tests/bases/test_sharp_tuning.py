@@ -7,11 +7,11 @@ import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from photos import picture
-from safetensors import safe_open
 from safetensors.torch import save_file
 from scenes import shifted
 from sharp_weights import MICRO
@@ -102,43 +102,37 @@ def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(bas
 # A decoder's own file -----------------------------------------------------------------------------
 
 
-def test_a_decoders_file_finds_its_checkpoint_and_holds_it_to_its_digest(
-    owner: Owner, base: TunableSharp, tmp_path: Path
-) -> None:
+def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, tmp_path: Path) -> None:
     best, beside = tmp_path / "best.safetensors", tmp_path / "sharp.safetensors"
     best.write_bytes(decoder_bytes(base.network.gaussian_decoder(), owner))
-    other = deterministic_weights(expected_shapes(MICRO))
-    other["prediction_head.texture_prediction_head.bias"] += 1
-    # The link is renewed, and counts more than another file of the checkpoint's name.
-    save_file(other, beside)
-    for where in (tmp_path / "where it lay once", owner.path, owner.path):
-        link_owner(Owner(where, owner.sha256), tmp_path)
+    assert str(owner.path.parent).encode() not in best.read_bytes()[:9999]
     expected = gaussians_from(owner.path).tensors
+    beside.symlink_to(owner.path)  # a file of the checkpoint's name
     assert all(map(torch.equal, gaussians_from(best).tensors, expected))
-    with safe_open(best, framework="pt") as opened:
-        notes, tensors = opened.metadata(), {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-    assert str(owner.path.parent) not in str(notes)
+    beside.unlink()
+    beside.write_bytes(b"another")
+    for where in (tmp_path / "where it lay once", owner.path, owner.path):  # the link is renewed, and counts more
+        link_owner(Owner(where, owner.sha256), tmp_path)
+    assert all(map(torch.equal, gaussians_from(best).tensors, expected))
 
-    # Without the link: a file of that name beside it, if it is the right one.
-    alone = tmp_path / "alone"
-    alone.mkdir()
-    best, beside = alone / "best.safetensors", alone / "sharp.safetensors"
-    moved = {**json.loads(notes[NOTE]), "checkpoint": "/elsewhere/sharp.safetensors"}
-    save_file(tensors, best, {NOTE: json.dumps(moved)})
-    with pytest.raises(InputError, match=r"trained on sharp\.safetensors, which is not beside it: put"):
-        SharpBase.load(best)
-    beside.symlink_to(owner.path)
-    assert all(map(torch.equal, gaussians_from(best).tensors, expected))
-    beside.unlink()
-    save_file(other, beside)
-    with pytest.raises(InputError, match="trained on a checkpoint with the SHA-256"):
-        SharpBase.load(best)
-    beside.unlink()
-    beside.symlink_to(owner.path)
-    name = min(tensors)
-    save_file({key: value for key, value in tensors.items() if key != name}, best, notes)
-    with pytest.raises(InputError, match=f"1 names differ, e.g. {name}"):
-        SharpBase.load(best)
-    save_file(tensors, best, {NOTE: "{}"})
-    with pytest.raises(InputError, match="does not say which checkpoint it was trained on"):
-        SharpBase.load(best)
+
+@pytest.mark.parametrize(
+    ("beside", "noted", "missing", "said"),
+    [
+        (None, True, "", r"trained on sharp\.safetensors, which is not beside it: put"),
+        (b"another", True, "", "trained on a checkpoint with the SHA-256"),
+        (..., True, "feature_model.fusion.out_conv.bias", r"1 names differ, e\.g\. feature_model\.fusion"),
+        (..., False, "", "does not say which checkpoint it was trained on"),
+    ],
+)
+def test_decoders_without_their_checkpoint_are_a_line(
+    owner: Owner, base: TunableSharp, tmp_path: Path, beside: Any, noted: bool, missing: str, said: str
+) -> None:
+    decoder = base.network.gaussian_decoder().state_dict()
+    tensors = {name: tensor.contiguous() for name, tensor in decoder.items() if name != missing}
+    facts = {"checkpoint": "/elsewhere/sharp.safetensors", "sha256": owner.sha256}
+    save_file(tensors, tmp_path / "best.safetensors", {NOTE: json.dumps(facts) if noted else "{}"})
+    if beside is not None:
+        (tmp_path / "sharp.safetensors").write_bytes(owner.path.read_bytes() if beside is ... else beside)
+    with pytest.raises(InputError, match=said):
+        SharpBase.load(tmp_path / "best.safetensors")

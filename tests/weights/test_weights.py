@@ -9,13 +9,11 @@ import os
 import random
 import re
 import socket
-import ssl
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from urllib.error import URLError
 
 import pytest
 from command import Run, run
@@ -164,21 +162,14 @@ def test_answers_that_are_not_the_file(
     assert bool(os.listdir(target.parent)) is ("10 bytes early" in words)  # all that came is kept
 
 
-def test_a_server_that_hangs(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_hangs_or_is_none(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TIMEOUT", 0.2)
     site.hang_after = 200_000
-    refused(site.url, target, site.url, "no answer within 0.2 seconds", f"{600_000:,} bytes")
+    refused(site.url, target, site.url, "no connection (timed out)", f"{600_000:,} bytes")
     assert len(site.requests) == 3
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        refused(f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "no answer")
-
-
-def test_why_there_is_no_connection(site: Site, target: Path) -> None:
+        refused(f"http://127.0.0.1:{silent.getsockname()[1]}/", target.with_name("other"), "timed out")
     refused(site.url.replace("http:", "https:"), target, "SSL")
-    error = ssl.SSLCertVerificationError(1, "failed")
-    error.verify_message = "self-signed certificate"
-    assert "not trusted (self-signed certificate)" in module.reason_of(URLError(error))
-    assert "name is not known here" in module.reason_of(URLError(socket.gaierror(-2, "unknown")))
 
 
 @pytest.mark.parametrize("url", ["", "a.pt", "file:///a", "http://", "https://[/", "http://a:b/", "http://a:0/"])
@@ -308,7 +299,7 @@ def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -
     ("name", "url", "said"),
     [
         ("nothing", None, "weights nothing: unknown: there are sharp"),
-        ("sharp", CLOSED, "check the network"),
+        ("sharp", CLOSED, "no connection (Connection refused): check network"),
         ("sharp", "http://me:secret@127.0.0.1:1/", "password"),
         ("depth", None, "HF_ENDPOINT"),
         ("lama", None, "205,669,692 were published"),

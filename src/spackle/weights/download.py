@@ -6,8 +6,6 @@ import contextlib
 import os
 import re
 import shutil
-import socket
-import ssl
 import time
 from collections.abc import Callable, Iterator
 from http.client import HTTPException, HTTPResponse, responses
@@ -144,7 +142,8 @@ def _network(url: str) -> Iterator[None]:
             raise Dropped(f"{status}: try again later") from error
         raise InputError(f"{url}: {status}: check the address, or give another") from error
     except (OSError, HTTPException) as error:
-        raise Dropped(reason_of(error)) from error
+        reason = reason_in_a_line(error.reason if isinstance(error, URLError) else error)
+        raise Dropped(f"no connection ({reason}): check network, https_proxy and clock, and try again") from error
 
 
 def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
@@ -162,15 +161,3 @@ def _first_byte(url: str, response: HTTPResponse, there: int, size: int) -> int:
     if total != size:
         raise InputError(f"{url}: another file: {total:,} bytes, {size:,} were published: give another address")
     return done
-
-
-def reason_of(error: Exception) -> str:
-    """Why there is no connection, and what to do."""
-    cause = error.reason if isinstance(error, URLError) else error
-    if isinstance(cause, socket.gaierror):
-        return "the server's name is not known here: check that you are online, and https_proxy if you need a proxy"
-    if isinstance(cause, ssl.SSLCertVerificationError):
-        return f"the server's certificate is not trusted ({cause.verify_message}): check the clock and SSL_CERT_FILE"
-    if isinstance(cause, TimeoutError):
-        return f"no answer within {TIMEOUT:g} seconds: check the connection and try again"
-    return f"no connection ({reason_in_a_line(cause)}): check the network and try again"
