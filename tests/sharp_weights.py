@@ -47,9 +47,10 @@ def gaussians_of(config: SharpConfig) -> int:
     return LAYERS * (config.side // STRIDE) ** 2
 
 
-def waves(side: int = 1536) -> Tensor:
-    """The golden numbers' picture, [1, 3, side, side]."""
-    y, x = np.mgrid[:side, :side] / side
+def waves(height: int = 1536, width: int | None = None) -> Tensor:
+    """The golden numbers' picture, [1, 3, height, width], square by default."""
+    width = width or height
+    y, x = np.mgrid[:height, :width] / np.array([height, width])[:, None, None]
     red = 0.5 + 0.5 * np.sin(2 * np.pi * (3 * x + 2 * y))
     green = 0.5 + 0.5 * np.cos(2 * np.pi * (5 * x * y + y))
     blue = 0.5 + 0.25 * np.sin(40 * x) * np.cos(30 * y) + 0.25 * x

@@ -81,16 +81,6 @@ def test_bf16_draws_the_same_picture_to_45_db() -> None:
     assert not torch.equal(*views)
 
 
-@pytest.mark.parametrize("batch", [4, 35])
-def test_the_number_of_windows_at_once_changes_nothing(batch: int) -> None:
-    network = micro_network()
-    with torch.inference_mode():
-        expected = network(waves(MICRO.side), 0.8, batch=5)
-        found = network(waves(MICRO.side), 0.8, batch)
-    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize(("side", "count"), [(1536, FULL_WINDOWS), (768, HALF_WINDOWS)])
 def test_windows_are_cut_and_merged_without_a_seam(side: int, count: int) -> None:
     image = waves(side)

@@ -34,11 +34,14 @@ def same(one: SharpOutput, other: SharpOutput) -> bool:
 
 
 @pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)])
-def test_so_many_windows_go_at_once(options: dict[str, Any], calls: int) -> None:
+def test_so_many_windows_go_at_once_and_change_nothing(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
-    SharpBase(micro_network(), **options).look(PHOTO, lambda done, total: seen.append(done))
+    found = SharpBase(micro_network(), **options).look(PHOTO, lambda done, total: seen.append(done))
     assert len(seen) == calls
     assert seen[-1] == WINDOWS
+    expected = SharpBase(micro_network(), windows=35).look(PHOTO)
+    torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
 
 
 # --- torch.compile

@@ -10,6 +10,7 @@ import pytest
 import torch
 from dataset_builds import build, write_inputs
 from safetensors.torch import save_file
+from sharp_weights import waves
 from torch import Tensor
 
 from spackle.cli.weights import lama_weights
@@ -26,14 +27,9 @@ GOLDEN = dict(np.load(Path(__file__).parents[1] / "data" / "lama_golden.npz"))  
 
 def made_input(height: int, width: int) -> Tensor:
     """[1, 4, H, W]: waves with two holes, and the holes."""
-    yy, xx = np.meshgrid(np.arange(height) / height, np.arange(width) / width, indexing="ij")
-    waves = (
-        0.5 + 0.5 * np.sin(2 * np.pi * (3 * xx + 2 * yy)),
-        0.5 + 0.5 * np.cos(2 * np.pi * (5 * xx * yy + yy)),
-        0.5 + 0.25 * np.sin(40 * xx) * np.cos(30 * yy) + 0.25 * xx,
-    )
-    hole = (xx > 0.6) | ((np.abs(xx - 0.3) < 0.1) & (np.abs(yy - 0.5) < 0.25))
-    return torch.from_numpy(np.stack([*(wave * ~hole for wave in waves), hole])[None].astype(np.float32))
+    y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / width, indexing="ij")
+    hole = (x > 0.6) | (((x - 0.3).abs() < 0.1) & ((y - 0.5).abs() < 0.25))
+    return torch.cat([waves(height, width) * ~hole, hole[None, None]], 1)
 
 
 X = made_input(24, 40)
