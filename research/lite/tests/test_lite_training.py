@@ -244,7 +244,7 @@ def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
         (["encoder={place}/recipe.yaml"], "recipe.yaml: no weights of EfficientNet-Lite2 for PyTorch: give encoder="),
         (["encoder=/nowhere.pth"], "/nowhere.pth: no weights of EfficientNet-Lite2"),
         (["init={lite0}"], "lite0.safetensors: has no network of the size lite2: add network=lite0"),
-        (["init=/nowhere"], "lite weights /nowhere not found: give a .safetensors file as init"),
+        (["init=/nowhere"], "/nowhere: no such weight file"),
     ],
 )
 def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, options: list[str], said: str) -> None:
