@@ -102,7 +102,7 @@ def run_ours(clock: Clock, weights: Path, photo: Path, output: Path, **options: 
     base = spackle.SharpBase.load(weights, device=clock.device, **options)
     clock.lap("build and load")
     picture = spackle.load_photo(photo)
-    found = base.look(picture)
+    found = base.infer(picture)
     clock.lap("network")
     gaussians = to_processor(to_metric(found, picture))
     clock.lap("post-processing")

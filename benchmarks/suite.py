@@ -215,7 +215,7 @@ def sharp_section(runs: int, base: SharpBase, photo: Photo, peaks: Peaks, device
 
     def whole(lap: Lap) -> None:
         nonlocal count
-        output = base.look(photo)
+        output = base.infer(photo)
         lap(FORWARD)
         gaussians = to_processor(to_metric(output, photo))
         count = len(gaussians)

@@ -227,9 +227,9 @@ def test_too_little_memory_is_one_line(error: Exception) -> None:
 
 def test_the_callers_autocast_stays_outside() -> None:
     base, photo = SharpBase(micro_network()), Photo(torch.rand(20, 30, 3), 40.0, "EXIF", Path("a.jpg"))
-    expected = to_metric(base.look(photo), photo)
+    expected = to_metric(base.infer(photo), photo)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = to_metric(base.look(photo), photo)
+        found = to_metric(base.infer(photo), photo)
         assert torch.is_autocast_enabled("cpu")
     assert all(map(torch.equal, found.tensors, expected.tensors))
 

@@ -36,10 +36,10 @@ def same(one: SharpOutput, other: SharpOutput) -> bool:
 @pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)])
 def test_so_many_windows_go_at_once_and_change_nothing(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
-    found = SharpBase(micro_network(), **options).look(PHOTO, lambda done, total: seen.append(done))
+    found = SharpBase(micro_network(), **options).infer(PHOTO, lambda done, total: seen.append(done))
     assert len(seen) == calls
     assert seen[-1] == WINDOWS
-    expected = SharpBase(micro_network(), windows=35).look(PHOTO)
+    expected = SharpBase(micro_network(), windows=35).infer(PHOTO)
     torch.testing.assert_close(found.start.disparity_map, expected.start.disparity_map, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
 
@@ -82,11 +82,11 @@ def test_without_a_compiler_one_line_says_so_and_the_photo_is_done_all_the_same(
     plain, base = SharpBase(micro_network()), SharpBase(micro_network(), compiled=True)
     monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
     with caplog.at_level(logging.WARNING, "spackle"):
-        found = [base.look(PHOTO), base.look(PHOTO)]
+        found = [base.infer(PHOTO), base.infer(PHOTO)]
     assert len(caplog.records) == 1
     assert not base.compiled
     assert "C++" in base.compile_problem
-    expected = plain.look(PHOTO)
+    expected = plain.infer(PHOTO)
     assert all(same(output, expected) for output in found)
 
     def short(*arguments: object) -> Any:

@@ -63,7 +63,7 @@ def gaussians_from(weights: Path) -> Gaussians:
 
 def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSharp) -> None:
     with torch.no_grad():
-        before = base.gaussians(base.network.gaussian_decoder(), base.see(photo().rgb, CAMERA))
+        before = base.gaussians(base.network.gaussian_decoder(), base.encode(photo().rgb, CAMERA))
     after = SharpBase(base.network).predict(photo()).gaussians
     aside = CAMERA.looking(torch.tensor([0.2, -0.1, 0.1]), torch.tensor([0.0, 0.0, 4.0]))
     # The second one has pixels that are not square, as after rounding to a working size.
@@ -78,11 +78,11 @@ def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSh
 def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
     """Along the gradient itself, without rendering: its cut-offs are steps, which no gradient sees."""
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
-    seen = base.see(photo().rgb, CAMERA)
+    encoded = base.encode(photo().rgb, CAMERA)
 
     def loss() -> Tensor:
         random = torch.Generator().manual_seed(0)
-        tensors = base.gaussians(decoder, seen).tensors
+        tensors = base.gaussians(decoder, encoded).tensors
         return torch.stack([(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]).sum()
 
     loss().backward()

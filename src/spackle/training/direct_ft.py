@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from spackle.bases.sharp.base import Owner, decoder_bytes, link_owner, load_network, owner_of, to_square, usual_windows
 from spackle.bases.sharp.encoder import set_precision
-from spackle.bases.sharp.network import Seen, SharpNetwork, compose
+from spackle.bases.sharp.network import DecoderInput, SharpNetwork, compose
 from spackle.camera import Camera
 from spackle.dataset.sample import DatasetView
 from spackle.dataset.shards import DatasetFiles
@@ -58,21 +58,21 @@ class TunableSharp:
         return TunableSharp(network.to(device), precision)
 
     @torch.no_grad()
-    def see(self, rgb: Tensor, photo_camera: Camera) -> Seen:
+    def encode(self, rgb: Tensor, photo_camera: Camera) -> DecoderInput:
         """What the frozen part makes of a photo [H, W, 3], sRGB in 0..1, with a camera of the same size."""
         device = next(self.network.parameters()).device
         image = to_square(rgb.to(device), self.network.config.side)
         with own_arithmetic(device):
-            return self.network.see(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
+            return self.network.encode(image, photo_camera.focal[0] / photo_camera.width, usual_windows(device))
 
-    def gaussians(self, decoder: nn.Module, seen: Seen, place: torch.device | str = "cpu") -> Gaussians:
+    def gaussians(self, decoder: nn.Module, encoded: DecoderInput, place: torch.device | str = "cpu") -> Gaussians:
         """Gaussians in SHARP's normalised space, at a place, with gradients to a `GaussianDecoder`."""
-        device = seen.picture.device
+        device = encoded.picture.device
         autocast = torch.autocast(device.type, self.precision, enabled=self.precision != torch.float32)
         with own_arithmetic(device):
             with autocast:
-                deltas = decoder(seen.picture, seen.maps)
-            return compose(seen.start, deltas).to(place)
+                deltas = decoder(encoded.picture, encoded.maps)
+            return compose(encoded.start, deltas).to(place)
 
 
 def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
@@ -84,7 +84,7 @@ def normalised_camera(camera: Camera, photo_camera: Camera) -> Camera:
     same picture, and every gradient exists.
     """
     fx, fy = photo_camera.focal
-    matrix = camera.world_to_camera.double()  # the product rounded to float32 would move what is seen
+    matrix = camera.world_to_camera.double()  # the product rounded to float32 would move the picture
     stretch = matrix.new_tensor([photo_camera.width / (2 * fx), photo_camera.height / (2 * fy), 1.0, 1.0])
     return dataclasses.replace(camera, world_to_camera=matrix * stretch)
 
@@ -97,7 +97,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
     with enough_memory(*advice):
-        gaussians = base.gaussians(decoder, base.see(views[0].photo, photo_camera), place_of(renderer))
+        gaussians = base.gaussians(decoder, base.encode(views[0].photo, photo_camera), place_of(renderer))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
 

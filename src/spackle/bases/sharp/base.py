@@ -109,13 +109,13 @@ class SharpBase:
         """
         advice = [] if self.windows == 1 else ["try --sharp windows=1"]
         with enough_memory(*advice):
-            gaussians = to_processor(to_metric(self.look(photo, progress), photo))
+            gaussians = to_processor(to_metric(self.infer(photo, progress), photo))
         camera = Camera.from_focal(photo.focal_px, photo.width, photo.height)
         notes: dict[str, float | int | str] = {"precision": self.precision, "weights": self.weights}
         return BasePrediction(gaussians, camera.resized(*working_size(photo.width, photo.height)), notes)
 
     @torch.no_grad()
-    def look(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
+    def infer(self, photo: Photo, progress: Progress | None = None) -> SharpOutput:
         """What the network says about a photo; `to_metric` makes Gaussians of it."""
         image = to_square(photo.rgb.to(self.device, non_blocking=True), self.network.config.side)
         with own_arithmetic(self.device):

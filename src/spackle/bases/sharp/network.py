@@ -130,7 +130,7 @@ class SharpOutput:
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
+class DecoderInput:
     """What encoder and depth network make of one picture: all that the Gaussian decoder goes by."""
 
     start: InitialGaussians
@@ -157,20 +157,20 @@ class SharpNetwork(nn.Module):
         `disparity_factor` is the focal length over the width in the photo's pixels. So many windows as `batch` says go
         through the transformer at once; `progress` gets the windows done and the number of all.
         """
-        seen = self.see(image, disparity_factor, batch, progress)
-        deltas: Tensor = self.gaussian_decoder()(seen.picture, seen.maps)
-        return SharpOutput(seen.start, deltas)
+        encoded = self.encode(image, disparity_factor, batch, progress)
+        deltas: Tensor = self.gaussian_decoder()(encoded.picture, encoded.maps)
+        return SharpOutput(encoded.start, deltas)
 
-    def see(
+    def encode(
         self, image: Tensor, disparity_factor: float | Tensor, batch: int, progress: Progress | None = None
-    ) -> Seen:
+    ) -> DecoderInput:
         """Everything before the Gaussian decoder; the arguments are `forward`'s."""
         depth_network: DepthNetwork = self.monodepth_model.monodepth_predictor  # type: ignore[assignment]
         maps = depth_network.encoder(image * 2 - 1, batch, progress)
         disparity = depth_network.disparity(maps)
         # What PyTorch makes of a number over a tensor, for a tensor over a tensor too: the same bits.
         start = make_start(image, disparity.clamp(*DISPARITY_RANGE).reciprocal() * disparity_factor)
-        return Seen(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
+        return DecoderInput(start, torch.cat([image, start.disparity_map], dim=1) * 2 - 1, maps)
 
     def gaussian_decoder(self) -> GaussianDecoder:
         """The rest, by itself: the same modules under the same names."""
@@ -254,7 +254,7 @@ class GaussianDecoder(nn.Module):
         return self
 
     def forward(self, picture: Tensor, maps: list[Tensor]) -> Tensor:
-        """Deltas [14, 2, side/2, side/2] float32 of a picture [1, 5, side, side] and its maps (see `Seen`)."""
+        """Deltas [14, 2, side/2, side/2] float32 of a picture [1, 5, side, side] and its maps (see `DecoderInput`)."""
         deltas: Tensor = self.prediction_head(*self.feature_model(picture, maps))
         return deltas
 
