@@ -80,16 +80,6 @@ def ranges(site: Site) -> list[str | None]:
 # Whole files, and going on
 
 
-def test_a_download_is_the_file(site: Site, target: Path) -> None:
-    steps: list[tuple[int, int]] = []
-    fetch(site.url, target, lambda done, total: steps.append((done, total)))
-    is_whole(target)
-    assert steps == sorted(set(steps))
-    assert (steps[0], steps[-1]) == ((0, len(CONTENT)), (len(CONTENT), len(CONTENT)))
-    assert ranges(site) == [None]
-    assert site.requests[0]["Accept-Encoding"] == "identity"
-
-
 def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(site: Site, tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     link, real = tmp_path / "link.pt", tmp_path / "real" / "weights.pt"
@@ -121,11 +111,13 @@ def test_a_later_call_goes_on_with_the_rest(site: Site, target: Path, monkeypatc
     assert os.listdir(target.parent) == ["weights.pt.part"]
     with hold(target.with_name("weights.pt.lock")):
         refused(site.url, target, "another process")
-    steps: list[int] = []
-    fetch(site.url, target, lambda done, total: steps.append(done))
+    steps: list[tuple[int, int]] = []
+    fetch(site.url, target, lambda done, total: steps.append((done, total)))
     is_whole(target)
     assert ranges(site) == [None, f"bytes={BREAK}-"]
-    assert (steps[0], steps[-1]) == (BREAK, len(CONTENT))
+    assert site.requests[0]["Accept-Encoding"] == "identity"
+    assert steps == sorted(set(steps))
+    assert (steps[0], steps[-1]) == ((BREAK, len(CONTENT)), (len(CONTENT), len(CONTENT)))
 
 
 @pytest.mark.parametrize("size", [BREAK, len(CONTENT), len(CONTENT) + 1])
@@ -176,12 +168,8 @@ def test_a_server_that_hangs_or_is_none(site: Site, target: Path, monkeypatch: p
 def test_addresses_that_are_none(target: Path, url: str) -> None:
     refused(url, target, repr(url))
     refused(f"{url}\n", target)
-
-
-@pytest.mark.parametrize("url", ["http://%s127.0.0.1:1/w", "ftp://%s127.0.0.1/w", "http://%s[/w", "%s127.0.0.1:1/w"])
-def test_a_password_is_refused_and_not_shown(target: Path, url: str) -> None:
     with pytest.raises(InputError, match="password") as caught:
-        fetch(url % "me:secret@", target)
+        fetch(url.replace("://", "://me:secret@") if "//" in url else f"me:secret@{url}", target)
     assert "secret" not in str(caught.value)
 
 
