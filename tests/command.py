@@ -7,7 +7,11 @@ import dataclasses
 import io
 import json
 import os
+import re
+import subprocess
 import sys
+import time
+import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +50,22 @@ def run(*arguments: object) -> Run:
             code = end.code or 0
     assert isinstance(code, int)
     return Run(code, out.getvalue(), err.getvalue())
+
+
+def page_of(command: Sequence[object], **options: Any) -> bytes:
+    """The page that `spackle view` shows, as a process that then ends; `options` are those of Popen."""
+    server = subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True, **options)
+    try:
+        assert server.stderr is not None
+        deadline, found = time.monotonic() + 120, None
+        while found is None and time.monotonic() < deadline:
+            found = re.search(r"http://127\.0\.0\.1\S+", server.stderr.readline())
+        assert found
+        with urllib.request.urlopen(found[0], timeout=60) as answer:
+            return bytes(answer.read())
+    finally:
+        server.terminate()
+        server.communicate(timeout=60)
 
 
 def report_of(folder: Path) -> dict[str, Any]:

@@ -9,13 +9,12 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-import time
-import urllib.request
 import venv
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import page_of
 from photos import picture
 from PIL import Image
 
@@ -75,27 +74,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_each_command_of_the_quick_start_works(environment: Path, place: Path, words: list[str]) -> None:
     command = [environment / "spackle", *words, *SHORTER.get(words[0], [])]
     if words[0] == "view":
-        view([*command, "--no-open"], place)
+        assert b"<canvas" in page_of([*command, "--no-open"], cwd=place, env=ALONE)
         return
     done = subprocess.run(command, cwd=place, env=ALONE, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
     for file in re.findall(r"-o (\S+)", " ".join(words)):
         assert (place / file).exists()
-
-
-def view(command: list[object], place: Path) -> None:
-    server = subprocess.Popen(list(map(str, command)), cwd=place, env=ALONE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert server.stderr is not None
-        deadline, found = time.monotonic() + 120, None
-        while found is None and time.monotonic() < deadline:
-            found = re.search(r"http://\S+", server.stderr.readline())
-        assert found
-        with urllib.request.urlopen(found[0], timeout=60) as answer:
-            assert b"<canvas" in answer.read()
-    finally:
-        server.terminate()
-        server.communicate(timeout=60)
 
 
 def test_the_python_of_the_quick_start_works_by_the_wheel(environment: Path, place: Path) -> None:

@@ -32,12 +32,12 @@ def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path)
         assert (str(missing) if code else spackle.__version__) in done.stdout + done.stderr
 
 
-def test_help_does_not_wait_for_torch() -> None:
-    code = "import sys; sys.argv = ['spackle', '--help']\nfrom spackle.cli import main\ntry: main()\n"
+@pytest.mark.parametrize(("words", "shown"), [("--help", "predict"), ("predict --help", "--trajectory")])
+def test_help_does_not_wait_for_torch(words: str, shown: str) -> None:
+    code = f"import sys; sys.argv = ['spackle', *{words.split()}]\nfrom spackle.cli import main\ntry: main()\n"
     code += "finally: assert not {'torch', 'numba', 'av'} & set(sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert result.returncode == 0, result.stderr
-    assert all(command in result.stdout for command in ("predict", "render", "demo"))
+    assert (result.returncode, shown in result.stdout) == (0, True), result.stderr
 
 
 def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:

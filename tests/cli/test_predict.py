@@ -21,7 +21,6 @@ from photos import (
     picture,
     read_ply,
     write_depth,
-    write_pair,
     write_photo,
 )
 from PIL import Image
@@ -75,15 +74,6 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
     total = report["seconds"].pop("total")
     assert set(report["seconds"]) == {"load", "prepare", "base", "complete", "write", "video", "measure"}
     assert total == pytest.approx(sum(report["seconds"].values()))
-
-
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path, plain: tuple[Path, Run]) -> None:
-    predicted(*write_pair(tmp_path), tmp_path / "out")
-    again = tmp_path / "out" / "photo"
-    for name in ("base.ply", "scene.ply"):
-        assert (again / name).read_bytes() == (plain[0] / name).read_bytes()
-    first, second = ({**report_of(folder), "seconds": None} for folder in (plain[0], again))
-    assert first == second
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]) -> None:

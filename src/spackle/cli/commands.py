@@ -122,16 +122,10 @@ def predict(
     from spackle.progress import Reporter
 
     settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
-    options = PredictOptions(
-        Options(settings, path, FillOptions(residual, fill, mode)),
-        {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov},
-        render=render,
-        keep_frame=keep_frame or depth is not None or path.cameras is not None,
-        overwrite=overwrite,
-        workers=workers,
-        threads=threads,
-        ray=ray,
-    )
+    scene = Options(settings, path, FillOptions(residual, fill, mode))
+    lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
+    keep_frame = keep_frame or depth is not None or path.cameras is not None  # geometry is of the whole photo
+    options = PredictOptions(scene, lens, render, keep_frame, overwrite, workers, threads, ray)
     if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 

@@ -134,11 +134,11 @@ def _table(scores: dict[str, Any]) -> Table:
 
 
 def _save_sheet(first: tuple[str, Tensor], rows: list[list[tuple[str, Tensor]]], path: Path) -> None:
-    """One picture on the left, rows of pictures of its size beside it, each with its name."""
-    height, width = (side + MARGIN for side in first[1].shape[:2])
+    """One picture on the left, rows of equally large pictures beside it, each with its name."""
+    height, width = (side + MARGIN for side in rows[0][0][1].shape[:2])
     sheet = Image.new("RGB", ((len(rows[0]) + 1) * width - MARGIN, len(rows) * height - MARGIN), "white")
     draw = ImageDraw.Draw(sheet)
-    places = {(0, (sheet.height - height + MARGIN) // 2): first}
+    places = {(0, (sheet.height - first[1].shape[0]) // 2): first}
     places |= {((c + 1) * width, r * height): named for r, row in enumerate(rows) for c, named in enumerate(row)}
     for (x, y), (name, image) in places.items():
         sheet.paste(Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()), (x, y))

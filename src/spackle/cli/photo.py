@@ -44,12 +44,6 @@ class PredictOptions:
     threads: int | None = None  # of each
     ray: str | None = None  # the cluster where they are; this machine where None
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """What a photo's folder gets, besides views/: the video is the last."""
-        files = ("base.ply", "scene.ply", REPORT)
-        return (*files, f"video{self.scene.path.video.suffix}") if self.render else files
-
     def open(self) -> Pipeline:
         """What all photos share; InputError for an option that cannot be used, whatever the photo."""
         pipeline, path = Pipeline.open(self.scene), self.scene.path
@@ -74,8 +68,10 @@ def predict_photo(
     reporter = reporter.restarted()
     with reporter.stage("load"):
         photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
+    video_file = f"video{options.scene.path.video.suffix}"
     with contextlib.ExitStack() as folders:
-        folders.enter_context(results_folder(folder, options.files, alone=True))
+        files = ["base.ply", "scene.ply", REPORT, *([video_file] if options.render else [])]
+        folders.enter_context(results_folder(folder, files, alone=True))
         stills = range(len(pipeline.given_views or []))
         if stills:
             pictures = [f"{index:04d}{kind}.png" for index in stills for kind in ("", "_base", "_mask")]
@@ -89,9 +85,9 @@ def predict_photo(
                 save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
         video = None
         if options.render:
-            video = views.maker.note(options.files[-1], views.cameras[views.frames[0][0]], len(views.frames))
+            video = views.maker.note(video_file, views.cameras[views.frames[0][0]], len(views.frames))
             with reporter.stage("video") as step:
-                save_views(done, new / options.files[-1], pipeline.renderer, step)
+                save_views(done, new / video_file, pipeline.renderer, step)
         if stills:
             (new / "views").mkdir()
             with reporter.stage("views") as step:

@@ -197,11 +197,6 @@ class Teller(Reporter):
         super().log(line)
         self._tell({"line": line})
 
-    def detail(self, line: str) -> None:
-        """For the terminal alone."""
-        if self.verbose:
-            super().log(line)
-
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[Step]:
         """As `Reporter.stage`; a total of 0 is unknown."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import gzip
 import hashlib
 import json
 import math
-import zlib
 from collections.abc import Callable, Mapping
 from importlib import resources
 
@@ -153,7 +153,7 @@ def page_files() -> dict[str, tuple[str, bytes]]:
 def single_html(scene: PageScene) -> bytes:
     """The page with a scene in it, which opens from a disk or a mail; nothing is ever fetched."""
     page, css, js = (_read(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
-    held = {name: base64.b64encode(_gzipped(data)).decode() for name, data in scene.files.items()}
+    held = {name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode() for name, data in scene.files.items()}
     data = as_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
     embedded = f'<script type="application/json" id="spackle-scene">{data}</script>'
@@ -164,12 +164,6 @@ def single_html(scene: PageScene) -> bytes:
     meta = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
     page = page.replace(STYLE, f"{meta}\n{style}").replace(SCRIPT, f"{embedded}\n{script}")
     return page.encode()
-
-
-def _gzipped(data: bytes) -> bytes:
-    """The same bytes at any time: there is no clock in them."""
-    packer = zlib.compressobj(6, wbits=31)
-    return packer.compress(data) + packer.flush()
 
 
 def _digest(text: str) -> str:
