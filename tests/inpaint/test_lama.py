@@ -17,8 +17,7 @@ from spackle.cli.weights import lama_weights
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.inpaint.lama import MARGIN, LamaInpainter, groups_of, load_network, padded
-from spackle.inpaint.lama_network import LamaNetwork, expected_shapes
+from spackle.inpaint.lama import MARGIN, LamaInpainter, LamaNetwork, expected_shapes, groups_of, load_network, padded
 from spackle.weights import PUBLISHED
 
 Weights = dict[str, Tensor]

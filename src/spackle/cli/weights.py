@@ -147,7 +147,7 @@ def deterministic_weights(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Te
 
 def lama_weights(*size: int) -> dict[str, Tensor]:
     """`deterministic_weights` of LaMa's generator, of another width and depth where given; variances around one."""
-    from spackle.inpaint.lama_network import expected_shapes
+    from spackle.inpaint.lama import expected_shapes
 
     made = deterministic_weights(expected_shapes(*size))
     return {name: 1 + 5 * x.abs() if name.endswith("running_var") else x for name, x in made.items()}

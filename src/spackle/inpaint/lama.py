@@ -12,15 +12,14 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from spackle.crop import Crop
 from spackle.device import enough_memory, own_arithmetic, pick_device
 from spackle.errors import InputError
 from spackle.image import working_size
 from spackle.inpaint import InpainterOptions
-from spackle.inpaint.lama_network import LamaNetwork, expected_shapes
-from spackle.network_file import check_finite, check_tensors, read_tensors
+from spackle.network_file import Shapes, check_finite, check_tensors, read_tensors
 from spackle.weights import installed
 
 SIDE = 1024  # pixels of the long side at which it works
@@ -28,8 +27,12 @@ MULTIPLE = 8  # of the sides of what the network is given
 SMALLEST = 16  # pixels of them: an eighth is reflected at its ends
 MARGIN = 128  # pixels around a group of holes that the network sees
 BLOCK = 16  # pixels of the grid on which groups are found
+LOCAL = 4  # one of so many channels is local in the blocks, the others are distant
+EPSILON = 1e-5  # of batch norms
+WIDTH, BLOCKS = 64, 18  # of "big-lama"
 FIRST = "model.1.ffc.convl2l.weight"
 ADVICE = "`spackle weights get lama` downloads LaMa's weights"
+Tensors = Mapping[str, Tensor]
 
 
 class LamaInpainter:
@@ -146,3 +149,182 @@ def load_network(path: Path) -> LamaNetwork:
     network = LamaNetwork({name: tensor.to(torch.float32, copy=True) for name, tensor in tensors.items()})
     check_finite(network, path, ADVICE)
     return network
+
+
+# The network --------------------------------------------------------------------------------------
+
+
+def expected_shapes(width: int = WIDTH, blocks: int = BLOCKS) -> Shapes:
+    """Names and shapes of the published tensors, without batch norms' counts of batches."""
+    shapes: Shapes = {}
+
+    def conv(name: str, *shape: int, bias: bool = False, transposed: bool = False) -> None:
+        shapes[f"{name}.weight"] = shape
+        if bias:
+            shapes[f"{name}.bias"] = (shape[transposed],)
+
+    def norm(name: str, channels: int) -> None:
+        shapes.update({f"{name}.{key}": (channels,) for key in ("weight", "bias", "running_mean", "running_var")})
+
+    deep = 8 * width
+    near, far, half = deep // LOCAL, deep - deep // LOCAL, (deep - deep // LOCAL) // 2
+    conv("model.1.ffc.convl2l", width, 4, 7, 7)
+    norm("model.1.bn_l", width)
+    for stage, channels in ((2, 2 * width), (3, 4 * width)):
+        conv(f"model.{stage}.ffc.convl2l", channels, channels // 2, 3, 3)
+        norm(f"model.{stage}.bn_l", channels)
+    for name, channels in (("l", near), ("g", far)):
+        conv(f"model.4.ffc.convl2{name}", channels, deep // 2, 3, 3)
+        norm(f"model.4.bn_{name}", channels)
+    for name in _layer_names(blocks):
+        conv(f"{name}.ffc.convl2l", near, near, 3, 3)
+        conv(f"{name}.ffc.convl2g", far, near, 3, 3)
+        conv(f"{name}.ffc.convg2l", near, far, 3, 3)
+        conv(f"{name}.ffc.convg2g.conv1.0", half, far, 1, 1)
+        norm(f"{name}.ffc.convg2g.conv1.1", half)
+        conv(f"{name}.ffc.convg2g.fu.conv_layer", far, far, 1, 1)
+        norm(f"{name}.ffc.convg2g.fu.bn", far)
+        conv(f"{name}.ffc.convg2g.conv2", far, half, 1, 1)
+        norm(f"{name}.bn_l", near)
+        norm(f"{name}.bn_g", far)
+    for stage, channels in zip(_up_stages(blocks), (deep, deep // 2, deep // 4), strict=True):
+        conv(f"model.{stage}", channels, channels // 2, 3, 3, bias=True, transposed=True)
+        norm(f"model.{stage + 1}", channels // 2)
+    conv(f"model.{_last_stage(blocks)}", 3, width, 7, 7, bias=True)
+    return shapes
+
+
+def _layer_names(blocks: int) -> list[str]:
+    return [f"model.{5 + block}.conv{half}" for block in range(blocks) for half in (1, 2)]
+
+
+def _up_stages(blocks: int) -> range:
+    return range(6 + blocks, 15 + blocks, 3)
+
+
+def _last_stage(blocks: int) -> int:
+    return 16 + blocks
+
+
+class LamaNetwork(nn.Module):
+    """Colours for the holes of a picture whose sides are multiples of 8, at least 16; for inference alone.
+
+    It runs in channels-last memory, its batch norms folded into the convolutions before them. A 3×3 convolution looks
+    at its input reflected at the sides, a layer's local features (a quarter) and distant ones together.
+    """
+
+    def __init__(self, tensors: Tensors) -> None:
+        """Take tensors as `expected_shapes` names them, in single precision."""
+        super().__init__()
+        blocks = sum(name.endswith("conv1.bn_l.weight") for name in tensors)
+        self.first = _conv(*_folded(tensors, "model.1.ffc.convl2l", "model.1.bn_l"))
+        deepest = [_folded(tensors, f"model.4.ffc.convl2{side}", f"model.4.bn_{side}") for side in "lg"]
+        stages = [_folded(tensors, f"model.{stage}.ffc.convl2l", f"model.{stage}.bn_l") for stage in (2, 3)]
+        stages.append((torch.cat([weight for weight, _ in deepest]), torch.cat([bias for _, bias in deepest])))
+        self.down = nn.ModuleList(_conv(*stage, stride=2) for stage in stages)
+        self.layers = nn.ModuleList(FourierLayer(tensors, name) for name in _layer_names(blocks))
+        self.up = nn.ModuleList(
+            _conv(*_folded(tensors, f"model.{stage}", f"model.{stage + 1}", transposed=True), transposed=True)
+            for stage in _up_stages(blocks)
+        )
+        last = f"model.{_last_stage(blocks)}"
+        # 3 output channels leave a processor's registers empty: the 7 rows of each become channels and are added up.
+        weight = tensors[f"{last}.weight"].permute(2, 0, 1, 3).flatten(0, 1)[:, :, None]
+        self.rows = _conv(weight, tensors[f"{last}.bias"].repeat(7) / 7)
+        self.eval().requires_grad_(False)
+
+    def forward(self, rgb: Tensor, hole: Tensor) -> Tensor:
+        """Colours [B, 3, H, W] in 0..1 for sRGB [B, 3, H, W] in 0..1 with holes [B, 1, H, W] bool."""
+        return self.logits(torch.cat([torch.where(hole, 0.0, rgb), hole.to(rgb)], 1)).sigmoid_()
+
+    def logits(self, x: Tensor) -> Tensor:
+        """[B, 3, H, W] before the sigmoid, of colours that are 0 in the holes and a channel that is 1 there."""
+        x = self.first(_reflected(x.contiguous(memory_format=torch.channels_last), 3)).relu_()
+        for conv in self.down:
+            x = conv(_reflected(x, 1)).relu_()
+        for one, two in zip(self.layers[::2], self.layers[1::2], strict=True):
+            x = two(one(x)).add_(x)
+        for conv in self.up:
+            x = conv(x).relu_()
+        height = x.shape[2]
+        rows = self.rows(_reflected(x, 3))
+        del x
+        return torch.stack([rows[:, 3 * row : 3 * row + 3, row : row + height] for row in range(7)]).sum(0)
+
+
+class FourierLayer(nn.Module):
+    """A fast Fourier convolution: what is near from all features, what is distant from near ones and the spectrum."""
+
+    def __init__(self, tensors: Tensors, name: str) -> None:
+        """Take the tensors whose names begin with `name`."""
+        super().__init__()
+        spectral = f"{name}.ffc.convg2g"
+        scale, shift = _affine(tensors, f"{name}.bn_l")
+        near = torch.cat([tensors[f"{name}.ffc.convl2l.weight"], tensors[f"{name}.ffc.convg2l.weight"]], 1)
+        self.near = _conv(near * scale.view(-1, 1, 1, 1), shift)
+        self.far = _conv(*_folded(tensors, f"{name}.ffc.convl2g", f"{name}.bn_g"))
+        self.narrow = _linear(*_folded(tensors, f"{spectral}.conv1.0", f"{spectral}.conv1.1"))
+        self.spectrum = _linear(*_folded(tensors, f"{spectral}.fu.conv_layer", f"{spectral}.fu.bn"))
+        scale, _ = _affine(tensors, f"{name}.bn_g")
+        self.wide = _linear(tensors[f"{spectral}.conv2.weight"] * scale.view(-1, 1, 1, 1), None)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, h, w] to the same shape; the first C / LOCAL channels are local."""
+        padded, local = _reflected(x, 1), x.shape[1] // LOCAL
+        near = self.near(padded)
+        far = self.far(padded[:, :local].contiguous(memory_format=torch.channels_last))
+        del padded
+        far.permute(0, 2, 3, 1).add_(self._spectral(x[:, local:].permute(0, 2, 3, 1)))
+        return torch.cat([near, far], 1).relu_()
+
+    def _spectral(self, x: Tensor) -> Tensor:
+        """[B, h, w, D] to the same shape: a linear map of the whole picture's spectrum, rectified, between two others.
+
+        The spectrum's channels, each a real and an imaginary part, lie in memory as the published tensors count them.
+        """
+        x = self.narrow(x).relu_()
+        parts = torch.view_as_real(torch.fft.rfft2(x, dim=(1, 2), norm="ortho").contiguous())
+        parts = self.spectrum(parts.flatten(-2)).relu_().unflatten(-1, (-1, 2))
+        filtered = torch.fft.irfft2(torch.view_as_complex(parts), s=x.shape[1:3], dim=(1, 2), norm="ortho")
+        return self.wide(x.add_(filtered))  # type: ignore[no-any-return]
+
+
+def _affine(tensors: Tensors, norm: str) -> tuple[Tensor, Tensor]:
+    """A batch norm as factor and summand of each channel."""
+    mean, var, weight, bias = (tensors[f"{norm}.{key}"] for key in ("running_mean", "running_var", "weight", "bias"))
+    scale = weight / torch.sqrt(var + EPSILON)
+    return scale, bias - mean * scale
+
+
+def _folded(tensors: Tensors, conv: str, norm: str, *, transposed: bool = False) -> tuple[Tensor, Tensor]:
+    """Weight and bias of a convolution with the batch norm behind it."""
+    scale, shift = _affine(tensors, norm)
+    shape = (1, -1, 1, 1) if transposed else (-1, 1, 1, 1)
+    bias = tensors.get(f"{conv}.bias")
+    return tensors[f"{conv}.weight"] * scale.view(shape), shift if bias is None else shift + bias * scale
+
+
+def _conv(weight: Tensor, bias: Tensor, *, stride: int = 1, transposed: bool = False) -> nn.Module:
+    """A convolution with these numbers; a transposed one doubles the sides."""
+    one, other, height, width = weight.shape
+    conv: nn.Conv2d | nn.ConvTranspose2d
+    if transposed:
+        conv = nn.ConvTranspose2d(one, other, (height, width), 2, 1, 1, device="meta")
+    else:
+        conv = nn.Conv2d(other, one, (height, width), stride, device="meta")
+    conv.weight = nn.Parameter(weight.contiguous(memory_format=torch.channels_last))
+    conv.bias = nn.Parameter(bias)
+    return conv
+
+
+def _linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
+    """A 1×1 convolution of features whose channels are the last axis."""
+    linear = nn.Linear(weight.shape[1], weight.shape[0], bias is not None, device="meta")
+    linear.weight = nn.Parameter(weight.flatten(1).contiguous())
+    if bias is not None:
+        linear.bias = nn.Parameter(bias)
+    return linear
+
+
+def _reflected(x: Tensor, margin: int) -> Tensor:
+    return F.pad(x, (margin,) * 4, mode="reflect")
