@@ -218,6 +218,10 @@ def _safetensors(folder: Path) -> None:
     save_file({"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}, folder / "a.safetensors")
 
 
+def _saved(folder: Path) -> None:
+    torch.save({"a": torch.zeros(3, 4), "b": torch.nn.Parameter(torch.ones(2))}, folder / "a.pt")
+
+
 def _read_weights(folder: Path) -> None:
     if (folder / "checkpoint.pt").exists():
         load_checkpoint(folder, print)
@@ -269,7 +273,7 @@ READERS: dict[str, Reader] = {
     "recipes": Reader([_recipe], lambda folder: load_recipe(Recipe, _only(folder))),
     "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", print)),
     "datasets": Reader([_dataset], _read_dataset),
-    "weights": Reader([_checkpoint, _safetensors], _read_weights),
+    "weights": Reader([_checkpoint, _safetensors, _saved], _read_weights),
     "clips": Reader(
         [_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4"), _animation], _read_clip
     ),

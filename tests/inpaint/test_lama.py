@@ -133,22 +133,16 @@ def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[T
     return torch.where(hole[..., None], 0.0, rgb), hole, torch.zeros(1, height, width)
 
 
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The sizes of what the network is given."""
+def sizes_given(inpainter: LamaInpainter) -> list[tuple[int, ...]]:
+    """The sizes of what the network is given from now on."""
     sizes: list[tuple[int, ...]] = []
-    forward = LamaNetwork.forward
-
-    def noted(self: LamaNetwork, rgb: Tensor, hole: Tensor) -> Tensor:
-        sizes.append(tuple(hole.shape[2:]))
-        return forward(self, rgb, hole)
-
-    monkeypatch.setattr(LamaNetwork, "forward", noted)
+    inpainter._network.register_forward_pre_hook(lambda network, inputs: sizes.append(tuple(inputs[1].shape[2:])))
     return sizes
 
 
-def test_only_holes_change_and_only_their_surroundings_are_seen(file: Path, seen: list[tuple[int, ...]]) -> None:
+def test_only_holes_change_and_only_their_surroundings_are_seen(file: Path) -> None:
     inpainter = LamaInpainter(InpainterOptions(file, device="cpu"))
+    seen = sizes_given(inpainter)
     rgb, hole, depth = views(60, 700, (20, 10, 40, 20), (0, 690, 60, 700))
     painted = inpainter.paint(rgb, hole, depth)
     assert seen == [(64, 32 + MARGIN), (64, 12 + MARGIN + 4)]
@@ -163,8 +157,9 @@ def test_only_holes_change_and_only_their_surroundings_are_seen(file: Path, seen
     torch.testing.assert_close(painted[0, 20:40, 10:20], plain[20:40, 10:20])
 
 
-def test_large_crops_are_reduced_and_no_hole_is_lost(file: Path, seen: list[tuple[int, ...]]) -> None:
+def test_large_crops_are_reduced_and_no_hole_is_lost(file: Path) -> None:
     inpainter = LamaInpainter(InpainterOptions(file, 128, "cpu"))
+    seen = sizes_given(inpainter)
     rgb, hole, depth = views(200, 300, (70, 100, 71, 200))
     rgb = torch.where(hole[..., None], 0.0, 0.25).expand_as(rgb)
     painted = inpainter.paint(rgb, hole, depth)
