@@ -31,9 +31,9 @@ from torch.nn.functional import interpolate
 from spackle.bases.lite import LiteBase
 from spackle.evaluation.datasets.stereo import pair_of_2014
 from spackle.formats import save_png
+from spackle.formats.png import sheet
 from spackle.image import PHOTO_SUFFIXES, load_photo
 from spackle.training.recipe import RgbdFolder
-from spackle.training.residual import sheet
 from spackle.training.sources import find_files
 
 GUESSES = ("constant", "ramp", "lite")

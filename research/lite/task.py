@@ -19,8 +19,9 @@ from weights import first_network, freeze, save_networks
 from spackle.bases.lite import LiteBase, LiteNet
 from spackle.device import pick_dtype
 from spackle.folders import make_folder
+from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step
-from spackle.training.residual import CACHE, PICTURED, parameters, sheet
+from spackle.training.residual import CACHE, PICTURED, parameters
 from spackle.training.train import Task, rank, wait_for_ranks
 
 PICTURE_SIDE = 320  # pixels of a picture's longer side

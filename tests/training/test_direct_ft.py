@@ -185,7 +185,7 @@ def test_a_photo_whose_loss_is_no_number_is_named(place: Path, tmp_path: Path, m
     assert any(f"among {name}" in done.lines[-1] for name in names_in(place / "photos"))
 
 
-def test_a_step_has_the_photos_own_view_and_a_photo_teaches_or_judges(place: Path) -> None:
+def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> None:
     drawn = [drawn_views([0, step], VIEWS) for step in range(20)]
     assert all(views[0] == 0 and len(set(views)) == VIEWS_AT_ONCE for views in drawn)
     assert {view for views in drawn for view in views} == set(range(VIEWS))

@@ -251,28 +251,22 @@ def squeezenet(squeezed: dict[str, np.ndarray], tmp_path: Path) -> SqueezeNet:
     return network
 
 
-def test_resnet_has_torchvisions_names_shapes_and_input() -> None:
-    network = ResNet50().eval()
-    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
-    assert len(shapes) == 320 - 2  # torchvision's, less its classifier
-    assert shapes["bn1.num_batches_tracked"] == ()
-    assert shapes["layer1.0.downsample.0.weight"] == (256, 64, 1, 1)
-    assert shapes["layer3.5.bn3.running_var"] == (1024,)
-    seen: list[Tensor] = []
-    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
-    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
-    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
-
-
 @pytest.mark.parametrize("older", [False, True])
-def test_resnet_reads_torchvisions_file(resnet: dict[str, Tensor], tmp_path: Path, older: bool) -> None:
+def test_resnet_has_torchvisions_names_shapes_and_input(resnet: dict[str, Tensor], tmp_path: Path, older: bool) -> None:
     """Older files have no counters."""
     path = tmp_path / "resnet.pth"
     torch.save({name: v for name, v in resnet.items() if not (older and "num_batches" in name)}, path)
     network = load_features("resnet50", path)
     assert isinstance(network, ResNet50)
     assert all(torch.equal(value, resnet[name]) for name, value in network.state_dict().items())
+    assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
+    assert len(network.state_dict()) == 320 - 2  # torchvision's, less its classifier
+    assert resnet["layer1.0.downsample.0.weight"].shape == (256, 64, 1, 1)
+    assert resnet["layer3.5.bn3.running_var"].shape == (1024,)
+    seen: list[Tensor] = []
+    network.conv1.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    network(torch.tensor([0.485, 0.456 + 0.224, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32))
+    assert seen[0][0, :, 0, 0].tolist() == pytest.approx([0, 1, -0.406 / 0.225], abs=1e-6)
     maps = network(torch.rand(1, 3, 64, 96))
     assert [tuple(m.shape) for m in maps] == [(1, 256, 16, 24), (1, 512, 8, 12), (1, 1024, 4, 6), (1, 2048, 2, 3)]
     assert all(m.min() >= 0 for m in maps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +13,13 @@ import torch
 from rich.console import Console
 from rich.filesize import decimal
 from torch import Tensor
-from torch.nn.functional import pad
 
 from spackle.dataset.sample import END
 from spackle.dataset.shards import DatasetFiles, Manifest, ShardEntry, load_manifest, open_in
 from spackle.errors import InputError, one_line, reading
 from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
-from spackle.formats.png import thumbnail
+from spackle.formats.png import sheet
 from spackle.progress import Reporter, Step, counted
 
 SHEET, VIDEO = "sheet.png", "trajectory.mp4"
@@ -100,12 +99,12 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
         raise InputError(f"{location}: holds no photos")
     with results_folder(output, (SHEET, VIDEO), alone=True):
         groups = [files.group(index) for index in _spread(len(files), photos)]
-        blocks = []
-        for group in groups:  # rows of base, mask and target, with a column for each view
+        rows: list[list[Tensor]] = []
+        for group in groups:
             chosen = [group.view(index) for index in _spread(group.views, views)]
-            rows = [(v.rendering.rgb, v.mask[..., None].expand(-1, -1, 3).float(), v.target) for v in chosen]
-            blocks.append(_stack([_stack([thumbnail(picture, THUMBNAIL) for picture in row], 0) for row in rows], 1))
-        save_png(_stack(blocks, 0), output / SHEET)
+            masks = [view.mask[..., None].expand(-1, -1, 3).float() for view in chosen]
+            rows += [[view.rendering.rgb for view in chosen], masks, [view.target for view in chosen]]
+        save_png(sheet(rows, THUMBNAIL, fill=1.0), output / SHEET)
         # The path without the photo's own view, which comes before it.
         path = (groups[0].view(index) for index in range(1, groups[0].views))
         save_video((torch.cat([view.rendering.rgb, view.target], dim=1) for view in path), output / VIDEO, fps=FPS)
@@ -115,10 +114,3 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
 def _spread(total: int, count: int) -> list[int]:
     """Up to `count` places in 0..total, evenly."""
     return sorted({round(place) for place in np.linspace(0, total - 1, min(count, total))})
-
-
-def _stack(pictures: Sequence[Tensor], axis: int) -> Tensor:
-    """Pictures in a row or column, the smaller ones filled up with white."""
-    longest = max(picture.shape[1 - axis] for picture in pictures)
-    sides = (0, 0, 0) if axis == 0 else (0, 0, 0, 0, 0)
-    return torch.cat([pad(p, (*sides, longest - p.shape[1 - axis]), value=1.0) for p in pictures], dim=axis)

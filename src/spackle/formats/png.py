@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
+import torch
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from spackle.color import to_bytes
 from spackle.files import atomic_path
@@ -18,6 +20,13 @@ def thumbnail(picture: Tensor, side: int) -> Tensor:
     scale = min(1.0, side / max(height, width))
     size = max(1, round(height * scale)), max(1, round(width * scale))
     return interpolate(picture.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
+
+
+def sheet(rows: Sequence[Sequence[Tensor]], side: int, fill: float = 0.0) -> Tensor:
+    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` pixels long; `fill` follows narrower rows."""
+    shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
+    widest = max(row.shape[1] for row in shown)
+    return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1]), value=fill) for row in shown])
 
 
 def save_png(rgb: Tensor, path: str | os.PathLike[str]) -> None:

@@ -116,26 +116,23 @@ def find_run(
     try:
         found = load_checkpoint(folder, log)
         if found:
-            _check_same_run(found, method, recipe, digest, output)
+            what, other = "", differences(found.recipe, recipe)
+            if found.method != method:
+                what = f"--method {found.method}, not of {method}"
+            elif other:
+                what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
+            elif found.digest != digest:
+                what = "another recipe (the files that data names differ)"
+            if what:
+                raise InputError(
+                    f"{output}: holds a run of {what}: choose another with -o, or --overwrite to start anew"
+                )
             log(f"{folder}: going on from step {found.progress.step}")
     except InputError:
         if not anew:
             raise
         found = None  # begun by another recipe, or damaged
     return folder, found
-
-
-def _check_same_run(checkpoint: Checkpoint, method: str, recipe: AnyRecipe, digest: str, folder: Path) -> None:
-    """InputError where a checkpoint is of another method, of another recipe, or of other samples."""
-    what, other = "", differences(checkpoint.recipe, recipe)
-    if checkpoint.method != method:
-        what = f"--method {checkpoint.method}, not of {method}"
-    elif other:
-        what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
-    elif checkpoint.digest != digest:
-        what = "another recipe (the files that data names differ)"
-    if what:
-        raise InputError(f"{folder}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
 
 
 def replace_run(folder: Path, new: Path) -> None:

@@ -26,12 +26,13 @@ from spackle.dataset.shards import DatasetFiles
 from spackle.device import enough_memory, own_arithmetic
 from spackle.errors import InputError
 from spackle.files import write_whole
+from spackle.formats.png import sheet
 from spackle.gaussians import Gaussians
 from spackle.network_file import read_tensors
 from spackle.progress import Reporter
 from spackle.render import Renderer, place_of
 from spackle.training.recipe import DataRecipe, Recipe
-from spackle.training.residual import PICTURED, ViewBatch, ViewTask, sheet
+from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask
 from spackle.training.samples import short_digest
 from spackle.training.sources import open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
@@ -163,7 +164,7 @@ class DirectFt(ViewTask):
             group = self.files.group(place)
             done = self.complete(network, [group.view(0), group.view(int(np.argmax(group.holes)))])
             rows += zip(done.base_rgb, done.rgb, done.target, strict=True)
-        return sheet(rows)
+        return sheet(rows, PICTURE_SIDE)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
         return [self.files.samples[self.learned[item]][1].photo for item in items]

@@ -16,12 +16,11 @@ from typing import Any, ClassVar
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from spackle.device import pick_dtype
 from spackle.files import write_whole
 from spackle.folders import make_folder
-from spackle.formats.png import thumbnail
+from spackle.formats.png import sheet
 from spackle.progress import Reporter
 from spackle.render import Renderer, get_renderer, place_of, render_batch
 from spackle.render.protocol import Rendering
@@ -36,6 +35,7 @@ from spackle.training.train import Task
 
 MIN_AUX = 64  # aux Gaussians of a view, however small its holes (paper, "Training Details and Loss Weights")
 PICTURED = 6  # views in the picture
+PICTURE_SIDE = 512  # pixels of a picture's longer side
 CACHE = "cache"  # in the output, where the recipe names no other folder
 
 
@@ -125,13 +125,6 @@ def parameters(network: nn.Module) -> dict[str, int]:
     return counts
 
 
-def sheet(rows: Sequence[Sequence[Tensor]], side: int = 512) -> Tensor:
-    """[H, W, 3]: rows of pictures [h, w, 3], each at most `side` pixels long; narrower rows are black at their end."""
-    shown = [torch.cat([thumbnail(picture.cpu(), side) for picture in row], dim=1) for row in rows]
-    widest = max(row.shape[1] for row in shown)
-    return torch.cat([pad(row, (0, 0, 0, widest - row.shape[1])) for row in shown])
-
-
 def complete_samples(
     network: nn.Module | None, samples: Sequence[Sample], renderer: Renderer, precision: torch.dtype = torch.float32
 ) -> ViewBatch:
@@ -140,7 +133,7 @@ def complete_samples(
     The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
     What needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
     """
-    place = place_of(renderer)
+    device = place_of(renderer)
     cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
     fields: Sequence[Tensor | None] = [None] * len(samples)
@@ -149,11 +142,11 @@ def complete_samples(
         features = features.to(next(network.parameters()).device)
         with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
             deltas = network(features.contiguous(memory_format=torch.channels_last))
-        fields = list(deltas.float().to(place))
-    samples = [sample.to(place) for sample in samples]
+        fields = list(deltas.float().to(device))
+    samples = [sample.to(device) for sample in samples]
     scenes = []
     for sample, field, chosen in zip(samples, fields, cells, strict=True):
-        index = chosen.to(place, non_blocking=True)
+        index = chosen.to(device, non_blocking=True)
         deltas = None if field is None else field.flatten(1).T[index]
         scenes.append([sample.base, compose(sample.seeds.select(index), deltas, sample.camera)])
     cameras, onto = [sample.camera for sample in samples], [sample.rendering for sample in samples]
@@ -233,7 +226,7 @@ class ResidualTask(ViewTask):
         items = range(0, self.validation_items, max(1, self.validation_items // PICTURED))[:PICTURED]
         batch = self.batch(None, items)
         done, plain = self.complete(network, batch), self.complete(None, batch)
-        return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)))
+        return sheet(list(zip(done.base_rgb, plain.rgb, done.rgb, done.target, strict=True)), PICTURE_SIDE)
 
     def names(self, step: int, items: Sequence[int]) -> list[str]:
         return [self.learned[item].name for item in items]

@@ -14,6 +14,7 @@ import math
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import timedelta
@@ -309,14 +310,12 @@ def validate(task: Task, network: nn.Module, device: torch.device) -> dict[str, 
 def made_ahead(make: Callable[[K], V], keys: Iterable[K]) -> Generator[V, None, None]:
     """The values of keys, in order; a thread makes the next one while one is used."""
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as worker:
-        begun: Future[V] | None = None
+        begun = deque[Future[V]]()
         for key in keys:
-            following = worker.submit(make, key)
-            if begun is not None:
-                yield begun.result()
-            begun = following
-        if begun is not None:
-            yield begun.result()
+            begun.append(worker.submit(make, key))
+            if len(begun) > 1:
+                yield begun.popleft().result()
+        yield from (last.result() for last in begun)
 
 
 def learning_rate(step: int, optim: OptimRecipe) -> float:
