@@ -89,13 +89,13 @@ def load_checkpoint(folder: Path, log: Log) -> Checkpoint | None:
             continue
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-            found = Checkpoint(**{**state, "progress": Progress(**state["progress"])})
+            checkpoint = Checkpoint(**{**state, "progress": Progress(**state["progress"])})
         except Exception as error:  # a damaged file can raise anything
             problem = problem or f"{path}: cannot be read ({reason_in_a_line(error)})"
         else:
             if problem:
                 log(f"{problem}: going on from the one before it")
-            return found
+            return checkpoint
     if problem:
         raise InputError(f"{problem}, nor is there one before it: --overwrite starts anew")
     return None
@@ -114,25 +114,25 @@ def find_run(
     anew = overwrite and any((output / name).exists() for name in RESULTS)
     folder = output / NEW if anew else output
     try:
-        found = load_checkpoint(folder, log)
-        if found:
-            what, other = "", differences(found.recipe, recipe)
-            if found.method != method:
-                what = f"--method {found.method}, not of {method}"
+        checkpoint = load_checkpoint(folder, log)
+        if checkpoint:
+            what, other = "", differences(checkpoint.recipe, recipe)
+            if checkpoint.method != method:
+                what = f"--method {checkpoint.method}, not of {method}"
             elif other:
                 what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
-            elif found.digest != digest:
+            elif checkpoint.digest != digest:
                 what = "another recipe (the files that data names differ)"
             if what:
                 raise InputError(
                     f"{output}: holds a run of {what}: choose another with -o, or --overwrite to start anew"
                 )
-            log(f"{folder}: going on from step {found.progress.step}")
+            log(f"{folder}: going on from step {checkpoint.progress.step}")
     except InputError:
         if not anew:
             raise
-        found = None  # begun by another recipe, or damaged
-    return folder, found
+        checkpoint = None  # begun by another recipe, or damaged
+    return folder, checkpoint
 
 
 def replace_run(folder: Path, new: Path) -> None:
@@ -141,11 +141,11 @@ def replace_run(folder: Path, new: Path) -> None:
     Where it is killed, the checkpoint is still in `new`, and a second call does the rest.
     """
     for name in (RUN, PREVIOUS, BAD, LOGS, PICTURES, BEST, LAST, NEWEST):
-        old, own = folder / name, new / name
-        if name in (PREVIOUS, BAD) or own.exists():  # else it was moved before
+        old, successor = folder / name, new / name
+        if name in (PREVIOUS, BAD) or successor.exists():  # else it was moved before
             shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
-        if own.exists():
-            os.replace(own, old)
+        if successor.exists():
+            os.replace(successor, old)
     shutil.rmtree(new)
 
 

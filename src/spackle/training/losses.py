@@ -147,8 +147,8 @@ def load_features(
         raise InputError(f"{name}: its weights are not given: name their file, or choose none")
     network: FeatureNet = ResNet50() if name == "resnet50" else SqueezeNet()
     advice = f"give another file with {name}'s weights"
-    found = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)
-    tensors = {key: value for key, value in found.items() if not key.startswith(network.head)}
+    tensors = read_tensors(path, advice) if name == "resnet50" else _read_npz(path, advice)
+    tensors = {key: value for key, value in tensors.items() if not key.startswith(network.head)}
     return load_strict(network, tensors, path, advice).to(device)
 
 

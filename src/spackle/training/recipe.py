@@ -189,14 +189,14 @@ R = TypeVar("R", bound=AnyRecipe)
 def differences(stored: Mapping[str, Any], recipe: RecipePart, above: str = "") -> list[str]:
     """The keys, below `above`, in which a recipe and a stored one (as `model_dump` has it) are different runs."""
     fields, now = type(recipe).model_fields, recipe.model_dump(mode="json")
-    found = [above + name for name, value in stored.items() if name not in fields and value is not None]
+    keys = [above + name for name, value in stored.items() if name not in fields and value is not None]
     for name, field in fields.items():
         part = getattr(recipe, name)
         if isinstance(part, RecipePart):
-            found += differences(stored.get(name) or {}, part, f"{above}{name}.")
+            keys += differences(stored.get(name) or {}, part, f"{above}{name}.")
         elif FREE not in field.metadata and stored.get(name) != now[name]:
-            found.append(above + name)
-    return sorted(found)
+            keys.append(above + name)
+    return sorted(keys)
 
 
 def load_recipe(kind: type[R], path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> R:
@@ -245,12 +245,12 @@ def _parse(text: str, where: object) -> Any:
 def _set(content: Any, keys: Sequence[str], value: object) -> None:
     """Put a value into nested dictionaries and lists; missing dictionaries are made."""
     for key, following in zip(keys, [*keys[1:], None], strict=True):
-        place = int(key) if isinstance(content, list) else key
+        index = int(key) if isinstance(content, list) else key
         if following is None:
-            content[place] = value
-        elif isinstance(content, dict) and not isinstance(content.get(place), (dict, list)):
-            content[place] = {}
-        content = content[place]
+            content[index] = value
+        elif isinstance(content, dict) and not isinstance(content.get(index), (dict, list)):
+            content[index] = {}
+        content = content[index]
 
 
 def _first_problem(kind: Any, error: ValidationError) -> str:

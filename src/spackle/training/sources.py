@@ -43,12 +43,12 @@ Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # a pho
 
 def find_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
     """Look for a recipe's files; InputError for a folder that is missing or without such files, or no data."""
-    shares, found = data.shares, list[Source]()
+    shares, sources = data.shares, list[Source]()
 
     def add(name: str, share: float, folder: Path, files: Sequence[Path], view: Callable[..., Sample]) -> None:
         if share > 0:
             names = [file.relative_to(folder).as_posix() for file in files]
-            found.append(Source(share, view, [name, *names]))
+            sources.append(Source(share, view, [name, *names]))
 
     def reverse(draw: Draw) -> Callable[[np.random.Generator], Sample]:
         return partial(random_reverse_view, draw=draw, disparity=data.disparity, renderer=renderer)
@@ -70,23 +70,23 @@ def find_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
     if data.pseudo is not None and shares.pseudo > 0:
         dataset = open_pseudo(data.pseudo)
         view = partial(pseudo_view, files=dataset, places=views_with_holes(dataset))
-        found.append(Source(shares.pseudo, view, ["pseudo", dataset.manifest.digest]))
-    if not found:
+        sources.append(Source(shares.pseudo, view, ["pseudo", dataset.manifest.digest]))
+    if not sources:
         raise InputError(
             "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
             "and a share above 0"
         )
-    return found
+    return sources
 
 
 def find_files(folder: Path, key: str, endings: tuple[str, ...], what: str) -> list[Path]:
     """All files below a folder whose names end so, in order; InputError for no folder, or no such file in it."""
     if not os.path.isdir(folder):
         raise InputError(f"{folder}: no such folder, but {key} names it: give {key}=FOLDER")
-    found = files_in(folder, endings, below=True)
-    if not found:
+    files = files_in(folder, endings, below=True)
+    if not files:
         raise InputError(f"{folder}: {key} names this folder, but there is nothing in it: looked for {what}")
-    return found
+    return files
 
 
 # Views --------------------------------------------------------------------------------------------

@@ -138,15 +138,15 @@ def train(
         task = open_task(recipe, device)
         if task.items_a_step % rank_count():
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes")
-        folder, found = find_run(output, overwrite, task.name, recipe, task.digest, reporter.log)
+        folder, checkpoint = find_run(output, overwrite, task.name, recipe, task.digest, reporter.log)
         facts = task.prepare(output, reporter)
         wait_for_ranks()  # nobody looks for checkpoints any more
         if folder != output and rank() == 0:
-            if found is None:
+            if checkpoint is None:
                 shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(exist_ok=True)
         with reading(folder, "cannot write: {reason}", OSError):
-            why, step = _learn(recipe, task, folder, found, facts, device, reporter)
+            why, step = _learn(recipe, task, folder, checkpoint, facts, device, reporter)
         if rank() == 0:
             if folder != output and why != "stopped":
                 replace_run(output, folder)
@@ -159,7 +159,7 @@ def _learn(
     recipe: AnyRecipe,
     task: Task,
     folder: Path,
-    found: Checkpoint | None,
+    checkpoint: Checkpoint | None,
     facts: dict[str, Any],
     device: torch.device,
     reporter: Reporter,
@@ -172,12 +172,12 @@ def _learn(
     wrapped = DistributedDataParallel(network) if rank_count() > 1 else network
     optimizer = AdamW(task.groups(), optim.lr, betas=optim.betas, weight_decay=optim.weight_decay)
     progress, stopped = Progress(), False
-    if found:
+    if checkpoint:
         with reading(folder, "its checkpoint is of another network ({reason}): choose another with -o, or --overwrite"):
-            network.load_state_dict(found.network)
-            average.load_state_dict(found.average)
-            optimizer.load_state_dict(found.optimizer)
-        progress = found.progress
+            network.load_state_dict(checkpoint.network)
+            average.load_state_dict(checkpoint.average)
+            optimizer.load_state_dict(checkpoint.optimizer)
+        progress = checkpoint.progress
     facts |= {"method": task.name, "aim": task.aim, "recipe": recipe.model_dump(mode="json")}
     facts |= {"processes": rank_count(), "versions": versions(), "hardware": hardware(device)}
 
@@ -197,9 +197,9 @@ def _learn(
 
     def parts(step: int) -> list[list[int]]:
         """This process's items of a step, as they go through the network."""
-        own = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
-        size = task.at_once or len(own)
-        return [own[start : start + size] for start in range(0, len(own), size)]
+        items = samples_of_step(step, task.items, task.items_a_step, run.seed, rank(), rank_count())
+        size = task.at_once or len(items)
+        return [items[start : start + size] for start in range(0, len(items), size)]
 
     def curves(group: str, values: Mapping[str, float]) -> None:
         for name, value in values.items():
@@ -220,9 +220,9 @@ def _learn(
             # Forward and backward: a step's parts add up their gradients, its last one joins those of the processes.
             optimizer.zero_grad(set_to_none=True)
             sums: dict[str, Tensor] = {}
-            for number, part in enumerate(own := parts(step), 1):
+            for number, part in enumerate(split := parts(step), 1):
                 share = len(part) * rank_count() / task.items_a_step
-                alone = rank_count() > 1 and number < len(own)
+                alone = rank_count() > 1 and number < len(split)
                 with wrapped.no_sync() if alone else contextlib.nullcontext():  # type: ignore[operator]
                     loss, terms = task.loss(wrapped, next(batches))
                     (share * loss).backward()  # type: ignore[no-untyped-call]
@@ -238,7 +238,7 @@ def _learn(
                     (folder / BAD).mkdir(exist_ok=True)
                     save_checkpoint(state(), folder / BAD)
                 wait_for_ranks()
-                names = ", ".join(task.names(step, [item for part in own for item in part]))
+                names = ", ".join(task.names(step, [item for part in split for item in part]))
                 raise InputError(
                     f"{folder / BAD}: step {step} gave numbers that are not finite ({', '.join(bad)}); the weights "
                     f"before it are there: lower optim.lr, or remove what is broken among {names}"
