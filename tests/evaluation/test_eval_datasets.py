@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,10 @@ from PIL import Image
 from spackle.bases.depth_map import DepthMap
 from spackle.camera import Camera
 from spackle.errors import InputError
-from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, Points, known_depth, load_case
 from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.datasets.multiview import spread
+from spackle.evaluation.protocols import Alignment, align, to_base
 from spackle.evaluation.rows import IMAGES
 from spackle.image import working_size
 
@@ -122,35 +121,27 @@ def colmap(
     lens = [FOCAL, WIDTH / 2, HEIGHT / 2, bend] if bend is not None else [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
     world = [*POINTS, np.array([0.0, 0.0, 99.0])]
     ids, errors = [10 + 3 * k for k in range(len(world))], [0.5] * len(POINTS) + [7.0]
-    images = []
-    for number, (name, eye) in enumerate(zip(names, eyes, strict=False)):
+    cameras, images, points = struct.pack("<QiiQQ4d", 1, 4, 2 if bend else 1, WIDTH, HEIGHT, *lens), b"", b""
+    model = "SIMPLE_RADIAL" if bend else "PINHOLE"
+    texts = [
+        f"# Camera list\n4 {model} {WIDTH} {HEIGHT} {' '.join(map(str, lens))}\n",
+        "# two lines a photo\n",
+        "# 3D\n",
+    ]
+    for key, (name, eye) in enumerate(zip(names, eyes, strict=False), 1):
         shift = -eye.to_world[:3, :3].T @ np.array(eye.at)
+        pose = [float(number) for number in (np.cos(eye.turn / 2), 0, -np.sin(eye.turn / 2), 0, *shift)]
         seen = [(*eye.pixel(point)[:2], key) for point, key in zip(world, ids, strict=True)] + [(1.0, 1.0, -1)]
-        images.append((number + 1, [np.cos(eye.turn / 2), 0, -np.sin(eye.turn / 2), 0, *shift], name, seen))
-    if binary:
-        model = 2 if bend is not None else 1
-        (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 4, model, WIDTH, HEIGHT, *lens))
-        data = struct.pack("<Q", len(images))
-        for key, pose, name, seen in images:
-            data += struct.pack("<i7di", key, *pose, 4) + name.encode() + b"\0" + struct.pack("<Q", len(seen))
-            data += b"".join(struct.pack("<ddq", *point) for point in seen)
-        (folder / "images.bin").write_bytes(data)
-        data = struct.pack("<Q", len(world))
-        for key, point, error in zip(ids, world, errors, strict=True):
-            track = [(image[0], 0) for image in images]
-            data += struct.pack("<Q3d3BdQ", key, *point, 1, 2, 3, error, len(track))
-            data += b"".join(struct.pack("<ii", *entry) for entry in track)
-        (folder / "points3D.bin").write_bytes(data)
-        return
-    model = "SIMPLE_RADIAL" if bend is not None else "PINHOLE"
-    (folder / "cameras.txt").write_text(f"# Camera list\n4 {model} {WIDTH} {HEIGHT} {' '.join(map(str, lens))}\n")
-    text = "# Image list with two lines of data per image:\n"
-    for key, pose, name, seen in images:
-        text += f"{key} {' '.join(map(repr, map(float, pose)))} 4 {name}\n"
-        text += " ".join(f"{float(x)!r} {float(y)!r} {point}" for x, y, point in seen) + "\n"
-    (folder / "images.txt").write_text(text)
-    rows = [f"{k} {' '.join(map(str, p))} 1 2 3 {e} 1 0 2 0" for k, p, e in zip(ids, world, errors, strict=True)]
-    (folder / "points3D.txt").write_text("\n".join(["# 3D points", *rows]) + "\n")
+        images += struct.pack("<i7di", key, *pose, 4) + name.encode() + b"\0" + struct.pack("<Q", len(seen))
+        images += b"".join(struct.pack("<ddq", *point) for point in seen)
+        texts[1] += f"{key} {' '.join(map(repr, pose))} 4 {name}\n"
+        texts[1] += " ".join(f"{x!r} {y!r} {point}" for x, y, point in seen) + "\n"
+    for key, point, error in zip(ids, world, errors, strict=True):
+        points += struct.pack("<Q3d3BdQii", key, *point, 1, 2, 3, error, 1, 2, 0)
+        texts[2] += f"{key} {' '.join(map(str, point))} 1 2 3 {error} 1 0 2 0\n"
+    counted = (cameras, struct.pack("<Q", len(names[: len(eyes)])) + images, struct.pack("<Q", len(world)) + points)
+    for name, data, text in zip(("cameras", "images", "points3D"), counted, texts, strict=True):
+        (folder / f"{name}{'.bin' if binary else '.txt'}").write_bytes(data if binary else text.encode())
 
 
 def eth3d(scene: Path, eyes: Sequence[Eye] = EYES) -> Path:
@@ -193,16 +184,11 @@ TREES: dict[str, Callable[[Path], Path]] = {
     "llff": lambda root: llff(root / "fern"),
     "tanks": lambda root: tanks(root / "Truck"),
 }
-EXPECTED = {"middlebury": 1, "booster": 2, "wildrgbd": 5, "eth3d": 5, "llff": 5, "tanks": 5}
-
-
-def cases(name: str, root: Path) -> list[Case]:
-    return read_cases(name, root)
 
 
 def error_of(name: str, root: Path) -> str:
     with pytest.raises(InputError) as caught:
-        cases(name, root)
+        read_cases(name, root)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -238,9 +224,11 @@ def test_each_tree_is_read_by_its_dataset_and_recognised_by_the_others(asked: st
         assert "expected" in message
         assert f"this looks like {there}" in message
         return
-    found = cases(asked, tmp_path / "data")
-    assert len(found) == EXPECTED[there]
-    assert [case.name for case in cases(asked, scene)] == [case.name for case in found]  # a scene alone is a root too
+    found = read_cases(asked, tmp_path / "data")
+    assert len(found) == {"middlebury": 1, "booster": 2}.get(there, len(EYES))
+    assert [case.name for case in read_cases(asked, scene)] == [
+        case.name for case in found
+    ]  # a scene alone is a root too
     assert len({case.name for case in found}) == len(found)
     assert all(case.photo.is_file() and all(view.photo.is_file() for view in case.seconds) for case in found)
     assert all(case.metric == (there in ("middlebury", "booster", "wildrgbd", "eth3d")) for case in found)
@@ -269,7 +257,6 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
     ("booster", f"{BOOSTER}/calib_00-02.xml", "<opencv_storage><proj_matL/></opencv_storage>", "calib_00-02.xml: "),
     ("wildrgbd", f"{WILD}/metadata", '{"w": 4, "h": 3, "K": [1, 2]}', "metadata: "),
     ("wildrgbd", f"{WILD}/cam_poses.txt", "0 1 2 3\n", "cam_poses.txt: "),
-    ("wildrgbd", f"{WILD}/cam_poses.txt", "0 " + "nan " * 16, "cam_poses.txt: "),
     ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 40 40\n", "cameras.txt: "),
     ("eth3d", f"{MODEL}/images.txt", "1 0 0 0 0 0 0 0 4 a.jpg\n\n", "images.txt: "),
     ("llff", "fern/poses_bounds.npy", "not NumPy", "poses_bounds.npy: "),
@@ -278,17 +265,9 @@ BROKEN: list[tuple[str, str, str | None, str]] = [  # dataset, file, its content
     ("eth3d", f"{MODEL}/images.txt", "1 1 0 0 0 0 0 1e300 4 a.jpg\n\n" * 2, "images.txt: "),
     ("eth3d", f"{MODEL}/points3D.txt", f"{'9' * 400} -1 0 3 1 2 3 0.5 1 0\n", "points3D.txt: "),
     ("eth3d", f"{MODEL}/cameras.txt", f"4 PINHOLE {'9' * 400} 36 40 40 24 18\n", "cameras.txt: "),
-    ("eth3d", f"{MODEL}/cameras.txt", "4 PINHOLE 48 36 1e300 40 24 18\n", "cameras.txt: "),
     ("wildrgbd", f"{WILD}/metadata", f'{{"w": {"9" * 400}, "h": 3, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}', "metadata: "),
-    ("wildrgbd", f"{WILD}/metadata", '{"w": 1e999, "h": 3, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}', "metadata: "),
     ("wildrgbd", f"{WILD}/metadata", f'{{"w": 4, "h": 3, "K": [{"9" * 400}, 0, 0, 0, 1, 0, 0, 0, 1]}}', "metadata: "),
     ("wildrgbd", f"{WILD}/cam_poses.txt", "0 " + "0 " * 16 + "\n1 " + "1 " * 16, "cam_poses.txt: "),
-    (
-        "middlebury",
-        f"{MIDDLEBURY}/calib.txt",
-        f"cam0=[9 0 9; 0 9 9; 0 0 1]\nbaseline=9\nwidth={'9' * 400}\nheight=9\n",
-        "c",
-    ),
 ]
 
 
@@ -305,20 +284,11 @@ def test_a_missing_or_damaged_file_is_named(
 
 @pytest.mark.parametrize("number", [0, 1e30])
 def test_a_pose_that_is_no_rotation_is_named(number: float, tmp_path: Path) -> None:
-    TREES["llff"](tmp_path)
-    table = np.load(tmp_path / "fern/poses_bounds.npy")
+    path = TREES["llff"](tmp_path) / "poses_bounds.npy"
+    table = np.load(path)
     table[2, :3] = number
-    np.save(tmp_path / "fern/poses_bounds.npy", table)
+    np.save(path, table)
     assert "poses_bounds.npy: image002.png: " in error_of("llff", tmp_path)
-
-
-def test_empty_lines_of_a_calibration_cost_nothing(tmp_path: Path) -> None:
-    scene = middlebury_2014(tmp_path / "Piano-perfect")
-    path = scene / "calib.txt"
-    path.write_text("\n" * 30_000 + path.read_text() + " " * 30_000)
-    start = time.perf_counter()
-    assert len(cases("middlebury", tmp_path)) == 1
-    assert time.perf_counter() - start < 1
 
 
 def test_too_few_photos_and_lenses_that_bend_are_refused(tmp_path: Path) -> None:
@@ -337,76 +307,76 @@ def test_too_few_photos_and_lenses_that_bend_are_refused(tmp_path: Path) -> None
 # -- rectified pairs -------------------------------------------------------------------------------------------------
 
 
-def assert_pair(case: Case, pixel: tuple[int, int], disparity: float, z: float) -> None:
-    """The centre of a left pixel must be seen `disparity` pixels further left, at the depth that is known there."""
+def assert_pair(case: Case, disparity: float, z: float, x: int = 30, y: int = 9) -> tuple[torch.Tensor, torch.Tensor]:
+    """The centre of a left pixel must be seen `disparity` pixels further left, at the depth that is known there.
+
+    Returns where depth is known [H, W], and K.
+    """
     assert case.camera is not None
     assert case.depth is not None
-    known = case.depth()
-    x, y = pixel
+    known, K = case.depth(), case.camera.K
+    assert known.K is not None
+    assert torch.equal(known.K, K)
     assert bool(known.valid[y, x])
-    torch.testing.assert_close(float(known.depth[y, x]), z, rtol=1e-5, atol=0)
     point = case.camera.unproject(torch.tensor([x + 0.5, y + 0.5]), known.depth[y, x])
     uv, depth = case.seconds[0].camera.project(point)
     torch.testing.assert_close(uv, torch.tensor([x + 0.5 - disparity, y + 0.5]), atol=1e-3, rtol=0)
-    torch.testing.assert_close(float(depth), z, rtol=1e-5, atol=0)
-    assert known.K is not None
-    assert torch.equal(known.K, case.camera.K)
+    torch.testing.assert_close([float(depth), float(known.depth[y, x])], [z, z], rtol=1e-5, atol=0)
+    return known.valid, K
 
 
 def test_middlebury_2014(tmp_path: Path) -> None:
     for name, truth in (("Piano-perfect", "disp0.pfm"), ("Piano-imperfect", "disp0.pfm"), ("Art", "disp0GT.pfm")):
         middlebury_2014(tmp_path / "trainingQ" / name, truth=truth)
     middlebury_2014(tmp_path / "testQ/Djembe", truth="")
-    found = cases("middlebury", tmp_path)
+    found = read_cases("middlebury", tmp_path)
     assert [case.name for case in found] == ["Art", "Piano-perfect"]
     for case in found:
-        assert_pair(case, (30, 9), 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
-        assert case.camera is not None
-        assert float(case.camera.K[0, 2]) == 20.75  # the file counts from the middle of the first pixel
-        assert case.depth is not None
-        assert not bool(case.depth().valid[0, 0])
+        valid, K = assert_pair(case, 5.0, FOCAL * 0.193001 / (5.0 + 3.5))
+        assert (float(K[0, 2]), bool(valid[0, 0])) == (20.75, False)  # the file counts from the first pixel's middle
     middlebury_2014(tmp_path / "trainingH/Art")
     assert "give the folder of one size" in error_of("middlebury", tmp_path)
 
 
+def write_levels(path: Path, value: int, width: int, height: int) -> None:
+    """A grey picture, whose first row is unknown."""
+    stored = np.full((height, width), value, np.uint8)
+    stored[0] = 0
+    Image.fromarray(stored).save(path)
+
+
 @pytest.mark.parametrize(("height", "shrink", "photos"), [(1110, 1, "."), (555, 2, "Illum2/Exp1"), (370, 3, ".")])
 def test_middlebury_2006(height: int, shrink: int, photos: str, tmp_path: Path) -> None:
-    scene = tmp_path / "Aloe"
     for name in ("view1.png", "view5.png"):
-        photo(scene / photos / name, 40, height)
-    levels = np.full((height, 40), 90, np.uint8)
-    levels[0] = 0
-    Image.fromarray(levels).save(scene / "disp1.png")
-    (scene / "dmin.txt").write_text("270\n")
-    (case,) = cases("middlebury", tmp_path)
-    assert case.metric
-    assert_pair(case, (30, 9), 90 / shrink, 3740 * 0.16 / (90 + 270))
-    assert case.depth is not None
-    assert not case.depth().valid[0].any()
+        photo(tmp_path / "Aloe" / photos / name, 40, height)
+    write_levels(tmp_path / "Aloe/disp1.png", 90, 40, height)
+    (tmp_path / "Aloe/dmin.txt").write_text("270\n")
+    (case,) = read_cases("middlebury", tmp_path)
+    valid, _ = assert_pair(case, 90 / shrink, 3740 * 0.16 / (90 + 270))
+    assert (case.metric, bool(valid[0].any())) == (True, False)
 
 
-@pytest.mark.parametrize(("width", "levels"), [(450, 4), (900, 2), (1800, 1), (434, 8)])
+@pytest.mark.parametrize(("width", "steps"), [(450, 4), (900, 2), (1800, 1), (434, 8)])
 @pytest.mark.parametrize("suffixes", [(".ppm", ".pgm"), (".png", ".png")])
-def test_middlebury_2003_and_2001(width: int, levels: int, suffixes: tuple[str, str], tmp_path: Path) -> None:
-    scene = tmp_path / "cones"
+def test_middlebury_2003_and_2001(width: int, steps: int, suffixes: tuple[str, str], tmp_path: Path) -> None:
     for name in ("im2", "im6"):
-        photo(scene / f"{name}{suffixes[0]}", width, 24)
-    Image.fromarray(np.full((24, width), 120, np.uint8)).save(scene / f"disp2{suffixes[1]}")
-    (case,) = cases("middlebury", tmp_path)
-    size, disparity = width / 450, 120 / levels
-    assert_pair(case, (300, 9), disparity, 1000 * size * 0.1 / (disparity + 30 * size))
+        photo(tmp_path / "cones" / f"{name}{suffixes[0]}", width, 24)
+    write_levels(tmp_path / f"cones/disp2{suffixes[1]}", 120, width, 24)
+    (case,) = read_cases("middlebury", tmp_path)
+    size, disparity = width / 450, 120 / steps
+    assert_pair(case, disparity, 1000 * size * 0.1 / (disparity + 30 * size), x=300)
     assert not case.metric
 
 
 def test_a_scene_description(tmp_path: Path) -> None:
     for name in ("left.png", "right.png"):
         photo(tmp_path / "mb_Art" / name)
-    Image.fromarray(np.full((HEIGHT, WIDTH), 30, np.uint8)).save(tmp_path / "mb_Art/disparity.png")
+    write_levels(tmp_path / "mb_Art/disparity.png", 30, WIDTH, HEIGHT)
     facts = {"left": "left.png", "right": "right.png", "disparity": "disparity.png", "disparity_scale": 1 / 3}
     lens = {"focal_px": FOCAL, "cx": 24.0, "cy": 18.0, "doffs_px": 2.0, "baseline_m": 0.16, "invalid": 0}
     (tmp_path / "mb_Art/scene.json").write_text(json.dumps(facts | lens))
-    (case,) = cases("middlebury", tmp_path)
-    assert_pair(case, (30, 9), 10.0, FOCAL * 0.16 / 12)
+    (case,) = read_cases("middlebury", tmp_path)
+    assert_pair(case, 10.0, FOCAL * 0.16 / 12)
     for content in ("[]", json.dumps(lens)):
         (tmp_path / "mb_Art/scene.json").write_text(content)
         assert "scene.json: not a scene description" in error_of("middlebury", tmp_path)
@@ -418,8 +388,8 @@ def test_eth3d_two_views(truth: str, tmp_path: Path) -> None:
     target = tmp_path / truth / "playground_1l/disp0GT.pfm"
     target.parent.mkdir(parents=True, exist_ok=True)
     (scene / "disp0GT.pfm").rename(target)
-    (case,) = cases("eth3d", tmp_path)
-    assert_pair(case, (30, 9), 5.0, FOCAL * 0.193001 / 5.0)
+    (case,) = read_cases("eth3d", tmp_path)
+    assert_pair(case, 5.0, FOCAL * 0.193001 / 5.0)
     assert "this looks like eth3d" in error_of("middlebury", tmp_path)
 
 
@@ -427,16 +397,13 @@ def test_booster(tmp_path: Path) -> None:
     scene = booster(tmp_path / "train/balanced/Bathroom")
     booster(tmp_path / "train/unbalanced/Bathroom")
     (scene / "camera_00/im0.png").write_bytes(b"no picture")  # is named in its turn, and spoils no other
-    first, second = cases("booster", tmp_path)
+    first, second = read_cases("booster", tmp_path)
     assert [first.name, second.name] == ["Bathroom/im0", "Bathroom/im1"]
     assert second.seconds[0].photo == scene / "camera_02/im1.png"
-    assert_pair(second, (30, 9), 7.0, FOCAL * 0.08 / (7.0 + 3.0))
-    assert second.camera is not None
-    assert second.camera.K[:2, 2].tolist() == [22.5, 18.5]
-    assert second.depth is not None
-    assert not second.depth().valid[:2].any()
+    valid, K = assert_pair(second, 7.0, FOCAL * 0.08 / (7.0 + 3.0))
+    assert (K[:2, 2].tolist(), bool(valid[:2].any())) == ([22.5, 18.5], False)
     (scene / "camera_00/im1.png").write_bytes(b"")
-    for case, why in zip((first, *cases("booster", tmp_path)), ("im0", "im0", "im1"), strict=True):
+    for case, why in zip((first, *read_cases("booster", tmp_path)), ("im0", "im0", "im1"), strict=True):
         with pytest.raises(InputError, match=rf"{why}\.png"):
             load_case(case)
 
@@ -459,7 +426,7 @@ def test_booster(tmp_path: Path) -> None:
 )
 def test_points_land_on_their_pixels(name: str, make: Callable[[Path], Path], scale: float, tmp_path: Path) -> None:
     make(tmp_path)
-    found = cases(name, tmp_path)
+    found = read_cases(name, tmp_path)
     names = [case.name for case in found]
     assert names == sorted(names)
     assert sum(len(case.seconds) for case in found) > 5
@@ -476,7 +443,7 @@ def test_second_views_are_the_nearest_that_are_neither_the_same_nor_far(tmp_path
     beside = [0.0, 0.01, 0.3, 0.35, 0.4, 0.5, 3.0]  # at a middle depth of 4: 0.2 to 1 is near
     eyes = [Eye((x, 0, 0)) for x in beside] + [Eye((0.25, 0, 0), 1.0)]
     llff(tmp_path / "fern", eyes)
-    first = cases("llff", tmp_path)[0]
+    first = read_cases("llff", tmp_path)[0]
     assert [view.name for view in first.seconds] == ["fern/image002", "fern/image003", "fern/image004"]
     assert first.bounds == (3.0, 6.0)
 
@@ -486,7 +453,7 @@ def test_a_broken_photo_costs_its_own_case_and_no_others(tmp_path: Path) -> None
     llff(tmp_path / "fern", eyes)
     broken = tmp_path / "fern/images_4/image001.png"
     broken.write_bytes(broken.read_bytes()[:60])
-    first, own, third, *others = cases("llff", tmp_path)
+    first, own, third, *others = read_cases("llff", tmp_path)
     for case, left in ((first, "fern/image002"), (third, "fern/image000")):
         loaded = load_case(case)
         assert [view.name for view in loaded.seconds] == [left]
@@ -507,17 +474,13 @@ def test_frames_are_spread_evenly_and_by_names_alone() -> None:
     taken = spread(list(sizes), lambda name: range(sizes[name]), 60)
     assert {name: len(frames) for name, frames in taken.items()} == {"Barn": 10, "Truck": 25, "Church": 25}
     for name, frames in taken.items():
-        steps = np.diff(frames)
-        assert steps.min() >= sizes[name] // len(frames)
-        assert steps.max() <= sizes[name] // len(frames) + 1
+        steps, even = np.diff(frames), sizes[name] // len(frames)
+        assert even <= steps.min() <= steps.max() <= even + 1
     assert taken == spread(list(sizes)[::-1], lambda name: range(sizes[name]), 60)
     assert sum(map(len, spread(list(sizes), lambda name: range(sizes[name]), 5000).values())) == 1110
-
-
-def test_with_more_scenes_than_frames_each_group_gets_its_share() -> None:
     scenes = [f"{group}/scene_{k:03d}" for group, n in (("apple", 200), ("box", 30), ("car", 5)) for k in range(n)]
-    taken = spread(scenes, lambda scene: range(300), 45)
-    groups = [scene.partition("/")[0] for scene, picked in taken.items() for _ in picked]
+    more = spread(scenes, lambda scene: range(300), 45)  # with more scenes than frames each group gets its share
+    groups = [scene.partition("/")[0] for scene, picked in more.items() for _ in picked]
     assert {group: groups.count(group) for group in groups} == {"apple": 20, "box": 20, "car": 5}
 
 
@@ -533,7 +496,7 @@ def test_working_sizes_give_the_papers_dense_counts() -> None:
 
 def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> None:
     llff(tmp_path / "fern")
-    case = cases("llff", tmp_path)[0]
+    case = read_cases("llff", tmp_path)[0]
     big = dataclasses.replace(case, photo=photo(tmp_path / "big.png", 96, 72))
     seconds = [dataclasses.replace(case.seconds[0], photo=photo(tmp_path / "odd.png", 36, 27))]
     loaded = load_case(dataclasses.replace(big, seconds=tuple(seconds)), max_side=64)
@@ -550,7 +513,7 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
 
 def test_files_that_are_no_photos_of_the_case(tmp_path: Path) -> None:
     middlebury_2014(tmp_path / "Piano")
-    (case,) = cases("middlebury", tmp_path)
+    (case,) = read_cases("middlebury", tmp_path)
     photo(tmp_path / "Piano/im1.png", HEIGHT, WIDTH)
     with pytest.raises(InputError, match=r"im1\.png: 36×48 pixels upright, but its calibration is for 48×36"):
         load_case(case)
@@ -574,8 +537,9 @@ def spoilt(depth: torch.Tensor, share: float) -> torch.Tensor:
     return torch.where(noise < share, 5 * depth, depth)
 
 
-def case_with(**known: Any) -> Case:
-    return Case("case", Path("photo.png"), Camera.from_focal(100.0, 160, 120), **known)
+def aligned(z_base: torch.Tensor, seen: torch.Tensor | None = None, **known: Any) -> Alignment:
+    case = Case("case", Path("photo.png"), Camera.from_focal(100.0, 160, 120), **known)
+    return align(case, z_base, torch.ones_like(z_base, dtype=torch.bool) if seen is None else seen)
 
 
 def test_a_known_factor_comes_back_under_outliers() -> None:
@@ -584,35 +548,26 @@ def test_a_known_factor_comes_back_under_outliers() -> None:
     z_base = spoilt(ramp() / 3.7, 0.3)
     seen = torch.ones_like(z_base, dtype=torch.bool)
     z_base[:, :5], seen[:, 5:10] = torch.nan, False
-    found = align(case_with(depth=lambda: depth), z_base, seen)
-    assert found.scale == pytest.approx(3.7, rel=0.01)
-    assert found.source == "depth"
+    found = aligned(z_base, seen, depth=lambda: depth)
+    assert (found.scale, found.source) == (pytest.approx(3.7, rel=0.01), "depth")
     assert 0.6 * 60 * 70 < found.pixels < 0.8 * 60 * 70
     assert 0 < found.spread < 0.05
-    assert align(case_with(depth=lambda: depth), z_base, seen, base_is_truth=True) == Alignment(1.0, 0, 0.0, "same")
-
-
-def test_points_give_the_scale_too() -> None:
     y, x = torch.meshgrid(torch.arange(2, 120, 10) + 0.3, torch.arange(3, 160, 10) + 0.9, indexing="ij")
     inside = torch.stack([x, y], -1).reshape(-1, 2)
     uv = torch.cat([inside, torch.tensor([[500.0, 5.0], [-1.0, 5.0]])])
     points = Points(uv, 0.25 * (2 + 3 * uv[:, 1] / 120))
-    found = align(case_with(points=lambda: points), spoilt(ramp(), 0.2), torch.ones(60, 80, dtype=torch.bool))
-    assert found.scale == pytest.approx(0.25, rel=0.02)
-    assert (found.source, found.pixels) == ("points", len(inside))
+    found = aligned(spoilt(ramp(), 0.2), points=lambda: points)
+    assert (found.scale, found.source, found.pixels) == (pytest.approx(0.25, rel=0.02), "points", len(inside))
 
 
 def test_bounds_are_the_last_resort_and_nothing_is_an_error() -> None:
-    seen = torch.ones(60, 80, dtype=torch.bool)
-    found = align(case_with(bounds=(4.0, 10.0)), ramp(), seen)
-    assert found.scale == pytest.approx(2.0, rel=1e-3)
-    assert (found.source, found.pixels) == ("bounds", 0)
+    found = aligned(ramp(), bounds=(4.0, 10.0))
+    assert (found.scale, found.source, found.pixels) == (pytest.approx(2.0, rel=1e-3), "bounds", 0)
     assert found.spread < 1e-3
     with pytest.raises(InputError, match="case: no depth of it is known"):
-        align(case_with(), ramp(), seen)
-    few = case_with(points=lambda: Points(torch.ones(3, 2), torch.ones(3)))
+        aligned(ramp())
     with pytest.raises(InputError, match="its points and the base's depth share under 8 pixels"):
-        align(few, ramp(), seen)
+        aligned(ramp(), points=lambda: Points(torch.ones(3, 2), torch.ones(3)))
 
 
 @pytest.mark.parametrize(

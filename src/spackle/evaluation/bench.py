@@ -21,9 +21,9 @@ from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, Viewpoint, load_case
-from spackle.evaluation.folder import ROWS, measure_images, open_folder, write_rows
+from spackle.evaluation.folder import ROWS, measure_images, write_rows
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row, Run
+from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.tables import make_tables, write_tables
 from spackle.folders import results_folder
@@ -71,22 +71,19 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
     about = {"parameters": count_parameters()}
-    warm = False  # whether this process has predicted something
+    timed: list[str] = []  # an image of this process, after which it is warm
 
     def time_next(index: int, case: Case) -> tuple[list[Row], list[Path]]:
-        nonlocal warm
-        rows = time_case(case, evaluation, config, warm)
-        warm = True
+        rows = time_case(case, evaluation, config, bool(timed))
+        timed.append(case.name)
         return rows, []
 
     with results_folder(output, (ROWS, *FILES), alone=True):
-        open_folder(output, config, about)
-        rows = measure_images(evaluation.cases, time_next, output, config["title"], options.root, reporter)
-        if rows is None:
+        run = measure_images(evaluation.cases, time_next, output, config, about, options.root, reporter)
+        if run is None:
             return "stopped"
-        run = Run(config, rows, about)
         write_tables(make_tables([run]), output, FILES)
-        write_rows(rows, output / ROWS)
+        write_rows(run.rows, output / ROWS)
     overheads = {s: statistics.median(run.numbers("overhead", s)) for s in run.settings}
     listed = ", ".join(f"{setting}: {100 * overhead:.2f} %" for setting, overhead in overheads.items())
     count, total = len(run.measured), len(run.images)
@@ -113,9 +110,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
         config["base_runs"], {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}, device, warm=counts
     )
     seconds, found = (times["", TOTAL] / MS).tolist(), latest["base"]
-    context = FillContext(
-        found.gaussians, found.camera, evaluation.renderer, evaluation.network, precision=options.base.precision
-    )
+    context = evaluation.context(found)
     facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load}
     facts |= {"warm": int(warm or not counts), "base_gaussians": len(found.gaussians)}
     facts |= {f"{NOTE}{name}": value for name, value in found.notes.items()}

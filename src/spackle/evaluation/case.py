@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from operator import attrgetter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,8 +62,7 @@ class EvalDataset:
     expected: str  # which files are looked for, for messages
     is_scene: Callable[[Path], bool]
     cases: Callable[[Mapping[str, Path]], list[Case]]  # of all scenes by name; InputError for a missing or damaged file
-    skip: frozenset[str] = frozenset()  # folders that are skipped: no truth, or the same photos again
-    scene_name: Callable[[Path], str] = attrgetter("name")
+    skip: Sequence[str] = ()  # folders that are skipped: no truth, or the same photos again
 
 
 def has_any(folder: Path, *names: str) -> bool:

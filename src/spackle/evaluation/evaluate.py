@@ -11,24 +11,23 @@ from torch import Tensor
 
 from spackle.bases.protocol import BasePrediction
 from spackle.errors import InputError
-from spackle.evaluation.alignment import Alignment, align, to_base
 from spackle.evaluation.case import Case, LoadedCase, load_case
-from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, open_folder, write_rows
-from spackle.evaluation.methods import Comparison
+from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows
+from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
 from spackle.evaluation.plots import check_matplotlib
-from spackle.evaluation.protocols import large_views, measure_views
-from spackle.evaluation.report import REPORT, make_report, save_picture
-from spackle.evaluation.rows import NOTE, REMARK, Row, Run
+from spackle.evaluation.protocols import Alignment, align, large_views, measure_views, to_base
+from spackle.evaluation.report import BEST, REPORT, WORST, make_report, save_picture, strip, write_sheets
+from spackle.evaluation.rows import NOTE, REMARK, Row
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
-from spackle.evaluation.sheets import BEST, WORST, strip, write_sheets
 from spackle.evaluation.table import NOT_RUN
 from spackle.evaluation.tables import FILES, make_tables, write_tables
 from spackle.files import write_whole
 from spackle.folders import results_folder
 from spackle.formats import save_png
+from spackle.gaussians import Gaussians
 from spackle.machine import hardware, versions
-from spackle.progress import Reporter
+from spackle.progress import Reporter, counted
 from spackle.residual import hole_mask
 
 
@@ -43,16 +42,14 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         check_matplotlib("--html")
     evaluation = open_evaluation(options)
     _log_missing(evaluation, reporter)
-    defined = definitions(options.wanted_metrics)
+    defined = definitions(options.wanted)
     about = {"versions": versions(), "machine": hardware(options.device), "definitions": defined}
     with results_folder(output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True):
-        open_folder(output, evaluation.config, about)
 
         def measure(index: int, case: Case) -> tuple[list[Row], list[Path]]:
             rows, pictures = measure_case(case, evaluation)
-            for row in rows:
-                if row.metric == REMARK:
-                    reporter.log(f"{case.name}: {row.value}")
+            for remark in (row.value for row in rows if row.metric == REMARK):
+                reporter.log(f"{case.name}: {remark}")
             files = [image_file(output, index, case.name, f".{name}.webp") for name in pictures]
             for file, picture in zip(files, pictures.values(), strict=True):
                 save_picture(picture, file)
@@ -60,20 +57,18 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
             save_png(strip(pictures), joined)
             return rows, [*files, joined]
 
-        title = str(evaluation.config["title"])
-        rows = measure_images(evaluation.cases, measure, output, title, options.root, reporter)
-        if rows is None:
+        run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
+        if run is None:
             return "stopped"
-        run = Run(evaluation.config, rows, about)
         write_tables(make_tables([run]), output)
         write_sheets(run, output)
         if html:
             write_whole(output / REPORT, make_report([(run, output)]).encode())
-        write_rows(rows, output / ROWS)
-    count, passed = len(run.measured), len(run.problems)
-    more = f", {passed} passed over" if passed else ""
-    reporter.log(f"{title}: {count} image{'s' if count > 1 else ''}{more} -> {output}")
-    reporter.result({"folder": output, "images": count + passed, "measured": count})
+        write_rows(run.rows, output / ROWS)
+    count, problems = len(run.measured), len(run.problems)
+    more = f", {problems} passed over" if problems else ""
+    reporter.log(f"{run.title}: {counted(count, 'image')}{more} -> {output}")
+    reporter.result({"folder": output, "images": count + problems, "measured": count})
     return "complete"
 
 
@@ -106,19 +101,18 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     else:
         views = large_views(prediction, options.disparities)
 
-    def direct_ft() -> tuple[BasePrediction, float]:
+    def direct_ft() -> tuple[Gaussians, float]:
         """The other base, and what its cameras' paths are to be multiplied by."""
         assert evaluation.direct is not None
         other = evaluation.direct.predict(loaded.full)[0]
         if alignment is None:
-            return other, 1.0
-        return other, alignment.scale / _align(loaded, other, evaluation, False).scale
+            return other.gaussians, 1.0
+        return other.gaussians, alignment.scale / _align(loaded, other, evaluation, False).scale
 
-    parts = (evaluation.renderer, evaluation.network, options.base.precision, evaluation.inpainter, direct_ft)
-    compared = Comparison(prediction, *parts)
-    methods = {name: compared.method(name) for name in options.methods}
+    context = evaluation.context(prediction)
+    methods = {name: make_method(name, context, evaluation.inpainter, direct_ft) for name in options.methods}
     image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
-    rows, pictures = measure_views(image, prediction, views, methods, evaluation.gauges, evaluation.renderer)
+    rows, pictures = measure_views(image, context, views, methods, evaluation.gauges)
     facts = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,
@@ -127,9 +121,11 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
         **{f"{NOTE}{name}": value for name, value in prediction.notes.items()},
         **{f"alignment_{name}": value for name, value in (dataclasses.asdict(alignment) if alignment else {}).items()},
     }
-    lacks = [f"without one of its second photos: {from_root(lack, options.root)}" for lack in loaded.lacks]
-    known = [*facts.items(), *((REMARK, lack) for lack in lacks)]
-    return [*(image._replace(metric=metric, value=value) for metric, value in known), *rows], pictures
+    known = [image._replace(metric=metric, value=value) for metric, value in facts.items()]
+    for lack in loaded.lacks:
+        remark = f"without one of its second photos: {from_root(lack, options.root)}"
+        known.append(image._replace(metric=REMARK, value=remark))
+    return [*known, *rows], pictures
 
 
 @torch.no_grad()

@@ -33,21 +33,15 @@ def write_rows(rows: Iterable[Row], path: Path) -> None:
     write_whole(path, "".join(lines).encode())
 
 
-def read_rows(path: Path) -> list[Row]:
-    """InputError for a file that holds anything else."""
-    with reading(path, DAMAGED):
-        rows = [Row(**json.loads(line)) for line in path.read_text("utf-8").splitlines()]
-        if not all(isinstance(word, str) for row in rows for word in row[:-1]):
-            raise ValueError("a name that is no text")
-    return rows
-
-
 def load_run(folder: Path) -> Run:
-    """The finished results in a folder; InputError where there are none."""
+    """The finished results in a folder; InputError where there are none, or a file of it is damaged."""
     if not (folder / ROWS).is_file():
         state = "not finished: run its command again" if (folder / CONFIG).is_file() else "no results"
         raise InputError(f"{folder}: {state}: {ROWS} is missing")
-    rows = read_rows(folder / ROWS)
+    with reading(folder / ROWS, DAMAGED):
+        rows = [Row(**json.loads(line)) for line in (folder / ROWS).read_text("utf-8").splitlines()]
+        if not all(isinstance(word, str) for row in rows for word in row[:-1]):
+            raise ValueError("a name that is no text")
     with reading(folder / CONFIG, DAMAGED):
         config = json.loads((folder / CONFIG).read_text("utf-8"))
         del config["format"]
@@ -82,48 +76,54 @@ def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
 
 
 def measure_images(
-    cases: Sequence[Case], measure: Measure, output: Path, dataset: str, root: Path, reporter: Reporter
-) -> list[Row] | None:
-    """Measure the images that no earlier run has finished: the rows of all; None where Ctrl-C came.
+    cases: Sequence[Case],
+    measure: Measure,
+    output: Path,
+    config: Mapping[str, Any],
+    about: Mapping[str, Any],
+    root: Path,
+    reporter: Reporter,
+) -> Run | None:
+    """Measure the images that no earlier run in the folder has finished: all results; None where Ctrl-C came.
 
     An image that cannot be used gives one row, its problem, and is tried again by the next run.
 
     Raises:
         BaseError: no image can be worked on.
-        InputError: not one image gave figures.
+        InputError: not one image gave figures, or another configuration's results are in the folder.
     """
-    found: list[Row] = []
-    begun, measured = False, 0
+    open_folder(output, config, about)
+    rows: list[Row] = []
+    run, begun = Run(config, rows, about), False
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
                 reporter.log("stopped; the same command goes on from here")
                 return None
-            part, inputs = image_file(output, index, case.name, ".json"), inputs_digest(case)
-            rows = _load_part(part, inputs)
-            if rows is None:
+            part, inputs = image_file(output, index, case.name, ".json"), _inputs_digest(case)
+            found = _load_part(part, inputs)
+            if found is None:
                 if index and not begun:
                     reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun, start = True, time.perf_counter()
                 try:
-                    rows, files = measure(index, case)
+                    found, files = measure(index, case)
                 except BaseError:  # no other image would fare better; too little memory is one, too
                     raise
                 except InputError as error:
                     problem = problem_of(case, error, root)
                     reporter.log(f"passed over: {problem}")
-                    rows = [Row(dataset, case.name, "", "", "", PROBLEM, problem)]
+                    found = [Row(run.title, case.name, "", "", "", PROBLEM, problem)]
                 else:
                     seconds = round(time.perf_counter() - start, 3)
                     content = {"inputs": inputs, "seconds": seconds, "files": file_records(part.parent, files)}
-                    write_whole(part, (json.dumps({**content, "rows": rows}, allow_nan=False) + "\n").encode())
+                    write_whole(part, (json.dumps({**content, "rows": found}, allow_nan=False) + "\n").encode())
                     reporter.detail(f"  {case.name}: {seconds:.1f} s")
-            measured += rows[0].metric != PROBLEM
-            found += rows
+            rows += found
             step(index + 1, len(cases))
-    if not measured:
+    if not run.measured:
         raise InputError(f"{root}: none of {len(cases)} images gave figures (the lines above say why)")
-    return found
+    return run
 
 
 def _load_part(path: Path, inputs: str) -> list[Row] | None:
@@ -136,7 +136,7 @@ def _load_part(path: Path, inputs: str) -> list[Row] | None:
         return None
 
 
-def inputs_digest(case: Case) -> str:
+def _inputs_digest(case: Case) -> str:
     """What the photos of a case hold, in one digest; a missing one has its turn later."""
     parts = []
     for path in (case.photo, *(second.photo for second in case.seconds)):

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
-from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
-from spackle.render import Renderer
 from spackle.render.protocol import Rendering
-from spackle.residual import ResidualNet, hole_mask
+from spackle.residual import hole_mask
 from spackle.residual.base_values import make_seeds
 from spackle.residual.complete import compose
 from spackle.residual.network import find_rim, predict_deltas
 from spackle.residual.view_features import ViewFeatures
-from spackle.scene_fill import FillContext, exemplar_texture, fill_scene, fill_view
+from spackle.scene_fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.occlusion_guard import push_behind
 
 
@@ -48,44 +45,35 @@ METHODS = {  # title in tables, description in captions
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """A photo's base, and what its methods need."""
+def make_method(
+    name: str,
+    context: FillContext,
+    inpainter: Inpainter | None = None,
+    direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
+) -> Method:
+    """A method of `METHODS` on a photo's base.
 
-    prediction: BasePrediction
-    renderer: Renderer
-    network: ResidualNet | None = None  # of the residual, run at `precision`; None: the seeds alone
-    precision: Precision = "auto"
-    inpainter: Inpainter | None = None  # of inpaint2d
-    # Of direct-ft: the photo by the other base, and that one's unit of length in this one's.
-    direct_ft: Callable[[], tuple[BasePrediction, float]] | None = None
-
-    def method(self, name: str) -> Method:
-        """A method of `METHODS`; direct-ft predicts the photo now."""
-        context, camera = self._context, self.prediction.camera
-        without_texture = dataclasses.replace(context, texture=None)
-        if name == "direct-ft":
-            assert self.direct_ft is not None
-            prediction, unit = self.direct_ft()
-            return functools.partial(_direct_ft, prediction.gaussians, unit, self.renderer)
-        if name == "inpaint2d":
-            assert self.inpainter is not None
-            return functools.partial(_inpaint_2d, self.inpainter)
-        methods: dict[str, Method] = {
-            "base": lambda cameras, before: (MethodView(view.rgb, view.alpha, 0) for view in before),
-            "spackle": functools.partial(_per_view, context),
-            "spackle-scene": functools.partial(_one_scene, context),
-            "network": functools.partial(_per_view, without_texture),
-            "seeds": functools.partial(_per_view, dataclasses.replace(without_texture, network=None)),
-            "dense": functools.partial(_dense, context, camera),
-        }
-        return methods[name]
-
-    @functools.cached_property
-    def _context(self) -> FillContext:
-        base, camera = self.prediction.gaussians, self.prediction.camera
-        renderer, network = self.renderer, self.network
-        return FillContext(base, camera, renderer, network, exemplar_texture, precision=self.precision)
+    Args:
+        name: see `METHODS`.
+        context: the base, and what fills its views' holes.
+        inpainter: of inpaint2d.
+        direct_ft: of direct-ft, asked now: the photo by the other base, and that one's unit of length in this one's.
+    """
+    if name == "direct-ft":
+        assert direct_ft is not None
+        return partial(_direct_ft, context, *direct_ft())
+    if name == "inpaint2d":
+        assert inpainter is not None
+        return partial(_inpaint_2d, inpainter)
+    methods: dict[str, Method] = {
+        "base": lambda cameras, before: (MethodView(view.rgb, view.alpha, 0) for view in before),
+        "spackle": partial(_per_view, context),
+        "spackle-scene": partial(_one_scene, context),
+        "network": partial(_per_view, dataclasses.replace(context, texture=None)),
+        "seeds": partial(_per_view, context.seeds_alone),
+        "dense": partial(_dense, context),
+    }
+    return methods[name]
 
 
 def _per_view(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
@@ -104,11 +92,9 @@ def _one_scene(context: FillContext, cameras: Sequence[Camera], before: Sequence
 
 
 @torch.no_grad()
-def _dense(
-    context: FillContext, photo_camera: Camera, cameras: Sequence[Camera], before: Sequence[Rendering]
-) -> Iterator[MethodView]:
+def _dense(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
     """An aux Gaussian for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
-    guard, network = context.photo_guard(), context.network
+    guard, network, photo_camera = context.photo_guard(), context.network, context.photo_camera
     for camera, rendering in zip(cameras, before, strict=True):
         features = ViewFeatures.of(rendering)
         seeds = make_seeds(features, camera, photo_camera)
@@ -135,11 +121,11 @@ def _inpaint_2d(inpainter: Inpainter, cameras: Sequence[Camera], before: Sequenc
 
 
 def _direct_ft(
-    base: Gaussians, unit: float, renderer: Renderer, cameras: Sequence[Camera], before: Sequence[Rendering]
+    context: FillContext, base: Gaussians, unit: float, cameras: Sequence[Camera], before: Sequence[Rendering]
 ) -> Iterator[MethodView]:
     """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
     for camera in cameras:
         pose = camera.world_to_camera.clone()
         pose[:3, 3] *= unit
-        drawn = renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
+        drawn = context.renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
         yield MethodView(drawn.rgb, drawn.alpha, None)

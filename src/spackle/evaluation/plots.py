@@ -8,13 +8,12 @@ import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spackle.errors import InputError
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.rows import Row, Run, mean, paper_rows, pivot
-from spackle.evaluation.sheets import ranked
 from spackle.evaluation.tables import method_name
 
 if TYPE_CHECKING:
@@ -45,6 +44,7 @@ WIDTH, HEIGHT = 4.6, 3.4  # inches of a plot, about a phone's width
 ROW = 0.21  # inches of a scene's row
 DOTS, SCENES = 1000, 30  # at most in a plot: pages stay small, rows legible
 LETTERS = 14  # of a scene's name
+UP = ("psnr_hole", "clipiqa", "musiq")  # higher is better
 # Characters that neither HTML nor XML may hold; names of files may.
 UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
 SCENE_FIGURES = {  # titles of the plot and of its axis
@@ -60,26 +60,24 @@ class Series(NamedTuple):
     method: str  # of `STYLES`
     points: Sequence[tuple[float, float]]
     hollow: bool = False
-    line: str = ""  # "", "-" or "--"
+    line: str = "none"  # or "-", "--"
 
 
 class Plot(NamedTuple):
     """A drawing below its title."""
 
     title: str
-    series: Sequence[Series]
+    alt: str  # for those who do not see it
     svg: bytes
-    note: str = ""
-
-    @property
-    def alt(self) -> str:
-        """For those who do not see it."""
-        return f"{self.title}. {', '.join(one.title for one in self.series)}"
+    note: str
 
     @property
     def address(self) -> str:
         """The drawing as a data address."""
         return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode()}"
+
+
+Finish = Callable[["Axes"], object]  # sets scales and ticks
 
 
 def check_matplotlib(option: str) -> None:
@@ -88,11 +86,17 @@ def check_matplotlib(option: str) -> None:
         raise InputError(f"{option}: needs matplotlib: pip install 'spackle-nvs[eval]'")
 
 
-def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None], height: float = HEIGHT) -> bytes:
-    """Series on axes with the titles `x` and `y`, as an SVG file `height` inches high; `finish` sets scales and ticks.
+def plots_of(run: Run) -> list[Plot]:
+    """The plots of an evaluation that its figures allow."""
+    scenes = [scenes_plot(run, metric) for metric in SCENE_FIGURES] if run.near else []
+    made = [*([] if run.near else [holes_plot(run)]), overhead_plot(run), *scenes]
+    return [plot for plot in made if plot]
 
-    The same values give the same bytes.
-    """
+
+def _draw(
+    title: str, series: Sequence[Series], x: str, y: str, finish: Finish, note: str = "", height: float = HEIGHT
+) -> Plot:
+    """Series on axes with the titles `x` and `y`, as an SVG file `height` inches high: the same bytes for the same."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -104,43 +108,30 @@ def draw(series: Sequence[Series], x: str, y: str, finish: Callable[[Axes], None
             colour, form = STYLES[one.method]
             places = ([p[0] for p in one.points], [p[1] for p in one.points])
             face = "white" if one.hollow else colour
-            axes.plot(*places, form, color=colour, ls=one.line or "none", mfc=face, alpha=0.8, label=one.title)
+            axes.plot(*places, form, color=colour, ls=one.line, mfc=face, alpha=0.8, label=one.title)
         axes.set(xlabel=x, ylabel=y)
         finish(axes)
         figure.legend(loc="outside lower left", frameon=False, ncols=1)
         file = io.BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue()
-
-
-def plots_of(run: Run) -> list[Plot]:
-    """The plots of an evaluation that its figures allow."""
-    scenes = [scenes_plot(run, metric) for metric in SCENE_FIGURES] if run.near else []
-    made = [*([] if run.near else [holes_plot(run)]), overhead_plot(run), *scenes]
-    return [plot for plot in made if plot]
+    return Plot(title, f"{title}. {', '.join(one.title for one in series)}", file.getvalue(), note)
 
 
 def holes_plot(run: Run) -> Plot | None:
-    """HAR against disparity, before and after, and the paper's."""
+    """HAR against disparity, before and after, and the paper's; None where nothing was measured."""
 
-    def means(rows: Sequence[Row], metric: str, method: str) -> list[tuple[float, float]]:
-        own = (row for row in rows if (row.method, row.metric) == (method, metric))
+    def means(rows: Iterable[Row], metric: str, method: str) -> list[tuple[float, float]]:
+        own = (row for row in rows if (row.method, row.metric, row.dataset) == (method, metric, run.title))
         found = {float(setting): mean(values).value for (setting,), values in pivot(own, "setting").items()}
         return [(move, value) for move, value in sorted(found.items()) if value is not None]
 
-    before = means(run.rows, "har_before", run.methods[0])
-    series = [Series(f"before: {run.base} alone", "base", before, line="--")]
+    papers, theirs = paper_rows("tab:controlled_disocclusion"), "Spackle on SHARP (paper)"
+    series = [Series(f"before: {run.base} alone", "base", means(run.rows, "har_before", run.methods[0]), line="--")]
     filling = [method for method in run.methods if method != "base"]
     series += [Series(f"after: {method_name(run, m)}", m, means(run.rows, "har", m), line="-") for m in filling]
-    papers = [row for row in paper_rows("tab:controlled_disocclusion") if row.dataset == run.title]
-    for title, method, metric, line in (
-        ("before: SHARP (paper)", "base", "har_before", "--"),
-        ("after: Spackle on SHARP (paper)", "spackle", "har", "-"),
-    ):
-        series.append(Series(title, method, means(papers, metric, "Spackle on SHARP (paper)"), True, line))
+    series.append(Series("before: SHARP (paper)", "base", means(papers, "har_before", theirs), True, "--"))
+    series.append(Series(f"after: {theirs}", "spackle", means(papers, "har", theirs), True, "-"))
     series = [one for one in series if one.points]
-    if not series:
-        return None
     values = [value for one in series for _, value in one.points]
     positive = [value for value in values if value > 0]
 
@@ -154,23 +145,22 @@ def holes_plot(run: Run) -> Plot | None:
         axes.set_xticks(sorted({move for one in series for move, _ in one.points}))
         axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
 
-    svg = draw(series, "disparity of the view", "HAR, share of the pixels", finish)
-    return Plot("Hole Area Ratio against disparity", series, svg)
+    title, y = "Hole Area Ratio against disparity", "HAR, share of the pixels"
+    return _draw(title, series, "disparity of the view", y, finish) if series else None
 
 
 def overhead_plot(run: Run) -> Plot | None:
-    """Added Gaussians against the size of the hole: a dot for each image and view."""
+    """Added Gaussians against the size of the hole: a dot for each image and view; None where none were counted."""
     series, count = [], 0
     found = pivot(run.rows, "method", "image", "setting", "view", "metric")
-    adding = dict.fromkeys(row.method for row in run.rows if row.metric == "aux" and row.method != "base")
+    adding = {row.method for row in run.rows if row.metric == "aux" and row.method != "base"}
     for method in (name for name in run.methods if name in adding):
         views = [key[:-1] for key in found if key[0] == method and key[-1] == "aux_share"]
         pairs = [(found[(*view, "har_before")][0], found[(*view, "aux_share")][0]) for view in views]
         dots = [(100 * float(one), 100 * float(two)) for one, two in pairs if one is not None and two is not None]
         count += len(dots)
-        kept = [dots[k] for k in evenly(len(dots), DOTS // len(adding))]
-        series.append(Series(method_name(run, method), method, kept))
-    series = [one for one in series if one.points]
+        if kept := [dots[k] for k in evenly(len(dots), DOTS // len(adding))]:
+            series.append(Series(method_name(run, method), method, kept))
     if not series:
         return None
     shown = sum(len(one.points) for one in series)
@@ -185,13 +175,12 @@ def overhead_plot(run: Run) -> Plot | None:
     if not run.near and holes:
         points = list(zip(holes, shares, strict=True))
         series.append(Series("Spackle on SHARP (paper), means", "spackle", points, True))
-
-    def finish(axes: Axes) -> None:
-        axes.set_xlim(left=0)
-        axes.set_ylim(bottom=0)
-
-    svg = draw(series, "hole before, % of the pixels", "added Gaussians, % of the base's", finish)
-    return Plot("Added Gaussians against hole size", series, svg, note)
+    title, x, y = (
+        "Added Gaussians against hole size",
+        "hole before, % of the pixels",
+        "added Gaussians, % of the base's",
+    )
+    return _draw(title, series, x, y, lambda axes: (axes.set_xlim(left=0), axes.set_ylim(bottom=0)), note)
 
 
 def scenes_plot(run: Run, metric: str) -> Plot | None:
@@ -211,10 +200,10 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
         axes.set_yticks(range(len(names)), [_short(name) for name in names])
         axes.set_ylim(len(names) - 0.5, -0.5)
 
-    title, axis = SCENE_FIGURES[metric]
-    svg = draw(series, axis, "", finish, HEIGHT / 2 + ROW * len(names))
+    title, x = SCENE_FIGURES[metric]
     some = f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
-    return Plot(title, series, svg, f"In the order of {METHODS[leader][0]}, best first.{some}")
+    note = f"In the order of {METHODS[leader][0]}, best first.{some}"
+    return _draw(title, series, x, "", finish, note, HEIGHT / 2 + ROW * len(names))
 
 
 def _short(name: str) -> str:
@@ -223,10 +212,14 @@ def _short(name: str) -> str:
     return name if len(name) <= LETTERS else f"{name[: half - 1]}…{name[-half:]}"
 
 
+def ranked(values: Mapping[str, float], metric: str) -> list[str]:
+    """Images from best to worst."""
+    sign = -1 if metric in UP else 1
+    return sorted(values, key=lambda name: (sign * values[name], name))
+
+
 def evenly(count: int, most: int) -> list[int]:
     """At most so many of so many, evenly, the first and the last among them."""
     if count <= most:
         return list(range(count))
-    if most == 1:
-        return [0]
-    return [math.floor(k * (count - 1) / (most - 1) + 0.5) for k in range(most)]
+    return [math.floor(k * (count - 1) / max(1, most - 1) + 0.5) for k in range(most)]

@@ -1,24 +1,32 @@
-"""From which views a photo is looked at, and what is measured there."""
+"""From which views a photo is looked at, the scale between its base and a dataset, and what is measured there."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from spackle.bases.depth_map import DepthMap
 from spackle.bases.protocol import BasePrediction
+from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError, reason_in_a_line
-from spackle.evaluation.case import Viewpoint
+from spackle.evaluation.case import Case, Points, Viewpoint
 from spackle.evaluation.methods import Method
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.rows import REMARK, Row
-from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
+from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
+
+MIN_PIXELS = 8  # fewer give no scale
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+BOUNDS_QUANTILES = (0.001, 0.999)  # what LLFF's near and far are, of the points in a view
+TRUTH = "truth"  # among the pictures of a view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,24 +82,128 @@ def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> lis
         raise InputError(f"no camera path: {error}: check depth and focal length") from error
 
 
+@dataclasses.dataclass(frozen=True)
+class Alignment:
+    """How long the base's unit is."""
+
+    scale: float  # the dataset's lengths in one unit of the base: z_dataset = scale · z_base
+    pixels: int  # with known depth, which it rests on; 0 where it comes from bounds, or nothing had to be measured
+    spread: float  # of single pixels around the scale, relative: a robust standard deviation
+    source: Literal["depth", "points", "bounds", "same"]
+
+
+def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = False) -> Alignment:
+    """The median of z_dataset / z_base over the pixels where both are known.
+
+    The dataset's depth map is asked first, then its points, then its bounds. A metric base and a metric dataset are
+    aligned too: what a network calls a metre rarely is one. Only a base that was made from the dataset's own depth
+    needs no scale.
+
+    Args:
+        case: whose lengths are wanted.
+        z_base: [H, W] the base's depth at the input camera, any size of the photo's shape.
+        seen: [H, W] bool, where that depth means something.
+        base_is_truth: the base lifted the dataset's own depth map.
+
+    Raises:
+        InputError: nothing is known about the case's depth, or too little of it where the base sees something.
+    """
+    if base_is_truth:
+        return Alignment(1.0, 0, 0.0, "same")
+    seen = seen & torch.isfinite(z_base) & (z_base > 0)
+    if case.depth is not None and (found := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
+        return found
+    if case.points is not None and (found := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")):
+        return found
+    if case.bounds is not None and seen.any():
+        return _of_bounds(case.bounds, z_base[seen])
+    sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
+    has = ", ".join(name for name, value in sources.items() if value is not None)
+    reason = f"its {has} and the base's depth share under {MIN_PIXELS} pixels" if has else "no depth of it is known"
+    raise InputError(f"{case.name}: {reason}: the base's scale cannot be found, leave its second views out")
+
+
+def to_base(view: Camera, photo: Camera, base: Camera, scale: float) -> Camera:
+    """A second view's camera, as the base's world has it.
+
+    A base with another principal point or focal length than the dataset's shears the scene: the same pixel at the same
+    depth is another point. The returned camera sees the base's points where `view` sees the dataset's: exactly where
+    the two look the same way, as in rectified pairs, or their lenses agree; else up to a skew of the pixel grid.
+
+    Args:
+        view: in the input photo's frame and the dataset's lengths.
+        photo: the dataset's camera of the input photo.
+        base: the base's camera of the input photo (`BasePrediction.camera`), on any grid of the photo's shape.
+        scale: see `Alignment`.
+
+    Returns:
+        The camera on the grid of `view`, in the base's frame and units.
+    """
+    K, pose = view.K.double(), view.world_to_camera.double()
+    # The base's point of a pixel, times this and the scale, is the dataset's.
+    shear = torch.linalg.solve(photo.K.double(), base.resized(photo.width, photo.height).K.double())
+    # Into an upper triangle with a positive diagonal times a rotation.
+    flip = torch.eye(3, dtype=torch.float64).flip(0)
+    rotation, lens = torch.linalg.qr((flip @ (K @ pose[:3, :3] @ shear)).T)
+    lens, rotation = flip @ lens.T @ flip, flip @ rotation.T
+    signs = torch.diag(lens.diagonal().sign())
+    lens, rotation = lens @ signs, signs @ rotation
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = torch.linalg.solve(lens, K @ pose[:3, 3]) / scale
+    lens = lens / lens[2, 2]
+    lens[0, 1] = 0.0  # the skew: a Camera has none
+    return Camera(lens.to(view.K), matrix.to(view.world_to_camera), view.width, view.height)
+
+
+def _depth_ratios(known: DepthMap, z_base: Tensor, seen: Tensor) -> Tensor:
+    """By the map's nearest pixel to each of the base's."""
+    (height, width), (rows, columns) = z_base.shape, known.depth.shape
+    y = ((torch.arange(height) + 0.5) * rows / height).long()
+    x = ((torch.arange(width) + 0.5) * columns / width).long()
+    z, valid = known.depth[y][:, x], known.valid[y][:, x] & seen
+    return z[valid] / z_base[valid]
+
+
+def _point_ratios(case: Case, points: Points, z_base: Tensor, seen: Tensor) -> Tensor:
+    """By the base's pixel that each point falls into."""
+    assert case.camera is not None  # whose pixels the points are in
+    height, width = z_base.shape
+    cells = (points.uv * torch.tensor([width / case.camera.width, height / case.camera.height])).floor().long()
+    inside = ((cells >= 0) & (cells < torch.tensor([width, height]))).all(1)
+    x, y = cells[inside].unbind(1)
+    known = seen[y, x]
+    return points.z[inside][known] / z_base[y, x][known]
+
+
+def _of_ratios(ratios: Tensor, source: Literal["depth", "points"]) -> Alignment | None:
+    ratios = ratios[torch.isfinite(ratios) & (ratios > 0)].double()
+    if len(ratios) < MIN_PIXELS:
+        return None
+    scale = ratios.median()
+    return Alignment(float(scale), len(ratios), MAD_TO_SIGMA * float((ratios / scale - 1).abs().median()), source)
+
+
+def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
+    """Rough: between what makes the nearest depths the same, and what makes the farthest the same."""
+    near, far = (float(z.double().sort().values[round(q * (len(z) - 1))]) for q in BOUNDS_QUANTILES)
+    low, high = math.log(bounds[0] / near), math.log(bounds[1] / far)
+    return Alignment(math.exp((low + high) / 2), 0, abs(high - low) / 2, "bounds")
+
+
 @torch.no_grad()
 def measure_views(
-    image: Row,
-    prediction: BasePrediction,
-    viewpoints: Sequence[Viewpoint],
-    methods: Mapping[str, Method],
-    gauges: Gauges,
-    renderer: Renderer,
+    image: Row, context: FillContext, viewpoints: Sequence[Viewpoint], methods: Mapping[str, Method], gauges: Gauges
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """Every method on every view; views of one setting are a method's to see together.
+    """Every method on every view of a base; views of one setting are a method's to see together.
 
     Returns:
         Rows, which take dataset and name from `image`; and the view with the largest hole by each method,
         [H, W, 3], the truth last where there is one.
     """
-    before = [renderer.render(prediction.gaussians, view.camera) for view in viewpoints]
+    before = [context.renderer.render(context.base, view.camera) for view in viewpoints]
     holes = [hole_area_ratio(view.alpha) for view in before]
-    shown, base = max(range(len(viewpoints)), key=holes.__getitem__), len(prediction.gaussians)
+    largest, base = max(range(len(viewpoints)), key=holes.__getitem__), len(context.base)
     rows: list[Row] = []
     remarks: dict[Row, None] = {}
     pictures: dict[str, Tensor] = {}
@@ -107,16 +219,13 @@ def measure_views(
                 if filled.aux is not None:
                     figures += [("aux", filled.aux), ("aux_share", filled.aux / base), ("merged", base + filled.aux)]
                 view, hole = viewpoints[index], hole_mask(before[index].alpha)
+                row = image._replace(setting=setting, view=view.name, method=name)
                 for metric, value in (*figures, *gauges.measure(filled.rgb, view.truth, hole)):
                     if isinstance(value, str):
                         remarks[image._replace(metric=metric, value=value)] = None
-                        continue
-                    finite = value if math.isfinite(value) else None
-                    rows.append(Row(image.dataset, image.image, setting, view.name, name, metric, finite))
-                if index == shown:
+                    else:
+                        rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
+                if index == largest:
                     pictures[name] = filled.rgb
-    truth = viewpoints[shown].truth
+    truth = viewpoints[largest].truth
     return [*rows, *remarks], pictures | ({} if truth is None else {TRUTH: truth})
-
-
-TRUTH = "truth"  # among the pictures of a view

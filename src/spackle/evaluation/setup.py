@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,12 @@ import torch
 import spackle
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
+from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import PRECISIONS, pick_dtype
 from spackle.errors import InputError, check_name
-from spackle.evaluation.case import Case, EvalDataset, LoadedCase, known_depth
+from spackle.evaluation.case import Case, LoadedCase, known_depth
 from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OWN, open_metrics
@@ -28,6 +28,7 @@ from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpaint
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
 from spackle.residual import ResidualNet
+from spackle.scene_fill import FillContext
 from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
@@ -59,7 +60,7 @@ class EvaluateOptions:
         return self.protocol == "near-view"
 
     @property
-    def wanted_metrics(self) -> tuple[str, ...]:
+    def wanted(self) -> tuple[str, ...]:
         """The metrics to measure, in the order of `METRICS`."""
         named = DEFAULT_METRICS[self.protocol] if self.metrics is None else self.metrics
         return tuple(name for name in METRICS if name in named)
@@ -106,7 +107,7 @@ class EvaluateOptions:
         if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
             raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
         for value in self.disparities:
-            if not (math.isfinite(value) and 0 < value <= MAX_DISPARITY):
+            if not 0 < value <= MAX_DISPARITY:  # NaN, too
                 raise InputError(f"--disparity {value:g}: must be above 0 and up to {MAX_DISPARITY:g}")
         if len(set(self.disparities)) < len(self.disparities):
             raise InputError("--disparity: the same number twice: leave one out")
@@ -144,6 +145,11 @@ class Evaluation:
         network = self.options.base.network
         return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
 
+    def context(self, prediction: BasePrediction) -> FillContext:
+        """A photo's base, and what fills the holes of its views."""
+        fill = self.renderer, self.network
+        return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
+
 
 def open_evaluation(options: EvaluateOptions) -> Evaluation:
     """Check the options and load what all images share; networks of a base are loaded with the first image.
@@ -151,30 +157,55 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     InputError for an option, a dataset, weights or a package that cannot be used.
     """
     options.check()
-    dataset = DATASETS[options.dataset]
+    base, dataset, fill, wanted = options.base, DATASETS[options.dataset], FillOptions(options.residual), options.wanted
     cases, limit = read_cases(dataset.name, options.root), options.limit
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
     _check_cases(cases, options)
-    network, direct, features, inpainter = FillOptions(options.residual).load(), None, None, None
+    network, direct, features, inpainter = fill.load(), None, None, None
     if "inpaint2d" in options.methods:
         inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
     if options.direct_ft is not None:
-        direct = open_base(dataclasses.replace(options.base, checkpoint=_there(options.direct_ft, "--direct-ft")))
-    wanted = options.wanted_metrics
+        direct = open_base(dataclasses.replace(base, checkpoint=options.direct_ft))
     if options.features is not None and "distance" in wanted:
-        features = load_features("squeezenet", _there(options.features, "--features"))
-    published, found = open_metrics(
-        [name for name in wanted if name in DEFINITIONS], options.device.type, options.download
-    )
-    states = dict.fromkeys(wanted, OWN) | found
+        features = load_features("squeezenet", options.features)
+    published = [name for name in wanted if name in DEFINITIONS]
+    metrics, states = open_metrics(published, options.device.type, options.download)
+    states = dict.fromkeys(wanted, OWN) | states
     if "distance" in wanted and features is None:
         states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
-    config = _configuration(options, dataset, cases) | {"metrics": states}  # metric → who measures it, or why nobody
+    precision = str(pick_dtype(base.precision, torch.device("cpu"))).removeprefix("torch.")
+    config: dict[str, Any] = {
+        "kind": "evaluate",
+        "spackle": spackle.__version__,
+        "dataset": dataset.name,
+        "title": dataset.title,
+        "terms": dataset.terms,
+        "images": {"count": len(cases), "limit": limit, "names": digest_of([case.name for case in cases])},
+        "protocol": options.protocol,
+        "disparities": None if options.near else list(options.disparities),
+        "base": {
+            "name": base.public_name,
+            "title": "SHARP" if base.named == "sharp" else base.public_name,
+            "says": base.description,
+            "weights": weights_digests(base.files),
+            "precision": base.precision,
+            "device": options.device.type,
+        },
+        "methods": list(options.methods),
+        "residual": {
+            "weights": "seeds" if fill.file is None else "shipped" if options.residual is None else "given",
+            "sha256": None if fill.file is None else weights_digest(fill.file),
+            "precision": None if fill.file is None else precision,
+        },
+        "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
+        "features": None if options.features is None else weights_digest(options.features),
+        "metrics": states,  # who measures each, or why nobody
+    }
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
         config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
-    renderer, gauges = get_renderer(options.base.device), Gauges(wanted, published, features)
+    renderer, gauges = get_renderer(base.device), Gauges(wanted, metrics, features)
     return Evaluation(options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config)
 
 
@@ -189,40 +220,3 @@ def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:
         raise InputError(f"{where}: has no second photos: take --protocol large-view")
     if not options.base.network and not any(case.depth or case.points for case in cases):
         raise InputError(f"{where}: has no depth of any kind, which --base rgbd takes: take {', '.join(NETWORKS)}")
-
-
-def _configuration(options: EvaluateOptions, dataset: EvalDataset, cases: Sequence[Case]) -> dict[str, Any]:
-    base, file = options.base, FillOptions(options.residual).file
-    residual = {
-        "weights": "seeds" if file is None else "shipped" if options.residual is None else "given",
-        "sha256": None if file is None else weights_digest(file),
-        "precision": None if file is None else str(pick_dtype(base.precision, torch.device("cpu")))[len("torch.") :],
-    }
-    return {
-        "kind": "evaluate",
-        "spackle": spackle.__version__,
-        "dataset": dataset.name,
-        "title": dataset.title,
-        "terms": dataset.terms,
-        "images": {"count": len(cases), "limit": options.limit, "names": digest_of([case.name for case in cases])},
-        "protocol": options.protocol,
-        "disparities": None if options.near else list(options.disparities),
-        "base": {
-            "name": base.public_name,
-            "title": "SHARP" if base.named == "sharp" else base.public_name,
-            "says": base.description,
-            "weights": weights_digests(base.files),
-            "precision": base.precision,
-            "device": options.device.type,
-        },
-        "methods": list(options.methods),
-        "residual": residual,
-        "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
-        "features": None if options.features is None else weights_digest(options.features),
-    }
-
-
-def _there(path: Path, option: str) -> Path:
-    if not path.is_file():
-        raise InputError(f"{option} {path}: no such file: check the name")
-    return path

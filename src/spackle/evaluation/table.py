@@ -1,4 +1,4 @@
-"""A table as values, and its three forms: Markdown, LaTeX and HTML."""
+"""A table as values, and its forms: Markdown and LaTeX here, HTML by report.html."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Callable, Sequence
-from html import escape
 from typing import Literal
 
 EMPTY = ""  # not run, or nothing that could be
@@ -63,12 +62,12 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
     return [f"{BEST}{text}{BEST}" if text == best else text for text in texts]
 
 
-def write_table(table: Table, form: Literal["md", "tex", "html"]) -> str:
-    """For a page of Markdown; for a LaTeX document with the packages booktabs and graphicx; or for a page of HTML."""
-    return {"md": _markdown, "tex": _latex, "html": _html}[form](table)
+def write_table(table: Table, form: Literal["md", "tex"]) -> str:
+    """For a page of Markdown, or for a LaTeX document with the packages booktabs and graphicx."""
+    return {"md": _markdown, "tex": _latex}[form](table)
 
 
-def _groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
+def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
     """The upper level: a name, and over how many columns it stands."""
     return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
@@ -105,8 +104,8 @@ def _latex(table: Table) -> str:
     caption = " ".join([table.caption, *table.notes])
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(caption)}}}"]
     lines += [rf"\label{{{table.label}}}", r"\resizebox{\textwidth}{!}{", rf"\begin{{tabular}}{{{shape}}}", r"\toprule"]
-    groups, column, over, rules = _groups(table.heads), 1, [], []
-    for name, count in groups:
+    column, over, rules = 1, [], []
+    for name, count in groups(table.heads):
         over.append(rf"\multicolumn{{{count}}}{{c}}{{{tex(name)}}}" if name else " & ".join([""] * count))
         rules += [rf"\cmidrule(lr){{{column}-{column + count - 1}}}"] if name else []
         column += count
@@ -115,31 +114,3 @@ def _latex(table: Table) -> str:
     for rows in table.bodies:
         lines += [r"\midrule", *(" & ".join(map(tex, cells)) + r" \\" for cells in rows)]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", "}", r"\end{table*}"]) + "\n"
-
-
-def _html(table: Table) -> str:
-    """Where there are groups, a group's name stands above its rows: on a phone it costs no width."""
-    grouped = table.words > 1
-    heads = table.heads[grouped:]
-    lines = ["<table>", "<thead>"]
-    if any(group for group, _ in heads):
-        lines.append("<tr>")
-        for name, count in _groups(heads):
-            kind = f'th colspan="{count}" scope="colgroup"' if name else f'td colspan="{count}"'
-            lines.append(f"<{kind}>{escape(name)}</{kind[:2]}>")
-        lines.append("</tr>")
-    columns = [f'<th scope="col">{escape(head)}</th>' if head else "<td></td>" for _, head in heads]
-    lines += [f"<tr>{''.join(columns)}</tr>", "</thead>"]
-    for rows in table.bodies:
-        idle = any(cells[grouped] == NOT_RUN for cells in rows)
-        lines.append('<tbody class="idle">' if idle else "<tbody>")
-        if grouped and rows:
-            name = f"<span>{escape(rows[0][0])}</span>"
-            lines.append(f'<tr class="group"><th colspan="{len(heads)}" scope="rowgroup">{name}</th></tr>')
-        for cells in (row[grouped:] for row in rows):
-            words = cells[: table.words]
-            kind = "paper" if any(word.endswith(PAPER) for word in words) else "none" if cells[0] == NOT_RUN else ""
-            others = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", "</td><td>".join(map(escape, cells[1:])))
-            lines.append(f'<tr class="{kind}"><th scope="row">{escape(cells[0])}</th><td>{others}</td></tr>')
-        lines.append("</tbody>")
-    return "\n".join([*lines, "</table>"])

@@ -4,18 +4,50 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 from spackle.errors import InputError
-from spackle.evaluation.case import Case, EvalDataset
-from spackle.evaluation.datasets.posed_photos import ETH3D, LLFF, TANKS, WILDRGBD
-from spackle.evaluation.datasets.stereo import BOOSTER, MIDDLEBURY
+from spackle.evaluation.case import Case, EvalDataset, has_any
+from spackle.evaluation.datasets import posed_photos, stereo
+from spackle.evaluation.rows import load_data
 
 __all__ = ["DATASETS", "read_cases"]
 
-# In the order of the paper's tables.
-DATASETS = {dataset.name: dataset for dataset in (MIDDLEBURY, BOOSTER, WILDRGBD, TANKS, ETH3D, LLFF)}
+FACTS = load_data("datasets.json")  # in the order of the paper's tables
+
+
+def _called(folder: Path, dataset: str) -> bool:
+    """Whether a folder has the name of a dataset's scene."""
+    return not set(FACTS[dataset]["scenes"]).isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
+
+
+def _is_tanks(folder: Path) -> bool:
+    other = has_any(folder, posed_photos.LLFF_BOUNDS) or _called(folder, "llff")
+    return has_any(folder, "sparse", "dense/sparse") and (_called(folder, "tanks") or not other)
+
+
+def _is_llff(folder: Path) -> bool:
+    return has_any(folder, posed_photos.LLFF_BOUNDS, "sparse") and not _called(folder, "tanks")
+
+
+def _is_wildrgbd(folder: Path) -> bool:
+    return has_any(folder, "rgb") and has_any(folder, "cam_poses.txt", "metadata", "masks")
+
+
+_READERS = {
+    "middlebury": (stereo.is_middlebury, stereo.middlebury_cases),
+    "booster": (lambda folder: has_any(folder, "camera_00"), stereo.booster_cases),
+    "wildrgbd": (_is_wildrgbd, posed_photos.wildrgbd_cases),
+    "tanks": (_is_tanks, posed_photos.tanks_cases),
+    "eth3d": (posed_photos.is_eth3d, posed_photos.eth3d_cases),
+    "llff": (_is_llff, posed_photos.llff_cases),
+}
+DATASETS = {
+    name: EvalDataset(name, facts["title"], facts["terms"], facts["expected"], *_READERS[name], facts.get("skip", ()))
+    for name, facts in FACTS.items()
+}
 MAX_DEPTH = 4  # of a scene below the root; the deepest official one is root/train/balanced/SCENE
 MAX_FOLDERS = 100_000  # opened in search of scenes; WildRGB-D has 23,000 of them
 GUESS_FOLDERS = 300  # opened to guess what a folder is instead
@@ -42,7 +74,8 @@ def read_cases(name: str, root: Path) -> list[Case]:
         raise InputError(f"{root}: no scene of {name} at or below it: expected {dataset.expected}{hint}")
     scenes: dict[str, Path] = {}
     for folder in found:
-        other = scenes.setdefault(dataset.scene_name(folder), folder)
+        scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
+        other = scenes.setdefault(scene, folder)
         if other is not folder:
             raise InputError(f"{folder}: {other} is called the same: give the folder of one size or part alone")
     return dataset.cases(scenes)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from torch import Tensor
 from spackle.bases.depth_map import load_depth, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reading
-from spackle.evaluation.case import Case, EvalDataset, has_any, photo_files
+from spackle.evaluation.case import Case, has_any, photo_files
 from spackle.evaluation.datasets.colmap import model_folder, read_model
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
 from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, is_two_view, pair_of_2014
@@ -31,16 +30,6 @@ LLFF_BOUNDS = "poses_bounds.npy"
 MAX_POSES_BYTES = 1 << 24
 POSE_TOLERANCE = 0.05  # of published poses' rotations, see `checked_camera`
 MIDDLE_DEPTH_M = 0.8  # objects are held before the phone; so second views are 4 to 20 cm beside
-LLFF_SCENES = {"fern", "flower", "fortress", "horns", "leaves", "orchids", "room", "trex"}
-TANKS_SCENES = {
-    *("barn", "caterpillar", "church", "courthouse", "ignatius", "meetingroom", "truck"),
-    *("family", "francis", "horse", "lighthouse", "m60", "panther", "playground", "train"),
-    *("auditorium", "ballroom", "courtroom", "museum", "palace", "temple"),
-}
-
-
-def _called(folder: Path, scenes: set[str]) -> bool:
-    return not scenes.isdisjoint(re.split(r"[_\-. ]", folder.name.lower()))
 
 
 def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Camera:
@@ -52,7 +41,7 @@ def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Cam
 # --- ETH3D
 
 
-def _eth3d(scenes: Mapping[str, Path]) -> list[Case]:
+def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """The undistorted DSLR photos of the training scenes, or the two-view scenes: a case for each photo, or each pair.
 
     Multi-view: `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and
@@ -90,23 +79,16 @@ def _pair_of(scene: Path) -> Case:
     return pair_of_2014(scene, next((place for place in places if place.is_file()), None))
 
 
-ETH3D = EvalDataset(
-    "eth3d",
-    title="ETH3D",
-    terms="CC BY-NC-SA 4.0",
-    expected="SCENE/dslr_calibration_undistorted/images.txt, or two views: SCENE_1l/im0.png",
-    is_scene=lambda folder: (
-        has_any(folder, ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted") or is_two_view(folder)
-    ),
-    cases=_eth3d,
-    skip=frozenset({"two_view_testing"}),
-)
+def is_eth3d(folder: Path) -> bool:
+    """Whether this is a scene of ETH3D, of photos or of two views."""
+    photos = (ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted")
+    return has_any(folder, *photos) or is_two_view(folder)
 
 
 # --- Tanks and Temples
 
 
-def _tanks(scenes: Mapping[str, Path]) -> list[Case]:
+def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """`SCENE/images` with `SCENE/sparse/0`: what COLMAP, 3D Gaussian splatting and most of the field call a scene.
 
     `SCENE/sparse` without the 0, and `SCENE/dense/{images,sparse}`, are read too. The lens has to be nearly a pinhole's
@@ -118,7 +100,7 @@ def _tanks(scenes: Mapping[str, Path]) -> list[Case]:
     2048×1080 give 1536×810, and the 980×545 that came with 3D Gaussian splatting stay as they are.
     """
     read = {name: _tanks_views(scene) for name, scene in scenes.items()}
-    picked = spread(list(scenes), lambda name: range(len(read[name])), IMAGES[TANKS.title])
+    picked = spread(list(scenes), lambda name: range(len(read[name])), IMAGES["Tanks"])
     return [case for name, views in read.items() for case in make_cases(views, picked.get(name, []))]
 
 
@@ -133,25 +115,10 @@ def _tanks_views(scene: Path) -> list[Posed]:
     return posed_by(scene, model, photos, [Path(view.name).with_suffix("").as_posix() for view in model.views])
 
 
-def _is_tanks(folder: Path) -> bool:
-    other = has_any(folder, LLFF_BOUNDS) or _called(folder, LLFF_SCENES)
-    return has_any(folder, "sparse", "dense/sparse") and (_called(folder, TANKS_SCENES) or not other)
-
-
-TANKS = EvalDataset(
-    "tanks",
-    title="Tanks",
-    terms="see its page; research, cite",
-    expected="SCENE/sparse/0 beside SCENE/images",
-    is_scene=_is_tanks,
-    cases=_tanks,
-)
-
-
 # --- LLFF
 
 
-def _llff(scenes: Mapping[str, Path]) -> list[Case]:
+def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Eight scenes with `poses_bounds.npy`, `sparse/0`, or both, and photos in `images_4`, `images` or `images_8`.
 
     Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
@@ -221,20 +188,10 @@ def _match(scene: Path, names: Sequence[str], photos: Sequence[Path]) -> list[Pa
     return list(photos)
 
 
-LLFF = EvalDataset(
-    "llff",
-    title="LLFF",
-    terms="research, cite",
-    expected="SCENE/poses_bounds.npy or SCENE/sparse/0 beside SCENE/images_4 or SCENE/images",
-    is_scene=lambda folder: has_any(folder, LLFF_BOUNDS, "sparse") and not _called(folder, TANKS_SCENES),
-    cases=_llff,
-)
-
-
 # --- WildRGB-D
 
 
-def _wildrgbd(scenes: Mapping[str, Path]) -> list[Case]:
+def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Phone videos around objects, with the depth of the phone's laser.
 
     `CATEGORY/scenes/SCENE/` has `rgb/00000.png`, `depth/00000.png` (mm), `metadata` and `cam_poses.txt`.
@@ -252,11 +209,11 @@ def _wildrgbd(scenes: Mapping[str, Path]) -> list[Case]:
         read[name] = _wildrgbd_views(name, scenes[name])
         return range(len(read[name]))
 
-    picked = spread(sorted(scenes), frames, IMAGES[WILDRGBD.title])
+    picked = spread(sorted(scenes), frames, IMAGES["WildRGBD"])
     return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
 
 
-def _scene_name(folder: Path) -> str:
+def category_and_scene(folder: Path) -> str:
     """CATEGORY/SCENE, wherever the root is."""
     folder = folder.absolute()
     above = folder.parent.parent if folder.parent.name == "scenes" else folder.parent
@@ -293,14 +250,3 @@ def _wildrgbd_views(name: str, scene: Path) -> list[Posed]:
             views.append(Posed(f"{name}/{photo.stem}", photo, camera, MIDDLE_DEPTH_M))
     check_two(scene, len(views))
     return views
-
-
-WILDRGBD = EvalDataset(
-    "wildrgbd",
-    title="WildRGBD",
-    terms="MIT",
-    expected="CATEGORY/scenes/SCENE/ with rgb/, depth/, metadata and cam_poses.txt",
-    is_scene=lambda folder: has_any(folder, "rgb") and has_any(folder, "cam_poses.txt", "metadata", "masks"),
-    cases=_wildrgbd,
-    scene_name=_scene_name,
-)

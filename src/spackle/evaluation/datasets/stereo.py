@@ -19,7 +19,7 @@ from torch import Tensor
 from spackle.bases.depth_map import Calibration, DepthMap, load_depth, read_array, read_calibration, read_text
 from spackle.camera import Camera
 from spackle.errors import InputError, reading
-from spackle.evaluation.case import Case, EvalDataset, SecondView, has_any, photo_files
+from spackle.evaluation.case import Case, SecondView, has_any, photo_files
 from spackle.files import check_file
 from spackle.image import read_image
 
@@ -126,7 +126,7 @@ def pair_of_2014(folder: Path, truth: Path | None = None) -> Case:
 # --- Middlebury
 
 
-def _is_middlebury(folder: Path) -> bool:
+def is_middlebury(folder: Path) -> bool:
     old = has_any(folder, "view1.png", "im2.ppm", "im2.png", "scene.json")
     old |= has_any(folder, "disp1.png") and has_any(folder, "dmin.txt")
     new = has_any(folder, "im0.png") and not folder.name.startswith("camera_")  # as Booster's photos of a camera lie
@@ -139,7 +139,7 @@ def is_two_view(folder: Path) -> bool:
     return has_any(folder, "im0.png") and (named or has_any(folder, "cameras.txt"))
 
 
-def _middlebury(scenes: Mapping[str, Path]) -> list[Case]:
+def middlebury_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """One case for each scene; the second view is the true right photo.
 
     Scene folders: `im0.png` with `calib.txt` (2014 at full size, and MiddEval3 at full, half or quarter size);
@@ -206,22 +206,10 @@ def _described(folder: Path) -> Case:
     return dataclasses.replace(_pair(folder.name, left, right, lens, _picture_size(left), depth), metric=False)
 
 
-MIDDLEBURY = EvalDataset(
-    "middlebury",
-    title="Middlebury",
-    terms="free to use, cite",
-    expected="SCENE/im0.png with calib.txt, SCENE/view1.png with disp1.png, SCENE/im2.ppm with disp2.pgm, or a "
-    "scene.json",
-    is_scene=_is_middlebury,
-    cases=_middlebury,
-    skip=frozenset({"test", "testF", "testH", "testQ"}),
-)
-
-
 # --- Booster
 
 
-def _booster(scenes: Mapping[str, Path]) -> list[Case]:
+def booster_cases(scenes: Mapping[str, Path]) -> list[Case]:
     """Stereo at 12 megapixels of scenes with glass and mirrors: each photo of a left camera (one a light) is a case.
 
     `train/balanced/SCENE/camera_00/im*.png` at 4112×3008, the right photo of the same name in `camera_02`, one
@@ -229,10 +217,10 @@ def _booster(scenes: Mapping[str, Path]) -> list[Case]:
     The test scenes have no truth, and the unbalanced ones another right camera: both are skipped.
     At the working size the photos are 1536×1124: the paper's 431,616 cells.
     """
-    return [case for scene in scenes.values() for case in _booster_cases(scene)]
+    return [case for scene in scenes.values() for case in _lights_of(scene)]
 
 
-def _booster_cases(scene: Path) -> list[Case]:
+def _lights_of(scene: Path) -> list[Case]:
     photos = photo_files(scene / "camera_00")
     if not photos:
         raise InputError(f"{scene / 'camera_00'}: no photos: expected im0.png and more; unpack the scene again")
@@ -263,17 +251,6 @@ def _read_opencv(path: Path) -> Calibration:
         cx, baseline = float(left[0, 2]), float(entries["baselineLR"].text or "") / 1000
         lens = Calibration(float(left[0, 0]), cx, float(left[1, 2]), float(right[0, 2]) - cx, baseline)
     return _from_corner(lens.check(path))
-
-
-BOOSTER = EvalDataset(
-    "booster",
-    title="Booster",
-    terms="research, cite; see its page",
-    expected="train/balanced/SCENE/camera_00/*.png",
-    is_scene=lambda folder: has_any(folder, "camera_00"),
-    cases=_booster,
-    skip=frozenset({"test", "unbalanced"}),
-)
 
 
 # --- the Motorcycle
