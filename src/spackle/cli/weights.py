@@ -156,16 +156,12 @@ def lama_weights(*size: int) -> dict[str, Tensor]:
 @weights.command("list")
 def weights_list(as_json: JsonOption = False) -> None:
     """Say which weights are known, and which of them are here."""
-    from rich.console import Console
     from rich.filesize import decimal
-    from rich.table import Table
 
     from spackle.progress import Reporter
     from spackle.weights import PUBLISHED, weights_folder
 
-    reporter, folder, table = Reporter(as_json=as_json), weights_folder(), Table(box=None, pad_edge=False)
-    for header in ("name", "state", "file", "licence"):
-        table.add_column(header, overflow="fold")
+    reporter, folder = Reporter(as_json=as_json), weights_folder()
     for entry in PUBLISHED.values():
         file, state = folder / entry.file, "not here"
         if os.path.isfile(file):  # its size alone is checked, which takes no time
@@ -173,8 +169,7 @@ def weights_list(as_json: JsonOption = False) -> None:
             state = f"{decimal(size)}, whole" if size == entry.bytes else f"damaged, or your own: {size:,} bytes"
         facts = {"name": entry.name, "state": state, "file": file, "licence": entry.licence}
         reporter.result({**facts, "purpose": entry.purpose})
-        table.add_row(entry.name, state, entry.file, entry.licence)
+        if not as_json:
+            print(f"{entry.name:9} {state:18} {entry.file} ({entry.licence})")
     if not as_json:
-        console = Console(highlight=False)
-        console.print(table)
-        console.print(f"in {folder} (SPACKLE_WEIGHTS names another)", markup=False, soft_wrap=True)
+        print(f"in {folder} (SPACKLE_WEIGHTS names another)")

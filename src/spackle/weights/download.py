@@ -62,20 +62,17 @@ def download(url: str, path: str | os.PathLike[str], size: int, sha256: str, pro
 
 def check_url(url: str) -> None:
     """InputError for anything but http:// and https://, such as file://, and for a password in it."""
-    try:
+    with contextlib.suppress(ValueError):  # a port that is no number
         parts = urlsplit(url)
-        host = parts.hostname if parts.port != 0 else None  # a port that is no number is a ValueError
-        good = parts.scheme in ("http", "https") and bool(host) and url.isprintable() and " " not in url
-        named = parts.netloc if good else url
-    except ValueError:
-        good, named = False, url
-    if "@" in named:
+        good = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0
+        if good and "@" not in parts.netloc and url.isprintable() and " " not in url:
+            return
+    if "@" in url:
         raise InputError(
             "an address with a user name or password in it (not shown): spackle logs in nowhere, nor by ~/.netrc: "
             "give an address that works without"
         )
-    if not good:
-        raise InputError(f"{url!r}: not an address to download from: give one that begins with https:// or http://")
+    raise InputError(f"{url!r}: not an address to download from: give one that begins with https:// or http://")
 
 
 def _receive(url: str, part: Path, size: int, progress: Progress) -> None:
