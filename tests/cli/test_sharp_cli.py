@@ -48,12 +48,16 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(
         assert all(row["after"] < 0.01 < row["before"] for row in report["hole_area_ratio"])
 
 
-def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not(tmp_path: Path) -> None:
+def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_photo(tmp_path / "photos" / "a.png")
     weights = write_tiny(tmp_path / "w.pt")
     arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
-    assert run(*arguments, "--sharp", "windows=9", "--sharp", "compile=yes").err.count("done already") == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
+        assert run(*arguments, "--sharp", "windows=9", "--sharp", "compile=yes").err.count("done already") == 1
     changed = tiny_weights()
     changed["prediction_head.texture_prediction_head.bias"] += 0.1
     torch.save(changed, weights)
@@ -62,34 +66,23 @@ def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not
     assert report_of(tmp_path / "out" / "a")["base"]["precision"] == "fp32"
 
 
-@pytest.mark.parametrize("problem", ["photo", "focal", "output", "done"])
-def test_the_network_is_not_loaded_for_a_photo_that_does_not_need_it(
-    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, problem: str
+@pytest.mark.parametrize("wrong", [("missing.png", "out"), ("a.png", "out", "--focal-px", 1e9), ("a.png", "a.png")])
+def test_the_network_is_not_loaded_for_what_cannot_be(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, wrong: tuple[object, ...]
 ) -> None:
-    photo = write_photo(tmp_path / "photos" / "a.png")
-    base = ("--base", "sharp", "-c", weights, *QUICK)
-    if problem == "done":
-        assert run("predict", "-i", photo.parent, "-o", tmp_path / "out", *base).code == 0
+    write_photo(tmp_path / "a.png")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
-    (tmp_path / "file").touch()
-    wrong = {
-        "photo": ("-i", tmp_path / "missing.png", "-o", tmp_path / "out"),
-        "focal": ("-i", photo, "-o", tmp_path / "out", "--focal-px", 1e9),
-        "output": ("-i", photo, "-o", tmp_path / "file"),
-        "done": ("-i", photo.parent, "-o", tmp_path / "out"),
-    }
-    assert run("predict", *wrong[problem], *base).code == (0 if problem == "done" else 2)
+    assert run("predict", "-i", wrong[0], "-o", *wrong[1:], "--base", "sharp", "-c", weights, *QUICK).code == 2
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
 def test_anyone_can_make_weights_to_try_it_with(tmp_path: Path, suffix: str) -> None:
-    for name in ("one", "two"):
-        result = run("weights", "make", tmp_path / f"{name}{suffix}", "--size", "tiny")
-        assert result.code == 0, result.err
-        assert "show no scene" in result.err
-    network = load_network(tmp_path / f"one{suffix}", torch.float32)
-    for name, tensor in load_network(tmp_path / f"two{suffix}", torch.float32).state_dict().items():
-        assert torch.equal(tensor, network.state_dict()[name])
+    result = run("weights", "make", tmp_path / f"tiny{suffix}", "--size", "tiny")
+    assert result.code == 0, result.err
+    assert "show no scene" in result.err
+    network, weights = load_network(tmp_path / f"tiny{suffix}", torch.float32), tiny_weights()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in network.state_dict().items())
     result = run("weights", "make", tmp_path / "three.bin", "--size", "tiny")
     assert result.code == 2
     assert ".safetensors" in result.err
