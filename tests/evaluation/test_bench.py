@@ -22,7 +22,7 @@ from spackle.evaluation import bench
 from spackle.evaluation.case import Points
 from spackle.evaluation.folder import KINDS, load_run, open_folder
 from spackle.evaluation.protocols import large_views
-from spackle.evaluation.rows import BASE_PATH, EXTRA, PAPER, STAGES, Row
+from spackle.evaluation.rows import PAPER, STAGES, Row
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.tables import make_tables
@@ -105,7 +105,7 @@ def test_the_layouts_are_the_papers() -> None:
         assert any("1 of 4 images" in note and "broken" in note for note in table.notes)
 
 
-def test_tables_of_an_evaluation_and_a_benchmark_have_labels_of_their_own() -> None:
+def test_each_table_has_a_label_of_its_own() -> None:
     evaluation = evaluation_data.results("Middlebury", False, lambda image: {"spackle": {"aux": 30}})
     labels = [table.label for table in make_tables([evaluation, results()])]
     assert len(set(labels)) == len(labels) == 6
@@ -117,17 +117,11 @@ def test_tables_of_an_evaluation_and_a_benchmark_have_labels_of_their_own() -> N
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
-    for view in large_views(prediction, (0.3, 0.5)):
-        rows = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
-        found = dict(rows)
-        assert found["aux"] == len(fill_view(context, view.camera).aux) > 0
-        assert found["merged"] == len(prediction.gaussians) + found["aux"]
-        for stage in STAGES:
-            each = [value for name, value in rows if name == f"{stage}_run_ms"]
-            assert len(each) == 3
-            assert min(each) > 0
-        for path, parts in (("base_ms", BASE_PATH), ("extra_ms", EXTRA)):
-            assert found[path] == pytest.approx(sum(found[f"{name}_stage_ms"] for name in parts))
+    view = large_views(prediction, (0.3,))[0]
+    rows = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
+    assert dict(rows)["aux"] == len(fill_view(context, view.camera).aux) > 0
+    for stage in STAGES:
+        assert sum(name == f"{stage}_run_ms" and value > 0 for name, value in rows) == 3
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
     closed = FillContext(opaque, prediction.camera, renderer)
     whole = dict(bench.time_view([1.0], closed, view._replace(camera=prediction.camera), 1, CPU))
@@ -155,9 +149,7 @@ def facts_of(rows: list[Row]) -> dict[str, Any]:
     return {row.metric: row.value for row in rows if not row.setting}
 
 
-def test_points_suffice_and_a_first_prediction_in_a_process_does_not_count(
-    scenes: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings: dict[str, Any] = {"methods": ("spackle",), "disparities": (0.3,), "metrics": (), "residual": "seeds"}
     tools = open_evaluation(EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), **settings))
     case, predict, predictions = tools.cases[0], RgbdBase.predict, list[Any]()

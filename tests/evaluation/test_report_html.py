@@ -25,7 +25,6 @@ from spackle.evaluation.tables import make_tables
 pytest.importorskip("matplotlib")
 EVIL = "<script>alert('1')</script>&\"$x_{$\x01\ud800"
 METHODS = ("base", "inpaint2d", "seeds", "spackle")
-VOID = ("br", "hr", "img", "input", "meta")
 
 
 class Page(HTMLParser):
@@ -43,11 +42,9 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
         assert len(dict(attrs)) == len(attrs), attrs
-        if tag not in VOID:
-            self.open.append(tag)
+        self.open += [] if tag in ("br", "hr", "img", "input", "meta") else [tag]
 
     def handle_endtag(self, tag: str) -> None:
-        assert self.open, tag
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
@@ -61,8 +58,8 @@ class Page(HTMLParser):
 
     def drawings(self) -> list[ElementTree.Element]:
         """The plots, which have to be XML."""
-        plots = [image for image in self.named("img") if image.get("class") == "plot"]
-        return [ElementTree.fromstring(base64.b64decode(str(plot["src"]).partition(",")[2])) for plot in plots]
+        plots = (str(image["src"]) for image in self.named("img") if image.get("class") == "plot")
+        return [ElementTree.fromstring(base64.b64decode(plot.partition(",")[2])) for plot in plots]
 
 
 def figures(near: bool, method: str, scene: int) -> dict[str, float | None]:
@@ -138,9 +135,8 @@ def test_every_string_from_outside_is_escaped(tmp_path: Path) -> None:
 
 
 def test_many_evaluations_and_images_still_fit(tmp_path: Path) -> None:
-    titles = ("Middlebury", "Booster", "WildRGBD", "Tanks", "ETH3D", "LLFF")
-    page = Page(report(tmp_path, *(results(near, 3, title) for title in titles for near in (True, False))))
-    assert len(page.named("article")) == 2 * 12
+    runs = [results(near, 3, title) for title in ("Middlebury", "Booster", "LLFF") for near in (True, False)]
+    assert len(Page(report(tmp_path, *runs)).named("article")) == 2 * 6
     noise = Image.effect_noise((960, 720), 90).convert("RGB")
     fits = fitting([{"base": encode(noise), "spackle": encode(noise)}] * 12)
     assert sum(len(data) * 4 / 3 for case in fits for data in case.values()) <= BUDGET
@@ -151,7 +147,7 @@ def test_many_evaluations_and_images_still_fit(tmp_path: Path) -> None:
     assert fitting(whole) == whole
 
 
-def test_plots_show_each_value_once_in_forms_that_tell_methods_apart() -> None:
+def test_plots_show_each_value_once_in_a_form_of_its_method() -> None:
     assert len(set(STYLES.values())) == len({form for _, form in STYLES.values()}) == len(STYLES)
     assert [evenly(11, 4), evenly(3, 8), evenly(5, 1)] == [[0, 3, 7, 10], [0, 1, 2], [0]]
     plot = overhead_plot(results(near=True, count=3))

@@ -109,13 +109,13 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     times = measure(
         config["base_runs"], {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}, device, warm=counts
     )
-    seconds, found = (times["", TOTAL] / MS).tolist(), latest["base"]
-    context = evaluation.context(found)
+    seconds, prediction = (times["", TOTAL] / MS).tolist(), latest["base"]
+    context = evaluation.context(prediction)
     facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load}
-    facts |= {"warm": int(warm or not counts), "base_gaussians": len(found.gaussians)}
-    facts |= {f"{NOTE}{name}": value for name, value in found.notes.items()}
+    facts |= {"warm": int(warm or not counts), "base_gaussians": len(prediction.gaussians)}
+    facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
     rows = [Row(config["title"], case.name, "", "", "", metric, value) for metric, value in facts.items()]
-    for view in large_views(found, options.disparities):
+    for view in large_views(prediction, options.disparities):
         if view.name == SIDE:
             figures = time_view(seconds, context, view, config["runs"], device)
             row = Row(config["title"], case.name, view.setting, SIDE, "spackle", "", None)

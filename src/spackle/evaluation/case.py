@@ -48,7 +48,6 @@ class Case:
     points: Callable[[], Points] | None = None
     bounds: tuple[float, float] | None = None  # nearest and farthest depth of the view, where no more is known
     seconds: tuple[SecondView, ...] = ()
-    metric: bool = False  # the dataset's lengths are metres
     problem: str | None = None  # why it cannot be used, where that is seen before its turn: of itself, not of the rest
 
 

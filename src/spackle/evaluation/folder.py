@@ -101,25 +101,25 @@ def measure_images(
                 reporter.log("stopped; the same command goes on from here")
                 return None
             part, inputs = image_file(output, index, case.name, ".json"), _inputs_digest(case)
-            found = _load_part(part, inputs)
-            if found is None:
+            rows_of_case = _load_part(part, inputs)
+            if rows_of_case is None:
                 if index and not begun:
                     reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun, start = True, time.perf_counter()
                 try:
-                    found, files = measure(index, case)
+                    rows_of_case, files = measure(index, case)
                 except BaseError:  # no other image would fare better; too little memory is one, too
                     raise
                 except InputError as error:
                     problem = problem_of(case, error, root)
                     reporter.log(f"passed over: {problem}")
-                    found = [Row(run.title, case.name, "", "", "", PROBLEM, problem)]
+                    rows_of_case = [Row(run.title, case.name, "", "", "", PROBLEM, problem)]
                 else:
                     seconds = round(time.perf_counter() - start, 3)
                     content = {"inputs": inputs, "seconds": seconds, "files": file_records(part.parent, files)}
-                    write_whole(part, (json.dumps({**content, "rows": found}, allow_nan=False) + "\n").encode())
+                    write_whole(part, (json.dumps({**content, "rows": rows_of_case}, allow_nan=False) + "\n").encode())
                     reporter.detail(f"  {case.name}: {seconds:.1f} s")
-            rows += found
+            rows += rows_of_case
             step(index + 1, len(cases))
     if not run.measured:
         raise InputError(f"{root}: none of {len(cases)} images gave figures (the lines above say why)")

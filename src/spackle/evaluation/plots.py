@@ -121,9 +121,9 @@ def holes_plot(run: Run) -> Plot | None:
     """HAR against disparity, before and after, and the paper's; None where nothing was measured."""
 
     def means(rows: Iterable[Row], metric: str, method: str) -> list[tuple[float, float]]:
-        own = (row for row in rows if (row.method, row.metric, row.dataset) == (method, metric, run.title))
-        found = {float(setting): mean(values).value for (setting,), values in pivot(own, "setting").items()}
-        return [(move, value) for move, value in sorted(found.items()) if value is not None]
+        chosen = (row for row in rows if (row.method, row.metric, row.dataset) == (method, metric, run.title))
+        by_setting = {float(setting): mean(values).value for (setting,), values in pivot(chosen, "setting").items()}
+        return [(move, value) for move, value in sorted(by_setting.items()) if value is not None]
 
     papers, theirs = paper_rows("tab:controlled_disocclusion"), "Spackle on SHARP (paper)"
     series = [Series(f"before: {run.base} alone", "base", means(run.rows, "har_before", run.methods[0]), line="--")]
@@ -152,11 +152,11 @@ def holes_plot(run: Run) -> Plot | None:
 def overhead_plot(run: Run) -> Plot | None:
     """Added Gaussians against the size of the hole: a dot for each image and view; None where none were counted."""
     series, count = [], 0
-    found = pivot(run.rows, "method", "image", "setting", "view", "metric")
+    values = pivot(run.rows, "method", "image", "setting", "view", "metric")
     adding = {row.method for row in run.rows if row.metric == "aux" and row.method != "base"}
     for method in (name for name in run.methods if name in adding):
-        views = [key[:-1] for key in found if key[0] == method and key[-1] == "aux_share"]
-        pairs = [(found[(*view, "har_before")][0], found[(*view, "aux_share")][0]) for view in views]
+        views = [key[:-1] for key in values if key[0] == method and key[-1] == "aux_share"]
+        pairs = [(values[(*view, "har_before")][0], values[(*view, "aux_share")][0]) for view in views]
         dots = [(100 * float(one), 100 * float(two)) for one, two in pairs if one is not None and two is not None]
         count += len(dots)
         if kept := [dots[k] for k in evenly(len(dots), DOTS // len(adding))]:
@@ -185,15 +185,15 @@ def overhead_plot(run: Run) -> Plot | None:
 
 def scenes_plot(run: Run, metric: str) -> Plot | None:
     """A figure of each scene by each method, in the order of Spackle, or else of the last method."""
-    values = {method: found for method in run.methods if (found := run.by_image(metric, method))}
+    values = {method: by_image for method in run.methods if (by_image := run.by_image(metric, method))}
     if not values:
         return None
     leader = "spackle" if "spackle" in values else list(values)[-1]
     order = ranked(values[leader], metric)
     names = [order[k] for k in evenly(len(order), SCENES)]
     series = []
-    for method, found in values.items():
-        points = [(found[name], float(row)) for row, name in enumerate(names) if name in found]
+    for method, by_image in values.items():
+        points = [(by_image[name], float(row)) for row, name in enumerate(names) if name in by_image]
         series.append(Series(method_name(run, method), method, points))
 
     def finish(axes: Axes) -> None:

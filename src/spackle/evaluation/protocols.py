@@ -111,10 +111,12 @@ def align(case: Case, z_base: Tensor, seen: Tensor, *, base_is_truth: bool = Fal
     if base_is_truth:
         return Alignment(1.0, 0, 0.0, "same")
     seen = seen & torch.isfinite(z_base) & (z_base > 0)
-    if case.depth is not None and (found := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
-        return found
-    if case.points is not None and (found := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")):
-        return found
+    if case.depth is not None and (alignment := _of_ratios(_depth_ratios(case.depth(), z_base, seen), "depth")):
+        return alignment
+    if case.points is not None and (
+        alignment := _of_ratios(_point_ratios(case, case.points(), z_base, seen), "points")
+    ):
+        return alignment
     if case.bounds is not None and seen.any():
         return _of_bounds(case.bounds, z_base[seen])
     sources = {"depth map": case.depth, "points": case.points, "bounds": case.bounds}
@@ -208,10 +210,10 @@ def measure_views(
     remarks: dict[Row, None] = {}
     pictures: dict[str, Tensor] = {}
     for setting in dict.fromkeys(view.setting for view in viewpoints):
-        own = [index for index, view in enumerate(viewpoints) if view.setting == setting]
-        cameras, renderings = [viewpoints[index].camera for index in own], [before[index] for index in own]
+        indices = [index for index, view in enumerate(viewpoints) if view.setting == setting]
+        cameras, renderings = [viewpoints[index].camera for index in indices], [before[index] for index in indices]
         for name, method in methods.items():
-            for index, filled in zip(own, method(cameras, renderings), strict=True):
+            for index, filled in zip(indices, method(cameras, renderings), strict=True):
                 figures: list[tuple[str, float | str]] = [("har_before", holes[index])]
                 if filled.alpha is not None:  # of what is left open (paper, eq. 11 and 10)
                     open_share = hole_area_ratio(filled.alpha)

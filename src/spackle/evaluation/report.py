@@ -185,8 +185,8 @@ def findings(run: Run) -> list[str]:
     """What an evaluation found, in sentences, from means over all views."""
 
     def mean_of(metric: str, method: str, setting: str) -> float | None:
-        own = (row for row in run.rows if (row.metric, row.method, row.setting) == (metric, method, setting))
-        return mean([row.value for row in own]).value
+        rows = (row for row in run.rows if (row.metric, row.method, row.setting) == (metric, method, setting))
+        return mean([row.value for row in rows]).value
 
     lines = []
     for metric, (what, unit, digits) in HEADLINES.items() if run.near else ():
@@ -196,8 +196,8 @@ def findings(run: Run) -> list[str]:
     adding = {row.method for row in run.rows if row.metric == "aux"} - {"base"}
     for method in [name for name in run.methods if name in adding and not run.near][:1]:
         for setting in run.settings:
-            found = [mean_of(name, method, setting) for name in ("har_before", "har", "aux_share", "aux")]
-            before, after, share, added = (value or 0.0 for value in found)
+            figures = [mean_of(name, method, setting) for name in ("har_before", "har", "aux_share", "aux")]
+            before, after, share, added = (value or 0.0 for value in figures)
             lines.append(
                 f"At disparity {setting} the base alone leaves {_percent(before)} of the pixels open, "
                 f"{METHODS[method][0]} {_percent(after)}, with {TEXTS['count'](added)} added Gaussians a view "
@@ -231,8 +231,8 @@ def _pick(run: Run, folder: Path, ranking: Ranking | None, count: int) -> list[t
 def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     """An image: its pictures one over the other, and the figures of the view that they show."""
     setting, view = run.largest_hole(name)
-    own = [row for row in run.rows if (row.image, row.setting, row.view) == (name, setting, view)]
-    figures = {(row.method, row.metric): float(row.value) for row in own if row.value is not None}
+    shown = [row for row in run.rows if (row.image, row.setting, row.view) == (name, setting, view)]
+    figures = {(row.method, row.metric): float(row.value) for row in shown if row.value is not None}
     hole = next((value for (_, metric), value in figures.items() if metric == "har_before"), None)
     names = list(pictures)
     left = "base" if "base" in names and len(names) > 1 else names[0]

@@ -28,8 +28,8 @@ Value = float | str | None
 
 def load_data(name: str) -> dict[str, Any]:
     """A JSON file that lies beside this one."""
-    found: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath(name).read_text("utf-8"))
-    return found
+    content: dict[str, Any] = json.loads(resources.files("spackle.evaluation").joinpath(name).read_text("utf-8"))
+    return content
 
 
 PAPER = load_data("paper.json")
@@ -71,10 +71,10 @@ def median(values: Sequence[Value]) -> Mean:
 
 def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:
     """The values of the rows that agree in these columns."""
-    found: dict[tuple[str, ...], list[Value]] = {}
+    groups: dict[tuple[str, ...], list[Value]] = {}
     for row in rows:
-        found.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
-    return found
+        groups.setdefault(tuple(getattr(row, column) for column in columns), []).append(row.value)
+    return groups
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,19 +130,19 @@ class Run:
 
     def numbers(self, metric: str, setting: str = "") -> list[float]:
         """A figure's finite values at a setting, by all methods."""
-        own = (row.value for row in self.rows if (row.setting, row.metric) == (setting, metric))
-        return [float(value) for value in own if value is not None]
+        values = (row.value for row in self.rows if (row.setting, row.metric) == (setting, metric))
+        return [float(value) for value in values if value is not None]
 
     def by_image(self, metric: str, method: str) -> dict[str, float]:
         """Means of a figure over each image's views; without those where no view has a number."""
-        own = (row for row in self.rows if (row.method, row.metric) == (method, metric))
-        means = {image: mean(values).value for (image,), values in pivot(own, "image").items()}
+        rows = (row for row in self.rows if (row.method, row.metric) == (method, metric))
+        means = {image: mean(values).value for (image,), values in pivot(rows, "image").items()}
         return {image: value for image, value in means.items() if value is not None}
 
     def largest_hole(self, image: str) -> tuple[str, str]:
         """Setting and view of an image in which the base leaves most open: the one that is shown."""
-        own = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
-        shown = max(own, key=lambda row: float(row.value or 0))
+        holes = [row for row in self.rows if (row.image, row.metric) == (image, "har_before")]
+        shown = max(holes, key=lambda row: float(row.value or 0))
         return shown.setting, shown.view
 
 

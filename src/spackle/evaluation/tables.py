@@ -80,7 +80,10 @@ def make_tables(runs: Sequence[Run]) -> list[Table]:
         if any(run.settings != kind[0].settings for run in kind):
             raise InputError("the results have different disparities: make their tables apart")
     return [
-        _table(label, spec, name, own) for name, own in kinds.items() if own for label, spec in TABLES[name].items()
+        _table(label, spec, name, of_kind)
+        for name, of_kind in kinds.items()
+        if of_kind
+        for label, spec in TABLES[name].items()
     ]
 
 
@@ -229,21 +232,21 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
                 return Mean(reduction(base.value, left.value), 0)
         return None
 
-    def text(found: Mean | None, column: Column, method: str) -> str:
+    def text(figure: Mean | None, column: Column, method: str) -> str:
         """Views without a finite value are counted behind it; the paper's percentages are printed as it has them."""
-        if found is None:
+        if figure is None:
             return EMPTY
         paper = method.endswith(FROM_PAPER)
         write = TEXTS["tenths %"] if paper and column.metric == "overhead" else column.text
         mark = ODD_MARK if paper and (dataset, column.setting, column.metric) in ODD else ""
-        bad = f"({found.bad} NaN)" if found.bad else ""
-        return f"{EMPTY if found.value is None else write(found.value)}{mark} {bad}".strip()
+        bad = f"({figure.bad} NaN)" if figure.bad else ""
+        return f"{EMPTY if figure.value is None else write(figure.value)}{mark} {bad}".strip()
 
     texts = []
     for column in columns:
-        found = [find(method, column.setting, column.metric) for method in methods]
-        cells = [text(one, column, method) for one, method in zip(found, methods, strict=True)]
-        values = [None if one is None else one.value for one in found]
+        figures = [find(method, column.setting, column.metric) for method in methods]
+        cells = [text(figure, column, method) for figure, method in zip(figures, methods, strict=True)]
+        values = [None if figure is None else figure.value for figure in figures]
         texts.append(cells if column.lower is None else mark_best(values, cells, column.lower))
     return [list(cells) for cells in zip(*texts, strict=True)]
 
@@ -300,9 +303,9 @@ def _near_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
     theirs = {
         name: {title: _cells(_of(spec["label"], title), columns, [name])[0] for title in IMAGES} for name in methods
     }
-    for found in (ours, theirs):
+    for group in (ours, theirs):
         empty = [EMPTY] * len(columns)
-        bodies.append([(name, *(cell for t in titles for cell in by.get(t, empty))) for name, by in found.items()])
+        bodies.append([(name, *(cell for t in titles for cell in by.get(t, empty))) for name, by in group.items()])
     return [("", "Method"), *((title, column.title) for title in titles for column in columns)], bodies
 
 
@@ -321,11 +324,11 @@ def _overhead_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
             rows.append((THEIRS, *_cells(theirs, counts, [theirs[0].method])[0]))
         bodies.append(_grouped(dataset, rows))
     averages: list[Cells] = []
-    for base, own in bases.items():
-        if len(own) > 1:  # of the datasets' means, as the paper's
+    for base, group in bases.items():
+        if len(group) > 1:  # of the datasets' means, as the paper's
             means = [
                 Row(run.title, "", setting, "", base, metric, mean(values).value)
-                for run in own
+                for run in group
                 for (setting, metric), values in pivot(run.rows, "setting", "metric").items()
                 if metric in ("aux", "aux_share")
             ]
@@ -333,7 +336,7 @@ def _overhead_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
     averages.append((THEIRS, *_cells(paper_rows(label), counts, [summary])[0]))
     bodies.append(_grouped("Average", averages))
     times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
-    pools = {base: ([row for run in own for row in run.rows], own[0].methods[0]) for base, own in bases.items()}
+    pools = {base: ([row for run in group for row in run.rows], group[0].methods[0]) for base, group in bases.items()}
     pools[THEIRS] = (list(paper_rows(label)), summary)
     for column in spec["runtime"]:
         rows = []

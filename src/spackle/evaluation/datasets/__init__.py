@@ -65,15 +65,15 @@ def read_cases(name: str, root: Path) -> list[Case]:
         raise InputError(f"{root}: no such folder: give the one that {name} was unpacked in")
     if root.name in ("", ".."):  # a scene is called like its folder
         root = root.resolve()
-    found = sorted(_walk(root, dataset, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
-    if not found:
+    folders = sorted(_walk(root, dataset, MAX_FOLDERS), key=lambda folder: (folder.name, folder.as_posix()))
+    if not folders:
         # The dataset that has most scenes there, after a short look; of equals the later one has the plainer marks.
         counts = {one.name: sum(1 for _ in _walk(root, one, GUESS_FOLDERS)) for one in reversed(DATASETS.values())}
         likely = max(counts, key=lambda name: counts[name])
         hint = f"; this looks like {likely}" if counts[likely] else ""
         raise InputError(f"{root}: no scene of {name} at or below it: expected {dataset.expected}{hint}")
     scenes: dict[str, Path] = {}
-    for folder in found:
+    for folder in folders:
         scene = posed_photos.category_and_scene(folder) if name == "wildrgbd" else folder.name
         other = scenes.setdefault(scene, folder)
         if other is not folder:

@@ -62,13 +62,12 @@ def check_two(scene: Path, count: int) -> None:
         raise InputError(f"{scene}: at least two photos with a pose are needed, {count} found: unpack the whole scene")
 
 
-def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None, *, metric: bool = False) -> list[Case]:
+def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
     """Photos as cases, their second views (of all `views`) in their own frames.
 
     Args:
         views: all photos of a scene.
         wanted: indices of the photos that become cases; all where None.
-        metric: the poses' lengths are metres.
     """
     cases = []
     for index, others in near_views(views, range(len(views)) if wanted is None else wanted).items():
@@ -78,8 +77,7 @@ def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None, *, m
             for other in (views[k] for k in others)
         ]
         camera = _placed(view.camera, torch.eye(4))
-        known: dict[str, Any] = {"points": view.points, "bounds": view.bounds, "metric": metric}
-        cases.append(Case(view.name, view.photo, camera, seconds=tuple(seconds), **known))
+        cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, tuple(seconds)))
     return cases
 
 

@@ -69,7 +69,7 @@ def _photos_of(scene: Path) -> list[Case]:
             why = "no such photo, but the model has it: unpack the scene's dslr_undistorted archive"
             raise InputError(f"{places[0]}: {why}")
         photos.append(photo)
-    return make_cases(posed_by(scene, model, photos), metric=True)
+    return make_cases(posed_by(scene, model, photos))
 
 
 def _pair_of(scene: Path) -> Case:
@@ -132,7 +132,7 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
 
 def _llff_views(scene: Path) -> list[Posed]:
-    photos = next((found for name in LLFF_PHOTOS if (found := photo_files(scene / name))), None)
+    photos = next((files for name in LLFF_PHOTOS if (files := photo_files(scene / name))), None)
     if photos is None:
         raise InputError(f"{scene}: no photos: expected them in {', '.join(LLFF_PHOTOS)}")
     check_two(scene, len(photos))
@@ -210,7 +210,7 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
         return range(len(read[name]))
 
     picked = spread(sorted(scenes), frames, IMAGES["WildRGBD"])
-    return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name], metric=True)]
+    return [_with_depth(case) for name in picked for case in make_cases(read[name], picked[name])]
 
 
 def category_and_scene(folder: Path) -> str:

@@ -56,7 +56,7 @@ def _pair(
     K[0, 2] += lens.doffs_px
     pose[0, 3] = -lens.baseline_m
     seconds = (SecondView("right", right, Camera(K, pose, *size)),)
-    return Case(name, left, Camera(lens.K, torch.eye(4), *size), depth=depth, seconds=seconds, metric=True)
+    return Case(name, left, Camera(lens.K, torch.eye(4), *size), depth=depth, seconds=seconds)
 
 
 def _picture_size(path: Path) -> tuple[int, int]:
@@ -191,8 +191,7 @@ def _of_2003(folder: Path) -> Case:
     size = width / WIDTH_OLD
     lens = Calibration(FOCAL_OLD * size, width / 2, height / 2, DOFFS_OLD * size, BASELINE_OLD)
     depth = _depth_by(lens, truths[0], 1 / LEVELS.get(width, LEVELS_2001))
-    case = _pair(folder.name, folder / f"im2{suffix}", folder / f"im6{suffix}", lens, (width, height), depth)
-    return dataclasses.replace(case, metric=False)
+    return _pair(folder.name, folder / f"im2{suffix}", folder / f"im6{suffix}", lens, (width, height), depth)
 
 
 def _described(folder: Path) -> Case:
@@ -203,7 +202,7 @@ def _described(folder: Path) -> Case:
         facts = json.loads(read_text(path))
         left, right, truth = (folder / str(facts[key]) for key in ("left", "right", "disparity"))
     depth = functools.partial(load_depth, truth, calib=path)
-    return dataclasses.replace(_pair(folder.name, left, right, lens, _picture_size(left), depth), metric=False)
+    return _pair(folder.name, left, right, lens, _picture_size(left), depth)
 
 
 # --- Booster
