@@ -26,9 +26,9 @@ from suite_scenes import SIDE, find_view, holed_scene, photo_scene
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
+from spackle.bases import BasePrediction
 from spackle.bases.lift import lift
 from spackle.bases.open import open_base
-from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric, to_processor

@@ -13,9 +13,9 @@ import torch
 from photos import box
 from torch import Tensor
 
+from spackle.bases import BasePrediction
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering

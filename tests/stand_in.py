@@ -13,10 +13,10 @@ from command import Run, run
 from photos import box
 from safetensors.torch import save_file
 
+from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.lite import LiteNet
-from spackle.bases.protocol import BasePrediction, Progress
 from spackle.image import Photo, resize_photo
 from spackle.weights import PUBLISHED, PublishedWeights
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from spackle import DepthMap, Photo, Scene, get_renderer, hole_mask
 from spackle import complete as complete_scene
+from spackle.bases import BasePrediction
 from spackle.bases.open import OpenedBase, open_base
-from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
 from spackle.gaussians import Gaussians

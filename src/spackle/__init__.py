@@ -11,12 +11,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers
+    from spackle.bases import Base as Base
+    from spackle.bases import BasePrediction as BasePrediction
     from spackle.bases.depth_map import DepthMap as DepthMap
     from spackle.bases.depth_map import load_depth as load_depth
     from spackle.bases.hf import HfBase as HfBase
     from spackle.bases.lite import LiteBase as LiteBase
-    from spackle.bases.protocol import Base as Base
-    from spackle.bases.protocol import BasePrediction as BasePrediction
     from spackle.bases.sharp import SharpBase as SharpBase
     from spackle.camera import Camera as Camera
     from spackle.errors import InputError as InputError
@@ -43,10 +43,10 @@ __version__ = "0.1.0"
 
 # A name is imported at its first use: `spackle --help` need not wait for torch.
 _NAMES = {
+    "spackle.bases": ("Base", "BasePrediction"),
     "spackle.bases.depth_map": ("DepthMap", "load_depth"),
     "spackle.bases.hf": ("HfBase",),
     "spackle.bases.lite": ("LiteBase",),
-    "spackle.bases.protocol": ("Base", "BasePrediction"),
     "spackle.bases.sharp": ("SharpBase",),
     "spackle.camera": ("Camera",),
     "spackle.errors": ("InputError",),

@@ -16,9 +16,9 @@ from typing import Literal
 
 from torch import Tensor
 
+from spackle.bases import Base, BasePrediction
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.open import OpenedBase, ResolvedBase, open_base, open_loaded
-from spackle.bases.protocol import Base, BasePrediction
 from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.camera_path import KeyframePath, TrajectoryKind

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from spackle.bases.protocol import USUAL_DISPARITY
+from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind
 from spackle.files import write_whole

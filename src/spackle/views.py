@@ -12,7 +12,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import USUAL_DISPARITY, BasePrediction
+from spackle.bases import USUAL_DISPARITY, BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import (
     MAX_DISPARITY,

@@ -24,12 +24,11 @@ from stand_in import publish
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases import hf
+from spackle.bases import NEAREST_M, hf
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.hf import FARTHEST_M, HfBase, meaning_of, to_depth_map
 from spackle.bases.lift import lift
 from spackle.bases.open import open_base
-from spackle.bases.protocol import NEAREST_M
 from spackle.bases.settings import BaseSettings
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
@@ -43,10 +42,11 @@ MODELS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     for name, entry in json.loads((Path(__file__).parents[1] / "data" / "depth_models.json").read_text()).items()
 }  # tiny ones of the published kinds: transformers' class, its settings, and those of its image processor
 RELATIVE = ("relative", "dpt")
+Folders = dict[str, Path]  # of models, by their names in `MODELS`
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     """Tiny models of the real classes with random weights, saved as published ones are."""
     root = tmp_path_factory.mktemp("models")
     for name, (kind, settings, preparation) in MODELS.items():
@@ -88,7 +88,7 @@ def maps(monkeypatch: pytest.MonkeyPatch) -> list[DepthMap]:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_each_kind_of_model_gives_gaussians_of_the_photo(
-    name: str, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+    name: str, folders: Folders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hf, "lift", functools.partial(lift, levels=0))  # each pixel has a Gaussian of its own
     photo, base = photo_of(), load(folders[name])
@@ -111,7 +111,7 @@ def test_each_kind_of_model_gives_gaussians_of_the_photo(
 @pytest.mark.parametrize("name", ["metric", "glpn", *RELATIVE])
 @pytest.mark.parametrize(("width", "height"), [(96, 64), (61, 83)])
 def test_the_map_is_the_models_output_as_transformers_gives_it(
-    name: str, width: int, height: int, folders: dict[str, Path], maps: list[DepthMap]
+    name: str, width: int, height: int, folders: Folders, maps: list[DepthMap]
 ) -> None:
     photo = photo_of(width, height)
     network = transformers.AutoModelForDepthEstimation.from_pretrained(folders[name]).eval()
@@ -131,13 +131,13 @@ def test_the_map_is_the_models_output_as_transformers_gives_it(
         torch.testing.assert_close(found.depth, expected, rtol=1e-5, atol=0)
 
 
-def test_a_large_photo_is_seen_and_lifted_at_its_working_size(folders: dict[str, Path]) -> None:
+def test_a_large_photo_is_seen_and_lifted_at_its_working_size(folders: Folders) -> None:
     big = Photo(torch.rand(40, 1600, 3, generator=torch.Generator().manual_seed(0)), 1600.0, "EXIF", Path("photo.png"))
     camera = load(folders["metric"]).predict(big).camera
     assert (camera.width, camera.height, camera.focal[0]) == (1536, 38, pytest.approx(1536))
 
 
-def test_tips_sees_the_photo_stretched_as_pillow_does_it(folders: dict[str, Path]) -> None:
+def test_tips_sees_the_photo_stretched_as_pillow_does_it(folders: Folders) -> None:
     photo = photo_of(192, 128)
     pixels, _ = load(folders["tips"]).prepare(photo.rgb)
     resized = torch.from_numpy(np.array(image_of(photo).resize((56, 42), Image.Resampling.BILINEAR)))
@@ -160,7 +160,7 @@ class Stub(nn.Module):
 @pytest.mark.parametrize("name", ["metric", "dinov2", "glpn", "zoedepth"])
 @pytest.mark.parametrize(("width", "height"), [(288, 192), (181, 240)])
 def test_depth_lies_where_the_photo_shows_it(
-    name: str, width: int, height: int, folders: dict[str, Path], maps: list[DepthMap]
+    name: str, width: int, height: int, folders: Folders, maps: list[DepthMap]
 ) -> None:
     """Whatever is resized and padded: 2 m where the photo is bright, 6 m where it is dark."""
     rgb = torch.zeros(height, width, 3)
@@ -199,7 +199,7 @@ def test_relative_disparity_runs_from_30_m_to_1_5_m() -> None:
     torch.testing.assert_close(found.depth, torch.tensor([[1.6, 0.8, 0.4, 1e4, 1e-4]]))  # its limits: 10 km, 0.1 mm
 
 
-def test_depth_pro_gives_the_lens_where_nobody_knows_it(folders: dict[str, Path], maps: list[DepthMap]) -> None:
+def test_depth_pro_gives_the_lens_where_nobody_knows_it(folders: Folders, maps: list[DepthMap]) -> None:
     """And else scales its depth to the lens; by the formulas of its image processor, which needs torchvision."""
     base, unknown = load(folders["depth_pro"]), photo_of(focal=90.0, source=f"default {DEFAULT_FOCAL_MM:g} mm")
     settings = MODELS["depth_pro"][2]
@@ -283,9 +283,7 @@ def test_a_field_of_view_that_no_lens_has_is_refused(fov: float) -> None:
     assert base.predict(photo_of()).camera.focal[0] == 80  # the lens is known
 
 
-def test_a_photo_that_a_model_cannot_work_on_is_one_line(
-    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_that_a_model_cannot_work_on_is_one_line(folders: Folders, monkeypatch: pytest.MonkeyPatch) -> None:
     speck = Photo(torch.rand(3, 5, 3), 5.0, "EXIF", Path("speck.png"))
     with pytest.raises(InputError, match=r"^speck.png: hf:.*glpn fails \(.*\): give another photo or model$"):
         load(folders["glpn"]).predict(speck)
@@ -299,7 +297,7 @@ def test_a_photo_that_a_model_cannot_work_on_is_one_line(
 # Precision.
 
 
-def test_bf16_is_close_to_fp32_without_stairs_and_repeats(folders: dict[str, Path], maps: list[DepthMap]) -> None:
+def test_bf16_is_close_to_fp32_without_stairs_and_repeats(folders: Folders, maps: list[DepthMap]) -> None:
     photo = photo_of()
     exact, low = load(folders["metric"]), load(folders["metric"], "bf16")
     for base, precision in ((exact, "fp32"), (low, "bf16"), (low, "bf16")):
@@ -326,7 +324,7 @@ def lacking(folder: Path, prefix: str) -> None:
     change_weights(folder, lambda tensors: {key: t for key, t in tensors.items() if not key.startswith(prefix)})
 
 
-def test_weights_of_half_precision_are_widened(folders: dict[str, Path], tmp_path: Path, maps: list[DepthMap]) -> None:
+def test_weights_of_half_precision_are_widened(folders: Folders, tmp_path: Path, maps: list[DepthMap]) -> None:
     folder = shutil.copytree(folders["metric"], tmp_path / "half")
     change_weights(folder, lambda tensors: {key: tensor.half() for key, tensor in tensors.items()})
     change(folder, CONFIG, {"dtype": "float16"})
@@ -362,11 +360,7 @@ def pickled(folder: Path) -> None:
     ],
 )
 def test_a_folder_that_is_no_model_is_one_line(
-    damage: Callable[[Path], None],
-    words: str,
-    folders: dict[str, Path],
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
+    damage: Callable[[Path], None], words: str, folders: Folders, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     folder = shutil.copytree(folders["metric"], tmp_path / "model")
     damage(folder)
@@ -380,7 +374,7 @@ def test_a_folder_that_is_no_model_is_one_line(
 
 @pytest.mark.parametrize("changes", [{"size": {"height": 1 << 20, "width": 64}}, {"size": 64}, {"resample": 3}])
 def test_an_input_for_depth_pro_that_is_not_known_is_one_line(
-    changes: dict[str, Any], folders: dict[str, Path], tmp_path: Path
+    changes: dict[str, Any], folders: Folders, tmp_path: Path
 ) -> None:
     folder = shutil.copytree(folders["depth_pro"], tmp_path / "model")
     change(folder, INPUT, changes)
@@ -388,9 +382,7 @@ def test_an_input_for_depth_pro_that_is_not_known_is_one_line(
         load(folder)
 
 
-def test_weights_that_a_model_never_uses_may_be_missing(
-    folders: dict[str, Path], tmp_path: Path, maps: list[DepthMap]
-) -> None:
+def test_weights_that_a_model_never_uses_may_be_missing(folders: Folders, tmp_path: Path, maps: list[DepthMap]) -> None:
     """DPT-Large as published lacks them: the first stage of the neck has nothing to add to."""
     folder = shutil.copytree(folders["dpt"], tmp_path / "dpt")
     lacking(folder, "neck.fusion_stage.layers.0.residual_layer1")
@@ -399,7 +391,7 @@ def test_weights_that_a_model_never_uses_may_be_missing(
     assert torch.equal(maps[0].depth, maps[1].depth)
 
 
-def test_code_in_a_models_folder_is_not_run(folders: dict[str, Path], tmp_path: Path) -> None:
+def test_code_in_a_models_folder_is_not_run(folders: Folders, tmp_path: Path) -> None:
     folder, flag = shutil.copytree(folders["metric"], tmp_path / "model"), tmp_path / "run"
     (folder / "own.py").write_text(f"open({str(flag)!r}, 'w')")
     own = {"AutoModelForDepthEstimation": "own.Model", "AutoConfig": "own.Config"}
@@ -410,7 +402,7 @@ def test_code_in_a_models_folder_is_not_run(folders: dict[str, Path], tmp_path: 
     assert not flag.exists()
 
 
-def test_a_missing_or_broken_package_is_one_line(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_or_broken_package_is_one_line(folders: Folders, monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken:
         def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
             if name == "transformers":
@@ -430,7 +422,7 @@ def test_a_missing_or_broken_package_is_one_line(folders: dict[str, Path], monke
 
 
 def test_folders_are_told_from_names_of_the_hub(
-    folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: Folders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -447,7 +439,7 @@ def test_folders_are_told_from_names_of_the_hub(
 
 
 @pytest.fixture
-def cached(folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cached(folders: Folders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of owner/name in the hub's cache, on a machine without network."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
@@ -457,7 +449,7 @@ def cached(folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyP
     return shutil.copytree(folders["metric"], model / "snapshots" / commit)
 
 
-def test_a_model_in_the_hubs_cache_needs_no_network(cached: Path, folders: dict[str, Path]) -> None:
+def test_a_model_in_the_hubs_cache_needs_no_network(cached: Path, folders: Folders) -> None:
     base = HfBase.load("owner/name", device="cpu", precision="fp32")
     assert base.name == "hf:owner/name"
     means = load(folders["metric"]).predict(photo_of()).gaussians.means
@@ -474,7 +466,7 @@ def test_what_neither_cache_nor_hub_give_is_one_line(cached: Path, missing: str)
 
 
 def test_auto_takes_depth_anything_before_lite(
-    folders: dict[str, Path], shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: Folders, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo = photo_of()
     assert open_base(BaseSettings()).predict(photo)[1].base == "lite"

@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate
 from weights import save_networks
 
 import spackle
+from spackle.bases import NEAREST_M
 from spackle.bases.lite import (
     FARTHEST,
     INPUT_SCALES,
@@ -22,7 +23,6 @@ from spackle.bases.lite import (
     LiteNet,
     load_networks,
 )
-from spackle.bases.protocol import NEAREST_M
 from spackle.errors import InputError
 from spackle.image import Photo
 

@@ -19,12 +19,12 @@ from sharp_weights import gaussians_of, write_tiny
 from stand_in import SHARP_FILE, StandIn, publish, write_model
 
 import spackle
+from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite import LiteBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
-from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.settings import KINDS, BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.encoder import TINY
@@ -130,7 +130,7 @@ def test_a_machine_without_a_home_has_no_sharp(photo: Path, monkeypatch: pytest.
         monkeypatch.delenv(name, raising=False)
     assert pick(photo)[1].why == f"{NO_DEPTH}, {NO_SHARP}"
     assert FillOptions().texture == "exemplar"  # nor LaMa
-    with pytest.raises(InputError, match="no weights on this machine"):
+    with pytest.raises(InputError, match="no weights of SHARP on this machine"):
         pick(photo, name="sharp")
 
 

@@ -7,7 +7,7 @@ import io
 import struct
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +55,6 @@ def same(depth: DepthMap, expected: NDArray[Any]) -> None:
     np.testing.assert_allclose(depth.depth.numpy(), expected, rtol=1e-6)
 
 
-def lens_of(depth: DepthMap) -> Any:
-    assert depth.K is not None
-    return depth.K.tolist()
-
-
 def refused(tmp_path: Path, data: bytes, why: str) -> None:
     path = portraits.write(tmp_path / "bad.jpg", data)
     with pytest.raises(InputError, match=why) as caught:
@@ -73,78 +68,6 @@ def refused(tmp_path: Path, data: bytes, why: str) -> None:
 # What each layout means.
 
 
-def test_heic_with_apples_words(tmp_path: Path) -> None:
-    data = portraits.heic(codes(), apple_xmp(ends=(0.5, 3.0), matrix=LENS))
-    others = pillow_heif.open_heif(io.BytesIO(data)).info["depth_images"]
-    np.testing.assert_array_equal(np.asarray(others[0]), codes())  # libheif sees the same map
-    depth = found(tmp_path, data)
-    same(depth, between(0.5, 3))
-    assert (depth.quantity, depth.note) == ("disparity", "portrait depth of the photo (Apple disparity, relative)")
-    assert depth.quantum == pytest.approx(2.5 / 255)
-    assert lens_of(depth) == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
-    assert depth.path == tmp_path / "portrait.xyz"
-    depth = found(tmp_path, portraits.heic(codes(), apple_xmp("fdep", (0.5, 8.0), "absolute")))
-    same(depth, LINEAR)
-    assert (depth.quantity, depth.K) == ("depth", None)
-    assert depth.note == "portrait depth of the photo (Apple depth, absolute)"
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("inverse, 0.5 to 8 m", between(1 / 8, 2)),
-        ("disparity, 0.25 to 3", between(0.25, 3)),
-        ("depth, 0.5 to 8 m", LINEAR),
-        ("", between(0.1, 1)),
-    ],
-)
-@pytest.mark.parametrize("name", [portraits.HEVC, b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"])
-def test_heic_with_hevcs_words(tmp_path: Path, words: str, expected: NDArray[np.float64], name: bytes) -> None:
-    depth = found(tmp_path, portraits.heic(codes(), information=words, kind=name))
-    same(depth, expected)
-    assert depth.quantity == ("depth" if words.startswith("depth") else "disparity")
-    assert ("assumed" in depth.note) == (words == "")
-    apple = portraits.heic(codes(), apple_xmp(), information="depth, 1 to 2 m")
-    same(found(tmp_path, apple), between(0.5, 3))  # Apple's words beat them
-
-
-def test_heic_with_ten_bits(tmp_path: Path) -> None:
-    fine = (codes().astype(np.uint16) * 4 + np.arange(32, dtype=np.uint16) % 4) << 6
-    depth = found(tmp_path, portraits.heic(fine, information="disparity, 0.5 to 3"))
-    same(depth, between(0.5, 3, (fine >> 6) / 1023))
-    assert depth.quantum == pytest.approx(2.5 / 1023)
-
-
-def test_heics_words_of_another_picture_are_not_the_maps(tmp_path: Path) -> None:
-    """They belong to the item that they refer to, wherever they stand in the file."""
-    data = portraits.heic(codes(), apple_xmp(), information="disparity, 0.25 to 3")
-    link = b"cdsc" + struct.pack(">HHH", 3, 1, 2)
-    assert data.count(link) == 1
-    same(found(tmp_path, data.replace(link, link[:-1] + b"\1")), between(0.25, 3))
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_jpeg_with_apples_further_pictures(tmp_path: Path, order: str) -> None:
-    data = portraits.apple_jpeg(codes(), apple_xmp(matrix=LENS), order=order)
-    depth = found(tmp_path, data)
-    decoded = np.asarray(Image.open(io.BytesIO(portraits.jpeg(codes()))))
-    same(depth, between(0.5, 3, decoded / 255))  # not the gain map or the matte before it
-    assert lens_of(depth) == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
-    assert depth.note == "portrait depth of the photo (Apple disparity, relative)"
-
-
-def test_apples_type_counts_where_the_format_is_not_given(tmp_path: Path) -> None:
-    for kind, expected in (("depth", "depth"), ("disparity", "disparity")):
-        said = f"<apdi:AuxiliaryImageType>{kind}</apdi:AuxiliaryImageType>"
-        packet = apple_xmp(None, accuracy="great", more=said)
-        depth = found(tmp_path, portraits.apple_jpeg(codes(), packet))
-        assert depth.quantity == expected
-        assert depth.note == f"portrait depth of the photo (Apple {kind}, of unknown accuracy)"
-    matte = "<apdi:AuxiliaryImageSubType>portraiteffectsmatte</apdi:AuxiliaryImageSubType>"
-    matte = portraits.apple_jpeg(codes(), apple_xmp(None, more=said + matte))
-    assert load_photo_depth(portraits.write(tmp_path / "matte.jpg", matte)) is None
-
-
 ANDROID: dict[str, Callable[..., bytes]] = {
     "GDepth, extended": portraits.gdepth_jpeg,
     "GDepth, one packet": functools.partial(portraits.gdepth_jpeg, part=None),
@@ -152,37 +75,96 @@ ANDROID: dict[str, Callable[..., bytes]] = {
     "Dynamic Depth, extended": functools.partial(portraits.dynamic_jpeg, extended=True),
 }
 each_of_android = pytest.mark.parametrize("make", ANDROID.values(), ids=ANDROID)
+TEN_BITS = (codes().astype(np.uint16) * 4 + np.arange(32, dtype=np.uint16) % 4) << 6
+SIXTEEN_BITS = codes().astype(np.uint16) * 257 - np.uint16(3) * (codes() == 200)
+LOSSY = portraits.jpeg(np.repeat(codes()[..., None], 3, axis=-1))
+
+
+def gray(picture: bytes) -> NDArray[Any]:
+    """What Pillow makes of a picture, in shares of its highest value."""
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("L")) / 255
+
+
+def layouts_read() -> Iterator[tuple[str, bytes, NDArray[Any], str, float, str]]:
+    """Name, file, depth, quantity, step, and how the note ends."""
+    apple, hevc = ("disparity", 2.5 / 255, "(Apple disparity, relative)"), portraits.heic
+    yield "HEIC, Apple's disparity", hevc(codes(), apple_xmp(matrix=LENS)), between(0.5, 3), *apple
+    yield (
+        "HEIC, Apple's before HEVC's",
+        hevc(codes(), apple_xmp(), information="depth, 1 to 2 m"),
+        between(0.5, 3),
+        *apple,
+    )
+    absolute = hevc(codes(), apple_xmp("fdep", (0.5, 8.0), "absolute"))
+    yield "HEIC, Apple's depth", absolute, LINEAR, "depth", 7.5 / 255, "(Apple depth, absolute)"
+    fine = hevc(TEN_BITS, information="disparity, 0.5 to 3")
+    yield "HEIC, ten bits", fine, between(0.5, 3, (TEN_BITS >> 6) / 1023), "disparity", 2.5 / 1023, "(HEIF disparity)"
+    for kind in (portraits.HEVC, b"urn:mpeg:mpegB:cicp:systems:auxiliary:depth"):
+        for words, depth, *rest in (
+            ("inverse, 0.5 to 8 m", between(1 / 8, 2), "disparity", 1.875 / 255, "(HEIF inverse depth)"),
+            ("disparity, 0.25 to 3", between(0.25, 3), "disparity", 2.75 / 255, "(HEIF disparity)"),
+            ("depth, 0.5 to 8 m", LINEAR, "depth", 7.5 / 255, "(HEIF depth)"),
+            ("", between(0.1, 1), "disparity", 0.9 / 255, "assumed to be 1 to 10 m)"),
+        ):
+            yield f"HEIC, {kind!r}: {words}", hevc(codes(), information=words, kind=kind), depth, *rest
+    for order in "<>":  # not the gain map or the matte before it
+        data = portraits.apple_jpeg(codes(), apple_xmp(matrix=LENS), order=order)
+        yield f"JPEG, Apple's {order}", data, between(0.5, 3, gray(portraits.jpeg(codes()))), *apple
+    for name, make in ANDROID.items():
+        inverse, linear = ("disparity", 1.875 / 255), ("depth", 7.5 / 255)
+        for image, said, depth, *rest in (
+            (png(codes()), Range(unit="Meters"), INVERSE, *inverse, "Depth, in meters)"),
+            (png(codes()), Range(style="RangeLinear"), LINEAR, *linear, "Depth, in m)"),
+            (png(codes()), Range(500, 8000, unit="mm"), INVERSE, *inverse, "in mm)"),
+            (png(codes()), Range(2, 0.125, unit="Diopters"), LINEAR, *linear, "in diopters)"),
+            (png(codes()), Range(2, 0.125, "RangeLinear", unit="Diopters"), INVERSE, *inverse, "in diopters)"),
+            (png(codes()), Range(0.5, 8, unit="parsec"), INVERSE, *inverse, "Depth, unit unknown)"),
+            (png(SIXTEEN_BITS), Range(), between(2, 1 / 8, SIXTEEN_BITS / 65535), "disparity", 1.875 / 65535, "in m)"),
+            (LOSSY, Range(), between(2, 1 / 8, gray(LOSSY)), "disparity", None, "in m)"),
+            (png(codes()), Range(50, 800), 100 * INVERSE, "disparity", 0.01875 / 255, "in m)"),
+        ):
+            yield f"{name}, {said}", make(image, said), depth, *rest
+
+
+LAYOUTS = {name: row for name, *row in layouts_read()}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_the_depth_of_each_layout(tmp_path: Path, name: str) -> None:
+    data, expected, quantity, quantum, note = LAYOUTS[name]
+    depth = found(tmp_path, data)
+    same(depth, expected)
+    assert (depth.quantity, depth.path) == (quantity, tmp_path / "portrait.xyz")
+    assert quantum is None or depth.quantum == pytest.approx(quantum)
+    assert depth.note.startswith("portrait depth of the photo (")
+    assert depth.note.endswith(note)
+    assert (depth.K is None) == (data.count(b"IntrinsicMatrixReferenceWidth") == 0)
+    assert depth.K is None or depth.K.tolist() == [[35, 0, 10], [0, 25, 15], [0, 0, 1]]
+
+
+def test_heics_words_of_another_picture_are_not_the_maps(tmp_path: Path) -> None:
+    """They belong to the item that they refer to, wherever they stand in the file."""
+    data = portraits.heic(codes(), apple_xmp(), information="disparity, 0.25 to 3")
+    others = pillow_heif.open_heif(io.BytesIO(data)).info["depth_images"]
+    np.testing.assert_array_equal(np.asarray(others[0]), codes())  # libheif sees the same map
+    link = b"cdsc" + struct.pack(">HHH", 3, 1, 2)
+    assert data.count(link) == 1
+    same(found(tmp_path, data.replace(link, link[:-1] + b"\1")), between(0.25, 3))
+
+
+def test_apples_type_counts_where_the_format_is_not_given(tmp_path: Path) -> None:
+    for kind in ("depth", "disparity"):
+        said = f"<apdi:AuxiliaryImageType>{kind}</apdi:AuxiliaryImageType>"
+        depth = found(tmp_path, portraits.apple_jpeg(codes(), apple_xmp(None, accuracy="great", more=said)))
+        assert depth.quantity == kind
+        assert depth.note == f"portrait depth of the photo (Apple {kind}, of unknown accuracy)"
+    matte = "<apdi:AuxiliaryImageSubType>portraiteffectsmatte</apdi:AuxiliaryImageSubType>"
+    matte = portraits.apple_jpeg(codes(), apple_xmp(None, more=said + matte))
+    assert load_photo_depth(portraits.write(tmp_path / "matte.jpg", matte)) is None
 
 
 @each_of_android
-def test_android(tmp_path: Path, make: Callable[..., bytes]) -> None:
-    depth = found(tmp_path, make(png(codes()), Range(unit="Meters")))
-    same(depth, INVERSE)
-    assert (depth.quantity, depth.K) == ("disparity", None)
-    assert depth.quantum == pytest.approx((2 - 1 / 8) / 255)
-    assert depth.note.endswith("Depth, in meters)")
-    depth = found(tmp_path, make(png(codes()), Range(style="RangeLinear")))
-    same(depth, LINEAR)
-    assert depth.quantity == "depth"
-    assert depth.quantum == pytest.approx(7.5 / 255)
-    same(found(tmp_path, make(png(codes()), Range(500, 8000, unit="mm"))), INVERSE)
-    same(found(tmp_path, make(png(codes()), Range(2, 0.125, unit="Diopters"))), LINEAR)
-    same(found(tmp_path, make(png(codes()), Range(2, 0.125, "RangeLinear", unit="Diopters"))), INVERSE)
-    fine = codes().astype(np.uint16) * 257 - np.uint16(3) * (codes() == 200)
-    depth = found(tmp_path, make(png(fine)))
-    same(depth, between(2, 1 / 8, fine / 65535))
-    assert depth.quantum == pytest.approx((2 - 1 / 8) / 65535)
-    lossy = portraits.jpeg(np.repeat(codes()[..., None], 3, axis=-1))
-    gray = np.asarray(Image.open(io.BytesIO(lossy)).convert("L")) / 255
-    same(found(tmp_path, make(lossy)), between(2, 1 / 8, gray))
-
-
-@each_of_android
-def test_a_map_without_a_unit_keeps_a_plausible_scale(tmp_path: Path, make: Callable[..., bytes]) -> None:
-    """And gets one where its own is not."""
-    depth = found(tmp_path, make(png(codes()), Range(0.5, 8, unit="parsec")))
-    same(depth, INVERSE)
-    assert depth.note.endswith("Depth, unit unknown)")
+def test_a_map_without_a_unit_gets_a_plausible_scale(tmp_path: Path, make: Callable[..., bytes]) -> None:
     factor = 3 / float(torch.from_numpy(INVERSE).median())
     for said in (Range(50, 800, unit=None), Range(0.005, 0.08, unit="Diopters")):  # the latter is a Pixel's habit
         depth = found(tmp_path, make(png(codes()), said))
@@ -191,7 +173,6 @@ def test_a_map_without_a_unit_keeps_a_plausible_scale(tmp_path: Path, make: Call
         assert depth.note.endswith("Depth, unit unknown, scaled to a median of 3 m)")
     linear = found(tmp_path, make(png(codes()), Range(50, 800, "RangeLinear", unit=None)))
     assert linear.quantum == pytest.approx(float(linear.depth.max() - linear.depth.min()) / 255, rel=1e-5)
-    same(found(tmp_path, make(png(codes()), Range(50, 800))), 100 * INVERSE)
 
 
 def test_distances_along_the_ray_become_depth(tmp_path: Path) -> None:
@@ -283,7 +264,8 @@ def _check_lens(depth: DepthMap, orientation: int) -> None:
     before = [upright(ray, orientation) for ray in ((x + 0.5 - 10) / 35, (y + 0.5 - 15) / 25)]
     columns, rows = upright(x, orientation), upright(y, orientation)
     v, u = np.mgrid[: depth.depth.shape[0], : depth.depth.shape[1]] + 0.5
-    K = np.array(lens_of(depth))
+    assert depth.K is not None
+    K = depth.K.numpy()
     for axis, ray in ((1, (u - K[0, 2]) / K[0, 0]), (0, (v - K[1, 2]) / K[1, 1])):
         along = np.diff(columns, axis=axis).mean(), np.diff(rows, axis=axis).mean()  # one is ±1, the other 0
         np.testing.assert_allclose(ray, along[0] * before[0] + along[1] * before[1], atol=1e-5)
@@ -349,7 +331,7 @@ def test_maps_that_are_cut_off_damaged_or_do_not_say_what_they_mean(tmp_path: Pa
         (portraits.apple_jpeg(codes(), apple_xmp(ends=(1e-320, 1e-310))), "no pixel with a depth"),
         (portraits.apple_jpeg(codes(), unsaid), "does not say its range"),
         (portraits.apple_jpeg(codes(), empty), "a number of its range makes no sense"),
-        (portraits.gdepth_jpeg(b"", text="****"), "not readable as base64"),
+        (portraits.gdepth_jpeg(b"", text="****"), "cannot be decoded"),
         (portraits.gdepth_jpeg(broken), "cannot be decoded"),
         (portraits.dynamic_jpeg(broken), "cannot be decoded"),
         (portraits.gdepth_jpeg(b"GIF89a" + image), "cannot be decoded"),
@@ -461,9 +443,9 @@ def test_huge_announced_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
-    start = time.perf_counter()
-    fill = b"\xff\xd8\xff" + b"\xff" * 1_000_000
-    tiny = b"\xff\xd8" + b"\xff\xe5\x00\x02" * 300_000
+    start = time.process_time()
+    fill = b"\xff\xd8\xff" + b"\xff" * 300_000
+    tiny = b"\xff\xd8" + b"\xff\xe5\x00\x02" * 100_000
     scans = portraits.dynamic_jpeg(png(codes()))
     scans = scans.replace(b"\xff\xd9", b"\xff\xda\x00\x02" * 500_000)
     places = portraits.full(b"iloc", b"\0\0\xff\xff" + b"\0\x09\0\0\xff\xff" * 60_000)  # numbers of no length
@@ -475,7 +457,7 @@ def test_nothing_in_a_file_makes_the_search_endless(tmp_path: Path) -> None:
             load_photo_depth(path)
         except InputError:
             continue
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
 
 
 # Bytes of chance.

@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 from stand_in import StandIn, predict, write_model
 
 import spackle
+from spackle.bases import BasePrediction, Progress
 from spackle.bases.hf import HfBase
-from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.sharp import SharpBase
 from spackle.dataset.shards import load_manifest
 from spackle.device import MemoryShort

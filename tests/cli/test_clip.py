@@ -10,9 +10,9 @@ import torch
 from scenes import box_before_wall, cast
 from torch import Tensor
 
+from spackle.bases import BasePrediction
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.clips.complete import ClipCompleter, CompletedView
 from spackle.clips.temporal import DepthAlignment, Track, align_depth, extend_flow, flicker, pixel_grid, sample

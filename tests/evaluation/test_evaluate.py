@@ -22,9 +22,9 @@ from evaluation_data import Figures, fake_pyiqa, results, write_boxes
 from scenes import box_before_wall, shifted
 from torch import Tensor
 
+from spackle.bases import BasePrediction
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import BaseError
-from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset

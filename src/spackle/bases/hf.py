@@ -18,9 +18,9 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from spackle.bases import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
-from spackle.bases.protocol import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, reading, reason_in_a_line

@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from spackle._numba import kernel
+from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import Bools, Floats, color_change, find_edges, sample, settle
-from spackle.bases.protocol import BasePrediction, Progress
 from spackle.bases.quadtree import LEVELS
 from spackle.bases.splats import layered_gaussians
 from spackle.camera import Camera

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad, relu, relu6
 
+from spackle.bases import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
-from spackle.bases.protocol import NEAREST_M, BasePrediction, Progress, nearest
 from spackle.device import own_arithmetic, pick_device
 from spackle.errors import InputError
 from spackle.image import Photo, resize_photo
@@ -177,9 +177,8 @@ def load_networks(path: str | os.PathLike[str]) -> list[LiteNet]:
 
 
 def _network(tensors: dict[str, Tensor], path: str | os.PathLike[str]) -> LiteNet:
-    last = tensors.get(LAST)
-    for size, stages in STAGES.items():
-        if last is not None and last.shape == (stages[-1][-1],):
+    for size, widths in WIDTHS.items():
+        if LAST in tensors and tensors[LAST].shape == (widths[-1],):
             return load_strict(LiteNet(size), tensors, path, ADVICE, prepare=channels_last)
     raise InputError(f"{path}: another network's weights: {LAST} is missing or of another length: {ADVICE}")
 
@@ -237,12 +236,8 @@ class LiteBase:
     def load(cls, path: Path | None = None, *, device: str | None = None) -> LiteBase:
         """Read the networks in a file that lite's training wrote, the package's own by default.
 
-        Args:
-            path: the file; those of its networks are asked that `INPUT_SCALES` counts.
-            device: cpu or a CUDA device; where None, CUDA if it is there.
-
-        Raises:
-            InputError: a file or device that cannot be used.
+        The device is cpu or a CUDA one; where None, CUDA if it is there. InputError for a file or device that cannot
+        be used.
         """
         target = pick_device(device)
         return cls(load_networks(path or SHIPPED), target)
@@ -273,11 +268,9 @@ class LiteBase:
     def at_scales(self, rgb: Tensor, scales: Sequence[InputScale]) -> Tensor:
         """[n, h, w] the logarithm of inverse depth of a photo [H, W, 3] at each of n scales, as fine as the last."""
         picture = rgb.float().permute(2, 0, 1)[None].to(self.device)
-        outputs = [self._ask(picture, scale) for scale in scales]
-        finest = outputs[-1].shape
-        return torch.cat([interpolate(scale[None, None], size=finest, mode="bilinear") for scale in outputs])[
-            :, 0
-        ].cpu()
+        outputs = [self._ask(picture, scale)[None, None] for scale in scales]
+        finest = outputs[-1].shape[2:]
+        return torch.cat([interpolate(output, size=finest, mode="bilinear")[0] for output in outputs]).cpu()
 
     def _ask(self, picture: Tensor, scale: InputScale) -> Tensor:
         """[h/2, w/2] log inverse depth of a photo [1, 3, H, W] that is seen at (h, w)."""
@@ -285,9 +278,8 @@ class LiteBase:
         seen = interpolate(picture, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         ways = torch.cat([seen, seen.flip(-1)]) if scale.mirrored else seen
         with own_arithmetic(self.device):
-            outputs = self.networks[scale.network](ways.contiguous(memory_format=torch.channels_last))
-        straight, *mirrored = outputs.float()
-        return torch.stack([straight, *(one.flip(-1) for one in mirrored)]).mean(0)
+            outputs = self.networks[scale.network](ways.contiguous(memory_format=torch.channels_last)).float()
+        return torch.stack([outputs[0], outputs[1].flip(-1)]).mean(0) if scale.mirrored else outputs[0]
 
 
 def merged(outputs: Tensor, tilt: Sequence[bool]) -> Tensor:

@@ -13,16 +13,14 @@ import functools
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import Any
 
-from spackle.bases import lite
+from spackle.bases import Base, BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lift import RgbdBase
+from spackle.bases.lite import LiteBase
 from spackle.bases.photo_depth.layouts import load_photo_depth
-from spackle.bases.protocol import Base, BasePrediction, Progress
-from spackle.bases.settings import AUTO, HF, MISSING, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
+from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
 from spackle.bases.sharp.base import SharpBase
 from spackle.device import MemoryShort
 from spackle.errors import InputError
@@ -32,33 +30,20 @@ from spackle.weights import check_undamaged
 
 LOG = logging.getLogger("spackle")
 Log = Callable[[str], None]
-Load = Callable[[Photo, Depth], Base | None]  # None: this photo or this machine has none
 Stage = Callable[[str], AbstractContextManager[Progress]]
-NO_DEPTH = (
-    "--base rgbd needs depth, and there is none in the photo: give --depth FILE, or --depth FOLDER for many photos"
-)
-ORDER = {  # of `auto`: the candidate's title, and the reason to go on without it
+ORDER = {  # of `auto`: what a candidate is called in reports and the log, and the reason to go on where there is none
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
     "depth": ("Depth Anything", "no Depth Anything here"),
     "lite": ("lite", ""),
 }
+NO_DEPTH = (
+    "--base rgbd needs depth, and there is none in the photo: give --depth FILE, or --depth FOLDER for many photos"
+)
 
 
 class BaseError(InputError):
     """The base of all photos cannot be used: trying another photo or another base is pointless."""
-
-
-@dataclasses.dataclass
-class Candidate:
-    """A base that photos may get."""
-
-    name: str
-    title: str  # in reports and the log
-    load: Load
-    absence: str = ""  # the reason to go on when there is none
-    shared: bool = True  # by all photos: if it cannot be loaded for one, it cannot for any
-    short: bool = False  # of memory, the last time
 
 
 def open_base(settings: BaseSettings) -> OpenedBase:
@@ -67,49 +52,34 @@ def open_base(settings: BaseSettings) -> OpenedBase:
     InputError for an option that the base cannot use, or a missing file.
     """
     settings.check()
-    files, named = settings.files, settings.named
-    prints = {name: fingerprint(file, "file of weights") for name, file in files.items()}
-
-    def candidate(name: str, title: str, absence: str = "") -> Candidate:
-        if name == RGBD:
-            return Candidate(name, title, functools.partial(_lift, settings), absence, shared=False)
-        load = functools.cache(functools.partial(_load_network, name, settings, files, prints))
-        return Candidate(name, title, lambda photo, depth: load(), absence)
-
-    if named == AUTO:
-        return OpenedBase([candidate(name, *words) for name, words in ORDER.items()], prints)
-    why = f"--base {named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
-    return OpenedBase([candidate(named, why)], prints)
+    why = f"--base {settings.named}" if settings.name != AUTO else "--depth" if settings.depth is not None else "-c"
+    candidates = ORDER if settings.named == AUTO else {settings.named: (why, "")}
+    return OpenedBase(candidates, settings, _fingerprints(settings), {})
 
 
 def open_loaded(base: Base) -> OpenedBase:
     """A base that a program has loaded."""
-    return OpenedBase([Candidate(base.name, "loaded", lambda photo, depth: base)], {})
+    return OpenedBase({base.name: ("loaded", "")}, BaseSettings(), {}, {base.name: base})
 
 
-def _load_network(
-    name: str, settings: BaseSettings, files: Mapping[str, Path], prints: Mapping[str, str]
-) -> Base | None:
-    """A network, None if it is not installed; BaseError if its files have changed since the base was opened."""
+def _fingerprints(settings: BaseSettings) -> dict[str, str]:
+    return {name: fingerprint(file, "file of weights") for name, file in settings.files.items()}
+
+
+def _load_network(name: str, settings: BaseSettings) -> Base | None:
+    """A network, None if it is not installed."""
     device, precision = None if settings.device == "auto" else settings.device, settings.precision
-    file = files.get(name)
-    if name in MISSING and file is not None:
-        check_undamaged(file)
-    base: Base
     if name.startswith(HF):
-        base = HfBase.load(name.removeprefix(HF), device=device, precision=precision)
-    elif name == "lite":
-        base = lite.LiteBase.load(settings.checkpoint, device=device)
-    elif file is None:
+        return HfBase.load(name.removeprefix(HF), device=device, precision=precision)
+    if name == "lite":
+        return LiteBase.load(settings.checkpoint, device=device)
+    if (file := settings.files.get(name)) is None:
         return None
-    elif name == "depth":
-        base = HfBase.load(str(file.parent), device=device, precision=precision, name=name)
-    else:
-        speed: dict[str, Any] = {"windows": settings.windows, "compiled": settings.compiled}
-        base = SharpBase.load(file, precision=precision, device=device, **speed)
-    if {name: fingerprint(file, "file of weights") for name, file in settings.files.items()} != prints:
-        raise BaseError(f"{', '.join(map(str, files.values()))}: changed while this was running: start again")
-    return base
+    check_undamaged(file)
+    if name == "depth":
+        return HfBase.load(str(file.parent), device=device, precision=precision, name=name)
+    windows, compiled = settings.windows, settings.compiled
+    return SharpBase.load(file, precision=precision, windows=windows, compiled=compiled, device=device)
 
 
 def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
@@ -153,9 +123,18 @@ def _untimed(stage: str) -> Iterator[Progress]:
 class OpenedBase:
     """Turns photos into Gaussians. The first photo that needs a network loads it for all others."""
 
-    def __init__(self, candidates: list[Candidate], fingerprints: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        candidates: Mapping[str, tuple[str, str]],
+        settings: BaseSettings,
+        fingerprints: Mapping[str, str],
+        loaded: dict[str, Base | None],
+    ) -> None:
+        """`candidates` are as `ORDER`; `loaded` networks are not loaded again."""
         self.candidates, self.fingerprints = candidates, fingerprints
-        self.notes: set[str] = set()  # on earlier photos' choices
+        self._settings, self._loaded = settings, loaded
+        self._failed: dict[str, tuple[str, bool]] = {}  # for all photos: the reason, and whether memory was short
+        self._notes: set[str] = set()  # on earlier photos' choices
 
     def predict(
         self, photo: Photo, depth: Depth = None, *, log: Log = LOG.warning, stage: Stage = _untimed
@@ -175,12 +154,15 @@ class OpenedBase:
         reasons, failures, lasting = list[str](), list[str](), True
         with contextlib.ExitStack() as stages:
             stages.enter_context(stage("prepare"))
-            for candidate in self.candidates:
-                base = None
+            for name, (title, absence) in self.candidates.items():
+                base: Base | None = None
                 try:
-                    if (base := candidate.load(photo, depth)) is None:
-                        reasons.append(candidate.absence)
-                        lasting &= not candidate.short
+                    if name not in self._failed:
+                        base = self.load(photo, depth, name)
+                    if base is None:
+                        reason, short = self._failed.get(name, (absence, False))
+                        reasons.append(reason)
+                        lasting &= not short
                         continue
                     stages.close()
                     prediction = base.predict(photo, stages.enter_context(stage("base")))
@@ -189,38 +171,46 @@ class OpenedBase:
                         raise InputError(f"{photo.path}: {problem}")
                     break
                 except InputError as error:
-                    short = isinstance(error, MemoryShort)
-                    for_good = candidate.shared and (base is None or short)  # another photo does not help
+                    short, shared = isinstance(error, MemoryShort), name != RGBD or name in self._loaded
+                    for_good = shared and (base is None or short)  # another photo does not help
                     if for_good and len(self.candidates) == 1:
                         raise BaseError(str(error)) from error
-                    if candidate is self.candidates[-1] or isinstance(error, BaseError):
+                    if name == list(self.candidates)[-1] or isinstance(error, BaseError):
                         raise
-                    reasons.append(f"{candidate.title} cannot be used")
-                    failures.append(f"{candidate.title}: {error}")
+                    reasons.append(f"{title} cannot be used")
+                    failures.append(f"{title}: {error}")
                     lasting &= not short
-                    log(f"{photo.path.name}: going on without {candidate.title}: {error}")
-                    if for_good:  # frees a loaded network, too
-                        candidate.load, candidate.absence, candidate.short = (
-                            lambda photo, depth: None,
-                            reasons[-1],
-                            short,
-                        )
-        why = ", ".join(reasons) or candidate.title
-        note = f"base {candidate.name} ({why})" + (f": {ROUGH}" if candidate.name == "lite" else "")
-        new = len(self.candidates) > 1 and note not in self.notes
-        self.notes.add(note)
-        return prediction, ResolvedBase(candidate.name, why, tuple(failures), lasting, note if new else "")
+                    log(f"{photo.path.name}: going on without {title}: {error}")
+                    if for_good:
+                        self._failed[name] = reasons[-1], short
+                        self._loaded.pop(name, None)  # frees its memory
+        why = ", ".join(reasons) or title
+        note = f"base {name} ({why})" + (f": {ROUGH}" if name == "lite" else "")
+        new = len(self.candidates) > 1 and note not in self._notes
+        self._notes.add(note)
+        return prediction, ResolvedBase(name, why, tuple(failures), lasting, note if new else "")
 
-    def load(self, photo: Photo) -> Base:
-        """The base that a person named, before its first prediction; raises as `predict` does."""
-        (candidate,) = self.candidates
-        try:
-            base = candidate.load(photo, None)
-        except InputError as error:
-            raise (BaseError(str(error)) if candidate.shared else error) from error
-        assert base is not None
-        return base
+    def load(self, photo: Photo, depth: Depth = None, name: str | None = None) -> Base | None:
+        """A candidate, the first where none is named, for a photo; None where this photo or this machine has none.
+
+        InputError where it cannot be loaded; BaseError where it is the only one, or its files have changed.
+        """
+        name = name or next(iter(self.candidates))
+        if name == RGBD and name not in self._loaded:
+            return _lift(self._settings, photo, depth)
+        if name not in self._loaded:
+            try:
+                self._loaded[name] = _load_network(name, self._settings)
+            except InputError as error:
+                if len(self.candidates) > 1:
+                    raise
+                raise BaseError(str(error)) from error
+            if _fingerprints(self._settings) != self.fingerprints:
+                files = ", ".join(map(str, self._settings.files.values()))
+                raise BaseError(f"{files}: changed while this was running: start again")
+        return self._loaded[name]
 
     def only(self, choice: ResolvedBase) -> OpenedBase:
         """The chosen base for all further photos, such as the frames of a clip, without a fallback."""
-        return OpenedBase([c for c in self.candidates if c.name == choice.base], self.fingerprints)
+        chosen = {choice.base: self.candidates[choice.base]}
+        return OpenedBase(chosen, self._settings, self.fingerprints, self._loaded)

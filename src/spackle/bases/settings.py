@@ -28,8 +28,8 @@ KINDS = {  # the description below tables, and the options that only some bases 
     "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
     AUTO: ("", ("--calib", "--precision", "--sharp")),  # for the base that it chooses
 }
-HF_SETTINGS = ("config.json", "preprocessor_config.json", "processor_config.json")
-HF_WEIGHTS = ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
+HF_FILES: tuple[str, ...] = ("config.json", "preprocessor_config.json", "processor_config.json")
+HF_FILES += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
 Depth = Path | DepthMap | None  # of a photo; a path may be a folder of depth maps named as the photos
 
 
@@ -39,7 +39,7 @@ def _download(name: str) -> str:
 
 ROUGH = f"rough geometry; for better: --depth FILE, {_download('depth')}, or {_download('sharp')}"
 MISSING = {  # what to do without the weights of a base
-    "sharp": f"no weights on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
+    "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
     "depth": f"not on this machine: {_download('depth')} downloads it",
 }
 
@@ -100,12 +100,7 @@ class BaseSettings:
     def files(self) -> dict[str, Path]:
         """Existing weight files that decide the predictions, by the base's name; those in a folder by their own."""
         if self.folder is not None:
-            return {
-                file.name: file
-                for p in (*HF_SETTINGS, *HF_WEIGHTS)
-                for file in sorted(self.folder.glob(p))
-                if file.is_file()
-            }
+            return {file.name: file for p in HF_FILES for file in sorted(self.folder.glob(p)) if file.is_file()}
         names = AUTO_NETWORKS if self.named == AUTO else (self.named,)
         found = {name: self.checkpoint or _weights_here(name) for name in names}
         return {name: file for name, file in found.items() if file is not None}

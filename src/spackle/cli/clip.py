@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
-from spackle.bases.protocol import BasePrediction
 from spackle.cli.photo import PredictOptions, shared_report
 from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip

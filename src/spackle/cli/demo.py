@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 from torch import Tensor
 
-from spackle.bases.protocol import BasePrediction
+from spackle.bases import BasePrediction
 from spackle.bases.settings import BaseSettings
 from spackle.cli.photo import save_views
 from spackle.cli.photos import compiled_ahead

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 import spackle
+from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
-from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.errors import InputError
 from spackle.files import write_json

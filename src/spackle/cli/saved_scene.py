@@ -15,7 +15,7 @@ import torch
 from rich.filesize import decimal
 from torch import Tensor
 
-from spackle.bases.protocol import USUAL_DISPARITY
+from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import PathError
 from spackle.errors import InputError

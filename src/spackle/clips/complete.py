@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import BasePrediction
+from spackle.bases import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, TrajectoryKind, view_at
 from spackle.clips.temporal import (

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import BasePrediction
+from spackle.bases import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.filters import far_fill

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from spackle.bases.protocol import BasePrediction
+from spackle.bases import BasePrediction
 from spackle.bases.sharp.base import unused_shapes
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork

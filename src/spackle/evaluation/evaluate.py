@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from spackle.bases.protocol import BasePrediction
+from spackle.bases import BasePrediction
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows

@@ -10,8 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from spackle.bases import BasePrediction
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError, reason_in_a_line

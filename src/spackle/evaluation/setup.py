@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 import spackle
+from spackle.bases import BasePrediction
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
-from spackle.bases.protocol import BasePrediction
 from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY
 from spackle.device import PRECISIONS, pick_dtype

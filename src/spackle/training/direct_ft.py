@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from spackle.bases.settings import MISSING
 from spackle.bases.sharp.base import Owner, decoder_bytes, link_owner, load_network, owner_of, to_square, usual_windows
 from spackle.bases.sharp.encoder import set_precision
 from spackle.bases.sharp.network import DecoderInput, SharpNetwork, compose
@@ -209,10 +210,7 @@ def _find_owner(checkpoint: Path | None) -> Owner:
     """The checkpoint that learns, checked by the published digest where it was downloaded."""
     path = checkpoint or installed("sharp")
     if path is None:
-        raise InputError(
-            "--method direct-ft: no weights of SHARP on this machine: `spackle weights get sharp` downloads them "
-            "(2.8 GB, for research only), -c FILE takes a local copy"
-        )
+        raise InputError(f"--method direct-ft: {MISSING['sharp']}")
     read_tensors(path, "give SHARP's checkpoint")  # refuses what is none, and reads no numbers yet
     if owner_of(path) is not None:
         raise InputError(f"-c {path}: a decoder that was trained already: give the checkpoint that it was trained on")

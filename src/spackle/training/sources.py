@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
+from spackle.bases import BasePrediction
 from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
-from spackle.bases.protocol import BasePrediction
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
 from spackle.dataset.shards import DatasetFiles

@@ -192,8 +192,6 @@ def _decoding() -> Iterator[None]:
     """BrokenDepth for whatever a decoder raises over a stranger's bytes."""
     try:
         yield
-    except BrokenDepth:
-        raise
     except Exception as error:
         raise BrokenDepth(f"cannot be decoded ({reason_in_a_line(error)})") from error
 
@@ -292,10 +290,8 @@ def _find_android(data: bytes, main: bytes, extended: bytes, complete: bool) -> 
     if text is None:  # editors that drop the extended XMP leave the rest behind: a photo whose depth is gone has none
         return None
     squeezed = "".join(text.split())
-    try:
+    with _decoding():
         picture = base64.b64decode(squeezed + "=" * (-len(squeezed) % 4), validate=True)
-    except ValueError as error:
-        raise BrokenDepth(f"is not readable as base64 ({error})") from error
     return _coded(tree, GDEPTH, picture, "GDepth", None)
 
 
@@ -375,15 +371,13 @@ def _find_in_heif(data: bytes) -> CodedDepth | None:
         return None
     xmp, turned, turn = item
     with _decoding():
-        images = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"]
-        if not images:
-            raise BrokenDepth("is announced, but missing")
-        width, height = images[0].size
+        image = pillow_heif.open_heif(io.BytesIO(data), hdr_to_16bit=False).info["depth_images"][0]
+        width, height = image.size
         check_pixels(width, height, len(data), "it")
-        codes, full = np.array(images[0]), FULL_CODES[images[0].mode]  # its own rotation is applied
+        codes, full = np.array(image), FULL_CODES[image.mode]  # its own rotation is applied
     scale, lens, source = describe(xmp) or (None, None, "")
     if scale is None:  # Apple's words count more than HEVC's
-        scale, source = _hevc_scale(images[0].info.get("metadata") or {})
+        scale, source = _hevc_scale(image.info.get("metadata") or {})
     return CodedDepth(codes, full, scale, source, lens, turned, turn)
 
 

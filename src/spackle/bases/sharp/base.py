@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases.protocol import BasePrediction, Progress
+from spackle.bases import BasePrediction, Progress
 from spackle.bases.sharp.encoder import CONFIGS, WINDOWS, SharpConfig, set_precision
 from spackle.bases.sharp.network import (
     GROUPS,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
 
-from spackle.bases.protocol import Progress
+from spackle.bases import Progress
 from spackle.network_file import channels_last
 
 LAYERS = 2  # of Gaussians: the visible surface, and what may be behind it

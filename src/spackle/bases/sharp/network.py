@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d, softplus
 
-from spackle.bases.protocol import Progress
+from spackle.bases import Progress
 from spackle.bases.sharp.encoder import (
     LAYERS,
     STRIDE,
