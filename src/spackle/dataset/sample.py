@@ -90,6 +90,7 @@ class PhotoGroup:
     key: str
     files: Mapping[str, bytes]
     facts: Mapping[str, Any]  # KEY.json
+    holes: tuple[float, ...]  # HAR of each view (paper, eq. 11)
     where: str  # for messages
 
     @staticmethod
@@ -106,23 +107,13 @@ class PhotoGroup:
                 files[member.name] = data[begin : begin + member.size]
                 at = begin + member.size + -member.size % tarfile.BLOCKSIZE
             facts = json.loads(files[f"{key}.json"])
-            if not isinstance(facts["photo"]["name"], str) or not isinstance(facts["trajectory"]["kind"], str):
-                raise TypeError("its photo or its path has no name")
-            for view in facts["views"]:
-                near, far = view["depth_range"]
-                if not (0 <= float(view["hole"]) <= 1 and SMALLEST_SCALE <= float(near) <= float(far) < math.inf):
-                    raise ValueError("a view's holes or depths make no sense")
-        return PhotoGroup(key, files, facts, where)
+            holes = tuple(float(view["hole"]) for view in facts["views"])
+        return PhotoGroup(key, files, facts, holes, where)
 
     @property
     def views(self) -> int:
         """How many there are."""
-        return len(self.facts["views"])
-
-    @property
-    def holes(self) -> tuple[float, ...]:
-        """HAR of each view (paper, eq. 11)."""
-        return tuple(float(view["hole"]) for view in self.facts["views"])
+        return len(self.holes)
 
     def view(self, index: int, *, with_base: bool = False) -> DatasetView:
         """Decode one view; InputError where a file of it is missing or damaged."""

@@ -51,13 +51,6 @@ class ShardEntry(BaseModel, frozen=True, extra="forbid", strict=True):
     samples: tuple[SampleEntry, ...]
     passed_over: tuple[str, ...] = ()  # photos that gave no sample, and why
 
-    @model_validator(mode="after")
-    def _filled(self) -> ShardEntry:
-        *offsets, end = itertools.accumulate((sample.size for sample in self.samples), initial=0)
-        if [sample.offset for sample in self.samples] != offsets or self.size != end + len(END):
-            raise ValueError("samples that do not fill their shard")
-        return self
-
 
 Place = tuple[ShardEntry, SampleEntry]
 
