@@ -234,7 +234,7 @@ def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, ki
     ("words", "message"),
     [
         ((), "Missing option '--dataset'"),
-        (("one", "--dataset", "middlebury", "--runs", "0"), "--runs must be between"),
+        (("one", "--dataset", "middlebury", "--runs", "0"), "Invalid value for '--runs'"),
         (("one", "two", "--dataset", "middlebury"), "two: a word of no option"),
         (("one", "--dataset", "middlebury", "--root", "two"), "one: a word of no option"),
         (("--dataset", "middlebury", "--base", "rgbd", "--root", "gone"), "gone: no such folder"),

@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 import socket
+import statistics
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ from spackle.evaluation.folder import load_run
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import DEFINITIONS, NOT_INSTALLED, open_metrics, psnr, reduction, ssim_average, ssim_map
 from spackle.evaluation.protocols import Gauges, large_views, measure_views
-from spackle.evaluation.rows import Mean, Row, mean, median, pivot
+from spackle.evaluation.rows import Mean, Row, mean, pivot
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.table import Table, mark_best, write_table
@@ -186,7 +187,11 @@ def test_what_does_not_go_together_and_means_of_nan() -> None:
             make_tables([one, second])
     rows = [Row("d", "a", "near", str(k), "base", "psnr", v) for k, v in enumerate((10.0, None, 30.0, 20.0))]
     values = pivot(rows, "method", "metric")["base", "psnr"]
-    assert (mean(values), median(values), mean([None])) == (Mean(20.0, 1), Mean(20.0, 1), Mean(None, 1))
+    assert (mean(values), mean([10.0, None, 12.0, 99.0], statistics.median), mean([None])) == (
+        Mean(20.0, 1),
+        Mean(12.0, 1),
+        Mean(None, 1),
+    )
 
 
 def test_a_table_as_markdown_and_latex() -> None:
@@ -197,8 +202,6 @@ def test_a_table_as_markdown_and_latex() -> None:
     assert r"\caption{Ours \& theirs, 5 \%. n.}" in text
     assert " & \\multicolumn{2}{c}{both} \\\\\n\\cmidrule(lr){2-3}" in text
     assert "x\\_1 & \\textbf{1} & a|b \\\\\n\\midrule\n & 2 & $\\pm$$<$3 \\\\" in text
-    with pytest.raises(ValueError, match="different lengths"):
-        Table("t", "", "", [("", "A")], [[("1", "2")]])
     assert mark_best([1.0, None, 2.0], ["1", "", "2"], lower=True) == ["**1**", "", "2"]
     assert mark_best([1.0, 1.0001], ["1.0", "1.0"], lower=False) == ["1.0", "1.0"]
     assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
@@ -457,7 +460,7 @@ def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) ->
         (("--disparity", "0.3", "3"), "up to 2"),
         (("--methods", "direct-ft"), "add --base sharp"),
         (("--methods", ","), "none is given"),
-        (("--limit", "0"), "--limit must be between"),
+        (("--limit", "0"), "Invalid value for '--limit'"),
         (("--direct-ft", "x.safetensors"), "no method takes it"),
         (("--residual", "none"), "--residual none"),
         (("-c", "x.pt"), "-c x.pt: the rgbd base has no use for it"),

@@ -26,7 +26,7 @@ NUMBER = re.compile(r"[\d.,]+")
 UNFIT = re.compile(r"[^\w.-]+")  # in the name of a folder
 
 # Options that both commands have.
-Limit = Annotated[int | None, typer.Option(help="So many images, spread over the dataset.")]
+Limit = Annotated[int | None, typer.Option(min=1, max=1_000_000, help="So many images, spread over the dataset.")]
 _DATASET = typer.Option(
     metavar="NAME", help="middlebury, booster, wildrgbd, tanks, eth3d, llff: an unknown one lists all."
 )
@@ -147,9 +147,10 @@ def bench(
     sharp: SharpOption = None,
     residual: Residual = None,
     limit: Limit = None,
-    runs: Annotated[int, typer.Option(help="How often everything behind the base is timed.")] = 5,
+    runs: Annotated[int, typer.Option(min=1, max=1000, help="How often everything behind the base is timed.")] = 5,
     base_runs: Annotated[
-        int | None, typer.Option(help="How often the base is timed. [default: 1 for sharp, else as --runs]")
+        int | None,
+        typer.Option(min=1, max=1000, help="How often the base is timed. [default: 1 for sharp, else as --runs]"),
     ] = None,
     device: DeviceOption = "auto",
     output: Output = None,

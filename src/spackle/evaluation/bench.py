@@ -19,7 +19,6 @@ from spackle.bases.sharp.base import unused_shapes
 from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
-from spackle.errors import InputError
 from spackle.evaluation.case import Case, Viewpoint, load_case
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
 from spackle.evaluation.protocols import large_views
@@ -37,7 +36,6 @@ from spackle.scene_fill import FillContext, fill_view
 
 FILES = ("bench.md", "bench.tex")
 SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
-MAX_RUNS = 1000
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")
@@ -60,9 +58,6 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         InputError: options, a dataset or a folder that cannot be used; another benchmark in `output`; too little
             memory for the base.
     """
-    for name, value in (("--runs", runs), ("--base-runs", base_runs)):
-        if value is not None and not 1 <= value <= MAX_RUNS:
-            raise InputError(f"{name} must be between 1 and {MAX_RUNS}, got {value}")
     evaluation, slow = open_evaluation(options), options.base.named == "sharp"
     device = options.device if options.base.network else torch.device("cpu")
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": ["spackle"]}

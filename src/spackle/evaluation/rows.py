@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -57,16 +56,10 @@ class Mean(NamedTuple):
     bad: int  # views whose figure was not finite: they are left out, and counted
 
 
-def mean(values: Sequence[Value]) -> Mean:
-    """The mean of the finite values."""
+def mean(values: Sequence[Value], of: Callable[[list[float]], float] = statistics.fmean) -> Mean:
+    """The mean of the finite values, or another figure of them, such as `statistics.median`."""
     known = [float(value) for value in values if value is not None]
-    return Mean(math.fsum(known) / len(known) if known else None, len(values) - len(known))
-
-
-def median(values: Sequence[Value]) -> Mean:
-    """The median of the finite values, as `mean` has the mean."""
-    known = [float(value) for value in values if value is not None]
-    return Mean(statistics.median(known) if known else None, len(values) - len(known))
+    return Mean(of(known) if known else None, len(values) - len(known))
 
 
 def pivot(rows: Iterable[Row], *columns: str) -> dict[tuple[str, ...], list[Value]]:

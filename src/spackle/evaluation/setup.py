@@ -33,7 +33,6 @@ from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
-MAX_LIMIT = 1_000_000
 MAX_DISPARITIES = 6  # columns of a table
 
 
@@ -102,8 +101,6 @@ class EvaluateOptions:
                 raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
         elif self.direct_ft is not None:
             raise InputError(f"--direct-ft {self.direct_ft}: no method takes it: add direct-ft to --methods")
-        if self.limit is not None and not 1 <= self.limit <= MAX_LIMIT:
-            raise InputError(f"--limit must be between 1 and {MAX_LIMIT}, got {self.limit}")
         if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
             raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
         for value in self.disparities:

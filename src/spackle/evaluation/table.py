@@ -10,7 +10,6 @@ from typing import Literal
 
 EMPTY = ""  # not run, or nothing that could be
 NOT_RUN = "not run"  # of a whole row
-PAPER = "(paper)"  # ends what a row of the paper's figures is called
 BEST = "**"  # around a cell's text
 Cells = Sequence[str]
 Text = Callable[[float], str]
@@ -27,11 +26,6 @@ class Table:
     bodies: Sequence[Sequence[Cells]]  # rows, in groups with a rule between them
     words: int = 1  # columns of text on the left; where there are two, the first one names a group in its first row
     notes: Sequence[str] = ()
-
-    def __post_init__(self) -> None:
-        widths = {len(cells) for rows in self.bodies for cells in rows} | {len(self.heads)}
-        if len(widths) > 1:
-            raise ValueError(f"table {self.label}: rows of different lengths: {sorted(widths)}")
 
 
 def _ratio(value: float) -> str:

@@ -30,7 +30,6 @@ from spackle.evaluation.rows import (
     images_text,
     load_data,
     mean,
-    median,
     paper_rows,
     pivot,
     setting_title,
@@ -224,7 +223,7 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
     def find(method: str, setting: str, metric: str) -> Mean | None:
         """Derived figures, too; what is known of images alone is all methods'."""
         if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
-            return (median if metric in TIMES else mean)(values)
+            return mean(values, statistics.median if metric in TIMES else statistics.fmean)
         if metric in REDUCED:
             of, figure, after = REDUCED[metric]
             base, left = find(of or method, setting, figure), find(method, setting, after)
