@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -180,9 +181,13 @@ def test_files_that_are_neither_scene_nor_photo(tmp_path: Path, name: str, conte
 def test_bad_options(tmp_path: Path, target: str) -> None:
     write_photo(tmp_path / "photo.png")
     save_ply(box_before_wall().base(), tmp_path / "scene.ply")
-    bad = {"--base": "shrap", "--disparity": "7", "--fov": "200", "--depth": "none.npy", "--port": "70000"}
-    for option, value in {**bad, "--host": "no.such.host.invalid"}.items():
-        refuses(run("view", tmp_path / target, option, value), value if option == "--depth" else option)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        bad = ["--base shrap", "--disparity 7", "--fov 200", "--depth none.npy", f"--port {taken.getsockname()[1]}"]
+        for option in (*bad, "--port 70000", "--port -1", "--host no.such.host.invalid", "--host 192.0.2.1"):
+            name, value = option.split()
+            refuses(run("view", tmp_path / target, name, value), value if name == "--depth" else name)
 
 
 def test_it_ends_at_once_whatever_it_is_at(tmp_path: Path) -> None:

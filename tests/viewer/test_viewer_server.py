@@ -17,7 +17,6 @@ from typing import Any
 import pillow_heif
 import pytest
 from viewer_client import (
-    PAGES,
     PHOTO,
     QUICK,
     a_scene,
@@ -188,13 +187,6 @@ def test_a_token_is_asked_for_on_every_request() -> None:
     assert "s3cret" not in "".join(lines)
 
 
-def test_where_nothing_can_listen_the_option_is_named(server: ViewerServer) -> None:
-    hosts: list[Any] = [("host", host) for host in ("192.0.2.1", "no.such.host.invalid")]
-    for option, value in [*(("port", port) for port in (-1, 65536, server.port)), *hosts]:
-        with pytest.raises(InputError, match=f"^--{option} {value}: "):
-            ViewerServer(PAGES, complete, **{option: value})
-
-
 def test_closing_tells_listeners_and_removes_the_photo() -> None:
     reached, lines = threading.Event(), list[str]()
 
@@ -248,8 +240,7 @@ def test_a_photo_becomes_the_scene_that_is_shown() -> None:
         assert events(server, "/jobs/2")[-1] == {"ready": "/scenes/2.json"}
         assert ask(server, "/scenes/2/base.bin").body == PHOTO
         description = ask(server, "/scenes/2.json")
-        assert not {b"<", b"&"} & set(description.body.split())
-        assert description.json["name"] == "<b>&.png"
+        assert (b"<" in description.body, description.json["name"]) == (False, "<b>&.png")
 
 
 def test_a_photos_choices_and_its_depth_map_reach_the_work() -> None:

@@ -65,9 +65,10 @@ def given_input(name: str, argument: Path | None, option: Path | None) -> Path:
     """A command's input, as an argument or by -i; InputError for none, or both."""
     if argument is not None and option is not None:
         raise InputError(f"{option}: {argument} is given already: leave one of them out")
-    if (found := argument or option) is None:
+    path = argument or option
+    if path is None:
         raise InputError(f"{name} missing: name it after the command")
-    return found
+    return path
 
 
 def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:
@@ -157,14 +158,16 @@ def path_options(
     """
     from spackle.views import PathOptions, VideoOptions, parse_size
 
-    given = {"--trajectory": trajectory, "--disparity": disparity}
-    says = f"--path {path}: is a camera path of its own"
-    if cameras is not None and path is None:
-        given["--frames"] = frames
-        says = f"--cameras {cameras}: gives the views themselves"
-    for option, value in given.items():
-        if value is not None and (path is not None or cameras is not None):
-            raise InputError(f"{says}: leave {option} {value} out")
+    useless: dict[str, object] = {"--trajectory": trajectory, "--disparity": disparity}
+    if path is not None:
+        reason = f"--path {path}: is a camera path of its own"
+    elif cameras is not None:
+        reason, useless["--frames"] = f"--cameras {cameras}: gives the views themselves", frames
+    else:
+        reason, useless = "", {}
+    for option, value in useless.items():
+        if value is not None:
+            raise InputError(f"{reason}: leave {option} {value} out")
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, show, stereo, ipd, convergence)
     return PathOptions(trajectory or "rotate-forward", disparity, cameras, path, frames, video)
@@ -172,16 +175,14 @@ def path_options(
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the options of `path_options` as its one parameter `path`, and --help-all."""
-    own, shared = (
+    declared, shared = (
         inspect.signature(function, eval_str=True, locals={"PathOptions": object}).parameters
         for function in (command, path_options)
     )
     kind = inspect.Parameter.KEYWORD_ONLY
-    parameters = [
-        parameter
-        for name, mine in own.items()
-        for parameter in (shared.values() if name == "path" else [mine.replace(kind=kind)])
-    ]
+    parameters: list[inspect.Parameter] = []
+    for name, option in declared.items():
+        parameters += shared.values() if name == "path" else [option.replace(kind=kind)]
     parameters.append(inspect.Parameter("help_all", kind, default=False, annotation=HelpAllOption))
 
     def expanded(*, help_all: bool, **values: Any) -> None:

@@ -55,13 +55,13 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
 
     InputError for an option, a clip or a single photo that cannot be used.
     """
-    found = find_photos(photos)
-    workers = _workers_for(options, len(found))
+    named = find_photos(photos)
+    workers = _workers_for(options, len(named))
     if is_clip(photos):
         pipeline = Pipeline.open(clip_options(options))
         check_file(photos, "clip")
         with results_folder(output), compiled_ahead(pipeline.renderer, reporter.log):
-            predict_clip(photos, output / found[0].name, pipeline, options.lens, reporter)
+            predict_clip(photos, output / named[0].name, pipeline, options.lens, reporter)
         return 0
     pipeline = options.open()
     if single := not os.path.isdir(photos):
@@ -73,16 +73,16 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
         compiled_ahead(pipeline.renderer, reporter.log),
     ):
         predictor = Predictor(output, options, shared, single, pipeline, reporter.verbose)
-        left = predictor.left(found, reporter)
+        left = predictor.left(named, reporter)
         if workers.count == 1 and ray is None:
             with threads_of_torch(workers.threads):
                 failed = sum(not predictor.predict(photo, reporter) for photo in left)
         else:
             word = None if ray is None else mark(output)
             open_predictor = partial(Predictor.open, output, options, shared, single, reporter.verbose, word)
-            failed = _predict_by_workers(ray, workers, open_predictor, list(left), len(found), reporter)
+            failed = _predict_by_workers(ray, workers, open_predictor, list(left), len(named), reporter)
     if failed:
-        reporter.log(f"{failed} of {len(found)} photos failed")
+        reporter.log(f"{failed} of {len(named)} photos failed")
     return failed
 
 
@@ -96,8 +96,8 @@ def find_photos(path: Path) -> list[NamedPhoto]:
     # a.jpg and a.png must not write over each other, nor over a.jpg.png.
     stems = Counter(photo.stem.casefold() for photo in photos)
     names = {photo.name.casefold() for photo in photos}
-    taken = {stem for stem, count in stems.items() if count > 1 or stem in names}
-    return [NamedPhoto(photo, photo.name if photo.stem.casefold() in taken else photo.stem) for photo in photos]
+    ambiguous = {stem for stem, count in stems.items() if count > 1 or stem in names}
+    return [NamedPhoto(photo, photo.name if photo.stem.casefold() in ambiguous else photo.stem) for photo in photos]
 
 
 def _workers_for(options: PredictOptions, photos: int) -> Workers:
@@ -194,12 +194,11 @@ class Predictor:
     def make(self, photo: NamedPhoto) -> Predicted:
         """As `predict`, for a worker."""
         notes = Notes(self.verbose)
-        done = self.predict(photo, notes)
-        return Predicted(photo.path.name, not done, notes.said)
+        return Predicted(photo.path.name, not self.predict(photo, notes), notes.said)
 
-    def left(self, found: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
+    def left(self, photos: Iterable[NamedPhoto], reporter: Reporter) -> Iterator[NamedPhoto]:
         """The photos that are not done yet; logs those that are."""
-        for photo in found:
+        for photo in photos:
             folder = self.output / photo.name
             earlier = {} if self.single or self.options.overwrite else earlier_report(folder)
             if (

@@ -34,7 +34,7 @@ from spackle.scene import DEFAULT_SIZE, Scene
 from spackle.viewer import PageScene, single_html
 from spackle.views import FrameMaker, PathOptions, cover, video_problem
 
-TOLERATED = 0.01  # holes of a frame that nobody need be told of
+TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
 PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}
 
 
