@@ -15,16 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from plain_scenes import (
-    Row,
-    compressed_ply_rows,
-    gaussians_of,
-    glb_parts,
-    glb_rows,
-    sog_rows,
-    splat_rows,
-    spz_rows,
-)
+from plain_scenes import compressed_ply_rows, gaussians_of, glb_parts, glb_rows, sog_rows, splat_rows, spz_rows
 from rich.console import Console
 from scenes import box_before_wall, psnr, random_gaussians, shifted, slanted_plane
 
@@ -43,7 +34,7 @@ from spackle.render import CpuRenderer
 
 CPU = CpuRenderer()
 BOX = box_before_wall(width=64, height=48, focal=54)
-FORMATS: dict[str, Callable[[bytes], Iterator[Row]]] = {
+FORMATS: dict[str, Callable[[bytes], Iterator[Any]]] = {
     "compressed.ply": compressed_ply_rows,
     "spz": spz_rows,
     "splat": splat_rows,
@@ -187,27 +178,24 @@ def test_compressed_ply_keeps_the_base_before_the_aux() -> None:
 def test_morton_order_is_that_of_interleaved_bits_of_logarithms() -> None:
     grid = np.array(np.meshgrid(*[range(8)] * 3)).reshape(3, -1).T
     points = np.vstack([grid, [1e4] * 3]).astype(np.float32)
-
-    def curve(point: Any) -> int:
-        cells = (np.log1p(point.astype(float)) / np.log1p(1e4) * 1023).astype(int).tolist()
-        return sum((cells[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
-
-    assert [curve(points[i]) for i in morton_order(points)] == sorted(curve(point) for point in points)
+    cells = (np.log1p(points.astype(float)) / np.log1p(1e4) * 1023).astype(int).tolist()
+    curve = [
+        sum((cell[axis] >> bit & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3)) for cell in cells
+    ]
+    assert [curve[i] for i in morton_order(points)] == sorted(curve)
     with np.errstate(all="raise"):
         morton_order(np.vstack([points, [3e38, 0, 0], [-3e38, 0, 0]]).astype(np.float32))
 
 
 def spz_scene(near: float, far: float) -> Gaussians:
     """A plane at `near` and a sky at `far`, both as fine as a photo's pixels."""
-    grid = torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy")
-    x, y = (t.flatten() for t in grid)
-    rays = torch.stack([x, y, torch.ones_like(x)], dim=1)
-    depth = torch.where(y < 0, far, near)
-    count = len(rays)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    scales = (depth / 60)[:, None] * torch.tensor([1.0, 1.0, 0.1])
+    x, y = (
+        t.flatten() for t in torch.meshgrid(torch.linspace(-0.5, 0.5, 40), torch.linspace(-0.4, 0.4, 32), indexing="xy")
+    )
+    depth, ones = torch.where(y < 0, far, near)[:, None], torch.ones_like(x)
+    scales, quats = depth / 60 * torch.tensor([1.0, 1.0, 0.1]), torch.eye(4)[:1].expand(len(x), 4)
     colors = 0.5 + 0.4 * torch.stack([torch.sin(20 * x), torch.sin(15 * y), torch.cos(12 * x + 9 * y)], dim=1)
-    return Gaussians(rays * depth[:, None], quats, scales, torch.full((count,), 0.99), colors)
+    return Gaussians(torch.stack([x, y, ones], dim=1) * depth, quats, scales, 0.99 * ones, colors)
 
 
 @pytest.mark.parametrize("far", [30.0, 500.0, 5000.0, 1e6])
@@ -258,20 +246,22 @@ def test_a_codebook_is_close_to_every_value() -> None:
 # The command.
 
 
-def told() -> tuple[Reporter, io.StringIO]:
-    text = io.StringIO()
-    return Reporter(console=Console(file=text, width=300)), text
-
-
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     save_ply(BOX.base(), tmp_path / "scene.ply", camera=BOX.camera, base_count=1000)
     return tmp_path / "scene.ply"
 
 
+def export(scene: Path, *names: str) -> str:
+    """Write files beside the scene, and what was said."""
+    text = io.StringIO()
+    export_scene(scene, [scene.parent / name for name in names], Reporter(console=Console(file=text, width=300)))
+    return text.getvalue()
+
+
 def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
-    outputs = [tmp_path / f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE)] + [tmp_path / "A.SPLAT"]
-    export_scene(scene, outputs, told()[0])
+    names = [*(f"out{suffix}" for suffix in (*SCENE_ENCODERS, *PAGE)), "A.SPLAT"]
+    export(scene, *names)
     base, copy = load_ply(scene), tmp_path / "out.ply"
     for a, b in zip(load_ply(copy).tensors, base.tensors, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
@@ -282,7 +272,7 @@ def test_all_formats_at_once(scene: Path, tmp_path: Path) -> None:
     gltf, _ = glb_parts((tmp_path / "out.glb").read_bytes())
     assert gltf["nodes"][0]["extras"] == {"spackle_base": 1000}
     assert (tmp_path / "A.SPLAT").stat().st_size == 32 * len(base)
-    assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *(output.name for output in outputs)}
+    assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", *names}
     copy.write_bytes(encode("ply", base, moved()))  # a camera elsewhere is no comment
     assert PlyFile(copy).camera() is None
 
@@ -294,11 +284,10 @@ def test_what_a_format_cannot_hold_is_said(scene: Path, tmp_path: Path) -> None:
     foreign, far = tmp_path / "inria.ply", tmp_path / "far.ply"
     foreign.write_bytes(head + more + b"end_header\n" + np.hstack([rows, np.ones((len(rows), 45), "<f4")]).tobytes())
     save_ply(spz_scene(0.3, 5000.0), far)
-    for path, said in ((foreign, "45 spherical harmonics"), (far, "640 Gaussians beyond 1,024 m"), (scene, "")):
-        reporter, text = told()
-        export_scene(path, [tmp_path / "out.spz"], reporter)
-        assert said in text.getvalue()
-        assert len(text.getvalue().splitlines()) == (2 if said else 1)
+    for path, says in ((foreign, "45 spherical harmonics"), (far, "640 Gaussians beyond 1,024 m"), (scene, "")):
+        said = export(path, "out.spz")
+        assert says in said
+        assert len(said.splitlines()) == (2 if says else 1)
 
 
 def test_rotations_too_long_to_square_keep_their_direction(tmp_path: Path) -> None:
@@ -309,21 +298,23 @@ def test_rotations_too_long_to_square_keep_their_direction(tmp_path: Path) -> No
     torch.testing.assert_close(load_ply(tmp_path / "huge.ply").quats, huge.quats / 3e38, atol=1e-6, rtol=0)
 
 
-def test_bad_requests_leave_nothing(scene: Path, tmp_path: Path) -> None:
-    (tmp_path / "text.ply").write_text("hello")
-    (tmp_path / "link.ply").symlink_to(scene)
+REQUESTS = [
+    ("scene.ply", ["a.spz", "a.obj"], r"a\.obj: which format"),
+    ("text.ply", ["a.spz", "none/a.sog"], "not a PLY"),
+    ("scene.ply", ["a.spz", "a.spz"], "named twice"),
+    ("scene.ply", ["a.spz", "scene.ply"], r"scene\.ply: is the scene itself"),
+    ("scene.ply", ["a.spz", "link.ply"], r"scene\.ply: is the scene itself"),
+]
+
+
+@pytest.mark.parametrize(("source", "outputs", "says"), REQUESTS)
+def test_bad_requests_leave_nothing(scene: Path, source: str, outputs: list[str], says: str) -> None:
+    scene.with_name("text.ply").write_text("hello")
+    scene.with_name("link.ply").symlink_to(scene)
     before = scene.read_bytes()
-    for source, outputs, says in [
-        ("scene.ply", ["a.spz", "a.obj"], r"a\.obj: which format"),
-        ("text.ply", ["a.spz", "none/a.sog"], "not a PLY"),
-        ("scene.ply", ["a.spz", "a.spz"], "named twice"),
-        ("scene.ply", ["a.spz", "scene.ply"], r"scene\.ply: is the scene itself"),
-        ("scene.ply", ["a.spz", "link.ply"], r"scene\.ply: is the scene itself"),
-        ("text.ply", ["a.spz"], "not a PLY"),
-    ]:
-        with pytest.raises(InputError, match=says):
-            export_scene(tmp_path / source, [tmp_path / name for name in outputs], told()[0])
-    assert {p.name for p in tmp_path.iterdir()} == {"scene.ply", "text.ply", "link.ply"}
+    with pytest.raises(InputError, match=says):
+        export(scene.with_name(source), *outputs)
+    assert {p.name for p in scene.parent.iterdir()} == {"scene.ply", "text.ply", "link.ply"}
     assert scene.read_bytes() == before
 
 
@@ -338,7 +329,7 @@ def test_too_large_a_scene_is_told_and_an_older_file_stays(
     output.write_bytes(b"older")
     monkeypatch.setattr(f"spackle.formats.{suffix}.{limit}", value)
     with pytest.raises(InputError, match=rf"{output.name}: [0-9,]+ Gaussians are too many"):
-        export_scene(scene, [output], told()[0])
+        export(scene, output.name)
     assert output.read_bytes() == b"older"
     assert len(list(scene.parent.iterdir())) == 2
 

@@ -107,10 +107,11 @@ def test_a_failed_video_leaves_the_old_file(tmp_path: Path, name: str) -> None:
     path.write_bytes(b"old")
     with pytest.raises(RuntimeError, match="renderer"):
         save_video(failing(), path)
+    one = torch.zeros(16, 16, 3)
     for wrong, says in (
-        ([], "at least one frame"),
-        ([torch.zeros(16, 16, 3), torch.zeros(16, 18, 3)], "frame 1 is"),
-        ([torch.zeros(3, 16, 16)], "a video frame is"),
+        ([], "at least one"),
+        ([one, torch.zeros(16, 18, 3)], "frame 1 is"),
+        ([one[..., 0]], "a video frame"),
     ):
         with pytest.raises(ValueError, match=says):
             save_video(wrong, path)

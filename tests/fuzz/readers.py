@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import struct
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -41,13 +42,14 @@ from spackle.training.checkpoint import Checkpoint, Progress, load_checkpoint, s
 from spackle.training.recipe import Recipe, load_recipe
 
 Files = dict[str, bytes]  # name in the case's folder → content
+Maker = Callable[[Path], object]
 
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
     """What makes valid files in a folder, and what reads them."""
 
-    makers: Sequence[Callable[[Path], object]]
+    makers: Sequence[Maker]
     read: Callable[[Path], object]
 
 
@@ -88,14 +90,14 @@ def _only(folder: Path) -> Path:
     return path
 
 
-def _pictures(name: str, mode: str = "RGB", **options: Any) -> Callable[[Path], object]:
+def _writes(name: str, data: bytes | str) -> Maker:
+    return lambda folder: (folder / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+
+
+def _pictures(name: str, mode: str = "RGB", **options: Any) -> Maker:
     exif = Image.Exif()
     exif[0x0112], exif[0xA405] = 6, 28
     return lambda folder: Image.fromarray(picture()).convert(mode).save(folder / name, exif=exif, **options)
-
-
-def _grey16(folder: Path) -> None:
-    Image.fromarray((1000 * metres()).astype(np.uint16)).save(folder / "a.png")
 
 
 def _npz(folder: Path) -> None:
@@ -103,25 +105,13 @@ def _npz(folder: Path) -> None:
     (folder / "a.npy").rename(folder / "a.npz")  # `sealed` packs it
 
 
-def _pfm(folder: Path) -> None:
-    (folder / "a.pfm").write_bytes(b"Pf\n64 48\n-1.0\n" + metres()[::-1].tobytes())
-
-
-def _portrait(name: str, data: bytes) -> Callable[[Path], object]:
-    return lambda folder: (folder / name).write_bytes(data)
-
-
-def _scene() -> Gaussians:
-    rng = np.random.default_rng(0)
-    parts = [torch.from_numpy(rng.uniform(0.1, 0.9, shape)).float() for shape in ((9, 3), (9, 4), (9, 3), (9,), (9, 3))]
-    return Gaussians(*parts)
-
-
 def _ply(folder: Path) -> None:
-    save_ply(_scene(), folder / "a.ply", camera=Camera.from_focal(50, 64, 48), base_count=4, disparity=0.3)
+    parts = torch.linspace(0.1, 0.9, 9 * 14).split([27, 36, 27, 9, 27])
+    scene = Gaussians(*(part.reshape(9, -1).squeeze(1) for part in parts))
+    save_ply(scene, folder / "a.ply", camera=Camera.from_focal(50, 64, 48), base_count=4, disparity=0.3)
 
 
-def _sharp_ply(folder: Path) -> None:
+def _sharp_ply() -> str:
     """ASCII, with SHARP's camera behind the Gaussians."""
     rest = [f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)]
     names = ["x", "y", "z", "opacity", *rest]
@@ -130,7 +120,7 @@ def _sharp_ply(folder: Path) -> None:
     for name, numbers in tables.items():
         lines += [f"element {name} {len(numbers)}", f"property float {name}"]
     rows = [" ".join(["0.5"] * len(names))] * 3 + [str(n) for numbers in tables.values() for n in numbers]
-    (folder / "a.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
+    return "\n".join([*lines, "end_header", *rows, ""])
 
 
 def _read_ply(folder: Path) -> None:
@@ -138,9 +128,9 @@ def _read_ply(folder: Path) -> None:
         read(PlyFile(_only(folder)))
 
 
-def _keyframes(folder: Path) -> None:
+def _keyframes() -> str:
     keys = [{"time": k, "eye": [k, 0, 0], "target": [0, 0, 3], "up": [0, -1, 0], "fov": 60} for k in range(3)]
-    (folder / "a.json").write_text(json.dumps({"keyframes": keys, "closed": False, "unit": "metres"}))
+    return json.dumps({"keyframes": keys, "closed": False, "unit": "metres"})
 
 
 def _calib(folder: Path) -> None:
@@ -154,7 +144,7 @@ def _described(folder: Path) -> None:
     (folder / "scene.json").write_text(json.dumps({"disparity": "disp.npy", "invalid": 0, **lens}))
 
 
-def _tree(name: str, *makers: Callable[[Path], object]) -> Reader:
+def _tree(name: str, *makers: Maker) -> Reader:
     def read(folder: Path) -> None:
         case = read_cases(name, folder)[0]
         load_case(case)
@@ -171,11 +161,12 @@ def _text_model(folder: Path) -> None:
     (scene / "dslr_calibration_undistorted").rename(scene / "sparse")
 
 
-def _recipe(folder: Path) -> None:
-    (folder / "a.yaml").write_text(
-        "data: {photos: a, disparity: [0.1, 0.5], rgbd: [{folder: b, focal_px: 500}]}\n"
-        "loss: {features: none, color: 1e1}\noptim: {lr: 1e-4, betas: [0.9, 0.99], steps: 100}\nrun: {seed: 3}\n"
-    )
+RECIPE = """
+data: {photos: a, disparity: [0.1, 0.5], rgbd: [{folder: b, focal_px: 500}]}
+loss: {features: none, color: 1e1}
+optim: {lr: 1e-4, betas: [0.9, 0.99], steps: 100}
+run: {seed: 3}
+"""
 
 
 def _coco(folder: Path) -> None:
@@ -189,14 +180,12 @@ def _coco(folder: Path) -> None:
 def _dataset(folder: Path) -> None:
     from dataset_builds import build, write_inputs
 
-    place = write_inputs(folder / "in", 2, 36, 32)
-    assert build(place, folder / "out", "--views", 2, "--shard-size", 1).code == 0
+    with tempfile.TemporaryDirectory() as inputs:
+        place = write_inputs(Path(inputs, "in"), 2, 36, 32)
+        assert build(place, folder / "out", "--views", 2, "--shard-size", 1).code == 0
     for path in (folder / "out").iterdir():
         path.rename(folder / path.name)
     (folder / "out").rmdir()
-    for path in sorted((folder / "in").rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    (folder / "in").rmdir()
 
 
 def _read_dataset(folder: Path) -> None:
@@ -208,14 +197,12 @@ def _read_dataset(folder: Path) -> None:
             group.view(index, with_base=True)
 
 
+TENSORS = {"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}
+
+
 def _checkpoint(folder: Path) -> None:
-    tensors = {"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}
-    state = Checkpoint(Progress(3, 0.5, history=[{"loss": 1.0}]), tensors, tensors, {"state": {}}, {"run": {}}, "x")
-    save_checkpoint(state, folder)
-
-
-def _safetensors(folder: Path) -> None:
-    save_file({"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}, folder / "a.safetensors")
+    progress = Progress(3, 0.5, history=[{"loss": 1.0}])
+    save_checkpoint(Checkpoint(progress, TENSORS, TENSORS, {"state": {}}, {"run": {}}, "x"), folder)
 
 
 def _saved(folder: Path) -> None:
@@ -230,7 +217,7 @@ def _read_weights(folder: Path) -> None:
         read_tensors(_only(folder), "give others")
 
 
-def _clip(name: str, **options: Any) -> Callable[[Path], object]:
+def _clip(name: str, **options: Any) -> Maker:
     return lambda folder: write_clip(folder / name, moving(3, 16, 24), **options)
 
 
@@ -256,24 +243,34 @@ READERS: dict[str, Reader] = {
         ],
         lambda folder: resize_photo(load_photo(_only(folder), keep_frame=False), 32),
     ),
-    "depth": Reader([_grey16, _npz, _pfm, lambda f: np.save(f / "a.npy", metres())], lambda f: load_depth(_only(f))),
+    "depth": Reader(
+        [
+            lambda folder: Image.fromarray((1000 * metres()).astype(np.uint16)).save(folder / "a.png"),
+            _npz,
+            _writes("a.pfm", b"Pf\n64 48\n-1.0\n" + metres()[::-1].tobytes()),
+            lambda folder: np.save(folder / "a.npy", metres()),
+        ],
+        lambda folder: load_depth(_only(folder)),
+    ),
     "portraits": Reader(
         [
-            _portrait("a.jpg", portraits.apple_jpeg(portraits.codes())),
-            _portrait("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
-            _portrait("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
-            _portrait("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
+            _writes("a.jpg", portraits.apple_jpeg(portraits.codes())),
+            _writes("a.jpg", portraits.gdepth_jpeg(portraits.png(portraits.codes()))),
+            _writes("a.jpg", portraits.dynamic_jpeg(portraits.png(portraits.codes()))),
+            _writes("a.heic", portraits.heic(portraits.codes(), portraits.apple_xmp())),
         ],
         lambda folder: load_photo_depth(_only(folder)),
     ),
-    "ply": Reader([_ply, _sharp_ply], _read_ply),
+    "ply": Reader([_ply, _writes("a.ply", _sharp_ply())], _read_ply),
     "cameras": Reader([lambda folder: camera_file(folder / "a.json", [0.0, 0.2])], lambda f: load_cameras(_only(f))),
-    "keyframes": Reader([_keyframes], lambda folder: load_path(_only(folder))),
+    "keyframes": Reader([_writes("a.json", _keyframes())], lambda folder: load_path(_only(folder))),
     "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),
-    "recipes": Reader([_recipe], lambda folder: load_recipe(Recipe, _only(folder))),
+    "recipes": Reader([_writes("a.yaml", RECIPE)], lambda folder: load_recipe(Recipe, _only(folder))),
     "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", print)),
     "datasets": Reader([_dataset], _read_dataset),
-    "weights": Reader([_checkpoint, _safetensors, _saved], _read_weights),
+    "weights": Reader(
+        [_checkpoint, lambda folder: save_file(TENSORS, folder / "a.safetensors"), _saved], _read_weights
+    ),
     "clips": Reader(
         [_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4"), _animation], _read_clip
     ),
@@ -281,11 +278,7 @@ READERS: dict[str, Reader] = {
     "booster": _tree("booster", lambda folder: booster(folder / "a")),
     "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a", EYES[:2])),
     "llff": _tree("llff", lambda folder: llff(folder / "fern", EYES[:2])),
-    "colmap": _tree(
-        "tanks",
-        lambda folder: tanks(folder / "Truck", EYES[:2]),
-        lambda folder: _text_model(folder),
-    ),
+    "colmap": _tree("tanks", lambda folder: tanks(folder / "Truck", EYES[:2]), _text_model),
 }
 
 

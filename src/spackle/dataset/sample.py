@@ -25,7 +25,7 @@ from spackle.camera import Camera
 from spackle.color import to_bytes
 from spackle.dataset.views import ViewStack
 from spackle.errors import reading
-from spackle.formats.camera_files import checked_camera, read_matrix
+from spackle.formats.camera_files import camera_of
 from spackle.gaussians import Gaussians
 from spackle.image import check_pixels
 from spackle.render.protocol import Rendering
@@ -126,8 +126,8 @@ class PhotoGroup:
                 index=index,
                 kind=self.facts["trajectory"]["kind"],
                 photo=decode_rgb(self.files[f"{self.key}.photo.png"]),
-                photo_camera=_camera(self.facts["photo_camera"], self.where),
-                camera=_camera(facts, self.where),
+                photo_camera=camera_of(self.facts["photo_camera"], self.where),
+                camera=camera_of(facts, self.where),
                 rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
                 mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
                 target=target,
@@ -158,11 +158,6 @@ def _camera_facts(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
     }
-
-
-def _camera(facts: Mapping[str, Any], where: str) -> Camera:
-    K, matrix = (read_matrix(facts[name], n, name, where) for name, n in (("K", 3), ("world_to_camera", 4)))
-    return checked_camera(K, matrix, facts["width"], facts["height"], where)
 
 
 def encode_rgb(rgb: Tensor) -> bytes:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,20 +13,16 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import UNITS, Keyframe, KeyframePath, PathError
-from spackle.errors import InputError, reason_in_a_line
+from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 
-MAX_CAMERA_BYTES, MAX_PATH_BYTES = 64 << 20, 4 << 20
+MAX_BYTES = 64 << 20
 MAX_FRAMES = 10_000  # cameras or keyframes
 MAX_SIZE = 16_384
 LARGEST = 1e9  # in a camera: single precision holds its square
 MAX_NUMBER = 1e6  # in a path: a thousand kilometres, eleven days
 RIGID_TOLERANCE = 1e-3
 ZERO_TOLERANCE = 1e-6
-
-_REQUIRED = ("time", "eye", "target")
-_KEYFRAME_NAMES = (*_REQUIRED, "up", "fov")
-_PATH_NAMES = ("keyframes", "closed", "unit")
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
@@ -34,26 +32,29 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     K is in pixels. A frame may carry its own width and height.
 
     Raises:
-        InputError: not such a file, no frame or more than 10,000, or a camera that cannot be: K without
-            positive focal lengths, with skew or a last row other than 0 0 1; world_to_camera that is
-            not a rotation and a translation; a size outside 1..16384.
+        InputError: not such a file, no frame or more than 10,000, or a camera that cannot be, see `checked_camera`.
     """
-    content = _read_json(path, "camera file", MAX_CAMERA_BYTES, dict)
-    frames = content.get("frames") if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f'{path}: needs a list "frames" with at least one camera')
-    if len(frames) > MAX_FRAMES:
-        raise InputError(f"{path}: {len(frames)} frames are too many (at most {MAX_FRAMES}): split the file")
-    cameras = []
-    for index, frame in enumerate(frames):
-        where = f"{path}: frame {index}"
-        if not isinstance(frame, dict):
-            raise InputError(f'{where}: must be an object with "K" and "world_to_camera"')
-        width, height = (frame.get(side, content.get(side)) for side in ("width", "height"))
-        K = read_matrix(frame.get("K"), 3, "K", where)
-        pose = read_matrix(frame.get("world_to_camera"), 4, "world_to_camera", where)
-        cameras.append(checked_camera(K, pose, width, height, where))
-    return cameras
+    content, frames = _read_json(path, "camera file", "frames", "K", "world_to_camera")
+    size = {side: content.get(side) for side in ("width", "height")}
+    return [camera_of(size | frame, f"{path}: frame {index}") for index, frame in enumerate(frames)]
+
+
+def camera_of(facts: Mapping[str, Any], where: str) -> Camera:
+    """A camera from what JSON says of it; InputError, beginning with `where`, if it cannot be."""
+    K, pose = (_matrix(facts.get(name), n, f"{where}: {name}") for name, n in (("K", 3), ("world_to_camera", 4)))
+    return checked_camera(K, pose, facts.get("width"), facts.get("height"), where)
+
+
+def _matrix(rows: object, n: int, where: str) -> Tensor:
+    """A list of n lists of n numbers as float64 [n, n]."""
+    lists = rows if isinstance(rows, list) else []
+    numbers = [value for row in lists if isinstance(row, list) and len(row) == n for value in row]
+    if len(lists) != n or len(numbers) != n * n or not all(type(value) in (int, float) for value in numbers):
+        raise InputError(f"{where} must be a list of {n} rows of {n} numbers")
+    try:
+        return torch.tensor([float(value) for value in numbers], dtype=torch.float64).reshape(n, n)
+    except OverflowError:  # a whole number with 400 digits
+        raise InputError(f"{where} must be finite") from None
 
 
 def checked_camera(
@@ -66,9 +67,11 @@ def checked_camera(
     dtype: torch.dtype = torch.float32,
     tolerance: float = RIGID_TOLERANCE,
 ) -> Camera:
-    """A camera of float64 matrices [3, 3] and [4, 4]; InputError, beginning with `where`, if it cannot be.
+    """A camera of float64 matrices [3, 3] and [4, 4]; a rotation's product with its transpose is 1 to `tolerance`.
 
-    A rotation's product with its transpose is the identity to `tolerance`.
+    Raises:
+        InputError: beginning with `where`: K without positive focal lengths, with skew or a last row other than
+            0 0 1; world_to_camera that is not a rotation and a translation; a size outside 1..16384.
     """
     sizes = [n for n in (width, height) if isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_SIZE]
     if len(sizes) != 2:
@@ -103,82 +106,64 @@ def load_path(path: str | os.PathLike[str]) -> KeyframePath:
             increase, a number that is not finite or beyond a million, an eye at its target, an up along the view,
             a fov outside 1..170 degrees, or a name that is unknown or there twice.
     """
-    content = _read_json(path, "path file", MAX_PATH_BYTES, _without_doubles)
-    if not isinstance(content, dict) or not isinstance(content.get("keyframes"), list):
-        raise InputError(f'{path}: needs a list "keyframes" of objects with "time", "eye" and "target"')
-    _check_names(content, _PATH_NAMES, str(path))
-    entries, closed, unit = content["keyframes"], content.get("closed", False), content.get("unit", "metres")
-    if len(entries) > MAX_FRAMES:
-        raise InputError(f"{path}: {len(entries)} keyframes are too many (at most {MAX_FRAMES})")
+    content, entries = _read_json(path, "path file", "keyframes", "time", "eye", "target")
+    _check_names(content, ["keyframes", "closed", "unit"], str(path))
+    closed, unit = content.get("closed", False), content.get("unit", "metres")
     if not isinstance(closed, bool):
         raise InputError(f'{path}: "closed" must be true or false')
     if unit not in UNITS:
         raise InputError(f'{path}: "unit" must be {" or ".join(UNITS)}')
-    keys = [_keyframe(entry, f"{path}: keyframe {index}") for index, entry in enumerate(entries)]
-    try:
-        return KeyframePath(tuple(keys), closed, unit)
-    except PathError as error:
-        raise InputError(f"{path}: {error}") from error
+    keys = tuple(_keyframe(entry, f"{path}: keyframe {index}") for index, entry in enumerate(entries))
+    with reading(path, "{reason}", PathError):
+        return KeyframePath(keys, closed, unit)
 
 
-def _read_json(path: str | os.PathLike[str], kind: str, limit: int, pairs: Any) -> Any:
-    """The content of a file of at most `limit` bytes; InputError where it is not JSON."""
-    if check_file(path, kind) > limit:
-        raise InputError(f"{path}: too long for a {kind} (at most {limit >> 20} MiB): is it the right file?")
-    try:
-        with open(path, encoding="utf-8-sig") as file:
-            return json.load(file, object_pairs_hook=pairs)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON: {reason_in_a_line(error)}") from error
-
-
-def read_matrix(rows: object, n: int, name: str, where: str) -> Tensor:
-    """A list of n lists of n numbers as float64 [n, n]."""
-    problem = f"{where}: {name} must be a list of {n} rows of {n} numbers"
-    if not (isinstance(rows, list) and len(rows) == n and all(isinstance(r, list) and len(r) == n for r in rows)):
-        raise InputError(problem)
-    if not all(type(value) in (int, float) for row in rows for value in row):
-        raise InputError(problem)
-    try:
-        return torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64)
-    except OverflowError:  # a whole number with 400 digits
-        raise InputError(f"{where}: {name} must be finite") from None
-
-
-def _keyframe(entry: object, where: str) -> Keyframe:
-    if not isinstance(entry, dict) or any(name not in entry for name in _REQUIRED):
-        raise InputError(f'{where}: must be an object with "time", "eye" and "target"')
-    _check_names(entry, _KEYFRAME_NAMES, where)
+def _keyframe(entry: Mapping[str, Any], where: str) -> Keyframe:
+    _check_names(entry, [field.name for field in dataclasses.fields(Keyframe)], where)
     given: dict[str, Any] = {}
     for name, value in entry.items():
-        vector = name in ("eye", "target", "up")
-        if vector and not (isinstance(value, list) and len(value) == 3):
+        single = name in ("time", "fov")
+        numbers = [value] if single else value
+        if not isinstance(numbers, list) or len(numbers) != (1 if single else 3):
             raise InputError(f'{where}: "{name}" must be a list of three numbers')
-        given[name] = tuple(_number(part, name, where) for part in value) if vector else _number(value, name, where)
-    try:
+        for number in numbers:
+            if type(number) not in (int, float) or not -MAX_NUMBER <= number <= MAX_NUMBER:  # NaN is not, either
+                raise InputError(f'{where}: "{name}" must hold finite numbers, at most a million, not {shown(number)}')
+        given[name] = float(value) if single else tuple(map(float, numbers))
+    with reading(where, "{reason}", PathError):
         return Keyframe(**given)
-    except PathError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
-def _number(value: Any, name: str, where: str) -> float:
-    if type(value) not in (int, float):
-        raise InputError(f'{where}: "{name}" must hold numbers, not {reason_in_a_line(json.dumps(value))}')
-    if not -MAX_NUMBER <= value <= MAX_NUMBER:  # NaN is not, either
-        raise InputError(f'{where}: "{name}" must be a finite number, at most a million, got {str(value)[:20]}')
-    return float(value)
+def _read_json(
+    path: str | os.PathLike[str], kind: str, name: str, *required: str
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The content of a file, and its list `name` of objects that have what is required; InputError for another file."""
+    if check_file(path, kind) > MAX_BYTES:
+        raise InputError(f"{path}: too long for a {kind} (at most {MAX_BYTES >> 20} MiB): is it the right file?")
+    with reading(path, "not JSON: {reason}", ValueError, RecursionError), open(path, encoding="utf-8-sig") as file:
+        content = json.load(file, object_pairs_hook=_names_once)
+    entries = content.get(name) if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f'{path}: needs a list "{name}" with at least one object')
+    if len(entries) > MAX_FRAMES:
+        raise InputError(f"{path}: {len(entries)} {name} are too many (at most {MAX_FRAMES}): split the file")
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict) or not set(required) <= set(entry):
+            names = ", ".join(f'"{each}"' for each in required)
+            raise InputError(f"{path}: {name.removesuffix('s')} {index}: must be an object with {names}")
+    return content, entries
 
 
-def _check_names(entry: dict[str, Any], known: tuple[str, ...], where: str) -> None:
+def _check_names(entry: Mapping[str, Any], known: Sequence[str], where: str) -> None:
     if unknown := sorted(set(entry) - set(known)):
-        raise InputError(f"{where}: unknown name {reason_in_a_line(unknown[0])!r}: there are {', '.join(known)}")
+        raise InputError(f"{where}: unknown name {shown(unknown[0])}: there are {', '.join(known)}")
 
 
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _names_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object of JSON; ValueError where a name is there twice."""
     found: dict[str, Any] = {}
     for name, value in pairs:
         if name in found:
-            raise ValueError(f"the name {name!r} is there twice in one object")
+            raise ValueError(f"the name {shown(name)} is there twice in one object")
         found[name] = value
     return found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from spackle.camera import Camera
 from spackle.color import srgb_to_linear
 from spackle.errors import InputError
-from spackle.formats.scene_files import FLIPPED_MEANS, FLIPPED_QUATS, Columns, SceneFile
+from spackle.formats.scene_files import Columns, SceneFile
 
 EXTENSION = "KHR_gaussian_splatting"
 LARGEST_FILE = 2**32 - 1  # bytes that a .glb can announce
@@ -39,7 +39,7 @@ def encode_glb(scene: SceneFile) -> bytes:
         raise InputError("glTF cannot hold a scene without Gaussians: use another format")
     if count * ROW + (1 << 16) > LARGEST_FILE:
         raise InputError(f"{count:,} Gaussians are too many for .glb (4 GiB at most): use another format")
-    arrays = _attributes(Columns.of(scene.gaussians))
+    arrays = _attributes(Columns.of(scene.gaussians).flipped())
     parts = [array.tobytes() for array in arrays.values()]
     text = json.dumps(
         _description(arrays, scene.camera, scene.base_count), separators=(",", ":"), allow_nan=False
@@ -55,8 +55,8 @@ def _attributes(columns: Columns) -> dict[str, NDArray[Any]]:
     linear = srgb_to_linear(torch.from_numpy(columns.srgb)).numpy()
     rgba = np.concatenate([linear, columns.opacities[:, None]], axis=1)
     return {
-        "POSITION": (columns.means * FLIPPED_MEANS).astype("<f4"),
-        f"{EXTENSION}:ROTATION": (columns.quats * FLIPPED_QUATS)[:, [1, 2, 3, 0]].astype("<f4"),
+        "POSITION": columns.means.astype("<f4"),
+        f"{EXTENSION}:ROTATION": columns.quats[:, [1, 2, 3, 0]].astype("<f4"),
         f"{EXTENSION}:SCALE": np.exp(columns.log_scales).astype("<f4"),
         f"{EXTENSION}:OPACITY": columns.opacities.astype("<f4"),
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": columns.harmonics.astype("<f4"),

@@ -41,11 +41,6 @@ _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
 _SLICES = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10), slice(10, 14)  # means, f_dc, opacity, scales, rot
 
-# Comments of the header, which other readers ignore.
-CAMERA_COMMENT = "spackle_camera"  # fx fy cx cy width height of the photo's camera
-BASE_COMMENT = "spackle_base"  # how many Gaussians are the base's
-DISPARITY_COMMENT = "spackle_disparity"  # how far to the side the scene was completed
-
 StrPath = str | os.PathLike[str]
 
 
@@ -60,14 +55,9 @@ def save_ply(
     """Write a binary PLY that viewers of 3D Gaussian splatting read.
 
     One `vertex` element of float32: x y z, normals of zero, f_dc from the sRGB colour, opacity as
-    logit, scales as logarithm, rot as unit quaternion wxyz. Row i depends on Gaussian i alone.
-
-    Args:
-        gaussians: the scene.
-        path: the file.
-        camera: the photo's camera, at the world's origin; like what follows kept in a comment for `PlyFile`.
-        base_count: how many of the first Gaussians are the base's.
-        disparity: how far the scene was completed, see `spackle.camera_path.max_offset`.
+    logit, scales as logarithm, rot as unit quaternion wxyz. Row i depends on Gaussian i alone. Comments, for `PlyFile`,
+    keep the photo's camera, which stands at the world's origin, how many of the first Gaussians are the base's, and the
+    disparity that the scene was completed for, see `spackle.camera_path.max_offset`.
 
     Raises:
         InputError: nothing can be written at `path`.
@@ -111,8 +101,8 @@ def ply_header(
     lines = ["ply", "format binary_little_endian 1.0"]
     if camera is not None:
         numbers = [*camera.focal, *camera.K[:2, 2].tolist(), camera.width, camera.height]
-        lines.append(" ".join(["comment", CAMERA_COMMENT, *map(repr, numbers)]))
-    for comment, number in ((BASE_COMMENT, base_count), (DISPARITY_COMMENT, disparity)):
+        lines.append(f"comment spackle_camera {' '.join(map(repr, numbers))}")
+    for comment, number in (("spackle_base", base_count), ("spackle_disparity", disparity)):
         lines += [] if number is None else [f"comment {comment} {number!r}"]
     for name, count, kind, properties in tables:
         lines += [f"element {name} {count}", *(f"property {kind} {each}" for each in properties)]
@@ -195,7 +185,7 @@ class PlyFile:
         InputError for a camera that makes no sense.
         """
         K, matrix = np.eye(3), np.eye(4)
-        if numbers := self._numbers(CAMERA_COMMENT, 6, lowest=-math.inf):
+        if numbers := self._numbers("spackle_camera", 6, lowest=-math.inf):
             K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height = numbers
         elif "intrinsic" in (extras := self._extras()):
             intrinsic, extrinsic = extras["intrinsic"], extras.get("extrinsic", matrix.ravel())
@@ -220,12 +210,12 @@ class PlyFile:
 
     def base_count(self) -> int | None:
         """How many of the first Gaussians are the base's; None in other files, InputError for more than there are."""
-        numbers = self._numbers(BASE_COMMENT, 1, highest=self._vertex().count)
+        numbers = self._numbers("spackle_base", 1, highest=self._vertex().count)
         return int(numbers[0]) if numbers else None
 
     def disparity(self) -> float | None:
         """How far the scene was completed; None in other files, InputError for no such number."""
-        numbers = self._numbers(DISPARITY_COMMENT, 1)
+        numbers = self._numbers("spackle_disparity", 1)
         return numbers[0] if numbers else None
 
     def scene(self) -> SceneFile:

@@ -22,10 +22,6 @@ SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # keep the logarithm, and float32 after it, finite
 SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
-# Half a turn about x: from x right, y down, z forward to x right, y up, z backward, as OpenGL and glTF have it.
-FLIPPED_MEANS = np.array([1, -1, -1], np.float32)
-FLIPPED_QUATS = np.array([1, 1, -1, -1], np.float32)
-
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
@@ -82,6 +78,11 @@ class Columns:
     def harmonics(self) -> Floats:
         """[N, 3] coefficients of the constant spherical harmonic, which gives the sRGB colour."""
         return (self.srgb - np.float32(0.5)) / np.float32(SH_C0)
+
+    def flipped(self) -> Columns:
+        """Half a turn about x: y up, z backward, as OpenGL and glTF have it."""
+        means, quats = self.means * np.float32([1, -1, -1]), self.quats * np.float32([1, 1, -1, -1])
+        return dataclasses.replace(self, means=means, quats=quats)
 
     def select(self, rows: NDArray[np.int64] | slice) -> Columns:
         """The Gaussians that an index or a slice picks."""

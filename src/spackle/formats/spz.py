@@ -6,20 +6,13 @@ import bisect
 import dataclasses
 import struct
 import zlib
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spackle.errors import InputError
-from spackle.formats.scene_files import (
-    FLIPPED_MEANS,
-    FLIPPED_QUATS,
-    SH_C0,
-    Columns,
-    Floats,
-    SceneFile,
-    smallest_three,
-)
+from spackle.formats.scene_files import SH_C0, Columns, Floats, SceneFile, smallest_three
 from spackle.gaussians import Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
@@ -42,23 +35,15 @@ SAMPLE, SAMPLES = 1 << 13, 8  # Gaussians in a row that are tried first, and at 
 SAMPLED_LIMIT = 8.7  # short pieces deflate a little worse than the whole
 
 
-@dataclasses.dataclass(frozen=True)
-class _Detail:
+class _Detail(NamedTuple):
     position: float  # a step, in standard deviations of the Gaussian's middle axis
     quat_bits: int  # of each of the three smaller components, of 9
     scale_step: int  # of the logarithm, in sixteenths
     opacity_step: int  # in 255ths
 
 
-_DETAILS = (
-    _Detail(1 / 16, 9, 1, 1),
-    _Detail(1 / 8, 7, 1, 1),
-    _Detail(1 / 4, 6, 1, 2),
-    _Detail(1 / 4, 5, 2, 2),
-    _Detail(1 / 2, 5, 2, 4),
-    _Detail(1 / 2, 4, 2, 4),
-    _Detail(1 / 2, 4, 4, 8),
-)
+_DETAILS = [_Detail(1 / 16, 9, 1, 1), _Detail(1 / 8, 7, 1, 1), _Detail(1 / 4, 6, 1, 2), _Detail(1 / 4, 5, 2, 2)]
+_DETAILS += [_Detail(1 / 2, 5, 2, 4), _Detail(1 / 2, 4, 2, 4), _Detail(1 / 2, 4, 4, 8)]
 
 
 def encode_spz(scene: SceneFile) -> bytes:
@@ -74,7 +59,7 @@ def encode_spz(scene: SceneFile) -> bytes:
     count = len(scene.gaussians)
     if count > MAX_COUNT:
         raise InputError(f"{count:,} Gaussians are too many for SPZ (at most {MAX_COUNT:,}): use another format")
-    columns = Columns.of(scene.gaussians)
+    columns = Columns.of(scene.gaussians).flipped()
     bits, _ = spz_grid(scene.gaussians)
     columns = _within(columns, bits)
     header = HEADER.pack(MAGIC, VERSION, count, 0, bits, 0, 0)
@@ -126,8 +111,8 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
     scales = np.clip(scales, 0, 255).astype(np.uint8)
     colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
     step = detail.opacity_step
-    quats = columns.quats * FLIPPED_QUATS
-    quats[(scales == scales[:, :1]).all(axis=1)] = [1, 0, 0, 0]  # a ball looks the same however it is turned
+    ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # it looks the same however it is turned
+    quats = np.where(ball, np.float32([1, 0, 0, 0]), columns.quats)
     return [
         _positions(columns, bits, detail.position).tobytes(),
         np.minimum(255, np.round(columns.opacities * (255 / step)) * step).astype(np.uint8).tobytes(),
@@ -143,7 +128,7 @@ def _positions(columns: Columns, bits: int, share: float) -> NDArray[np.uint8]:
     middle = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     exponent = np.floor(middle / np.float32(np.log(2)) + np.float32(np.log2(share) + bits))
     step = np.exp2(np.clip(exponent, 0, 20))[:, None]
-    fixed = np.round(columns.means * FLIPPED_MEANS * np.float64(2.0**bits) / step) * step
+    fixed = np.round(columns.means * np.float64(2.0**bits) / step) * step
     whole = np.clip(fixed, -LARGEST, LARGEST).astype("<i4")
     return np.ascontiguousarray(whole.view(np.uint8).reshape(-1, 3, 4)[:, :, :3])
 

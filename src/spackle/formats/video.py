@@ -9,9 +9,10 @@ import os
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import av
 import numpy as np
@@ -22,7 +23,6 @@ from torch import Tensor
 from spackle.color import to_bytes
 from spackle.errors import InputError
 from spackle.files import atomic_path, check_writable
-from spackle.formats.video_gif import GifEncoder
 
 MAX_REPEATS = 1000  # of a file that has to hold every repetition
 MAX_PLAYS = 65_535  # GIF's and WebP's counters have 16 bits
@@ -75,13 +75,10 @@ def check_video(path: str | os.PathLike[str], fps: float, loop: int | None = Non
     least, most = kind.fps
     if not (math.isfinite(fps) and least <= fps <= most):
         raise InputError(f"{path}: frames a second must be a number from {least:g} to {most:g}, got {fps}")
-    if loop is not None and kind.counts and not 0 <= loop <= MAX_PLAYS:
-        raise InputError(f"{path}: a loop count must be from 0 (for ever) to {MAX_PLAYS}, got {loop}")
-    if loop is not None and not kind.counts and not 1 <= loop <= MAX_REPEATS:
-        raise InputError(
-            f"{path}: a loop count must be from 1 to {MAX_REPEATS}, got {loop}: such a file holds every repetition "
-            "(.gif and .webp can play for ever)"
-        )
+    least, most = (0, MAX_PLAYS) if kind.counts else (1, MAX_REPEATS)
+    if loop is not None and not least <= loop <= most:
+        hint = "0 is for ever" if kind.counts else "it holds every repetition; .gif and .webp can play for ever"
+        raise InputError(f"{path}: a loop count of such a file must be from {least} to {most}, got {loop} ({hint})")
     return kind
 
 
@@ -93,12 +90,12 @@ class VideoWriter:
 
     .mp4, .m4v, .mov (H.264) and .webm (VP9) are yuv420p in the BT.709 colours that the file declares, with
     the index first, so that they play while they load; an odd width or height grows by one: the last column
-    or row is repeated. .gif has one palette for all frames, .webp is lossy, both keep odd sizes. One frame at
-    a time is held; besides, until the end, GIF keeps the frames in an unnamed temporary file, and WebP the
+    or row is repeated. .gif has one palette for all frames, .webp is lossy, both keep odd sizes. A frame is encoded
+    while the next one is made; until the end GIF keeps all of them in an unnamed temporary file, and WebP the
     compressed video in memory.
     """
 
-    _encoder: StreamEncoder | GifEncoder
+    _encoder: Any  # StreamEncoder, or GifEncoder
 
     def __init__(self, path: str | os.PathLike[str], fps: float = 30, loop: int | None = None) -> None:
         """Prepare to write.
@@ -118,7 +115,6 @@ class VideoWriter:
         self.frames = 0
         self._plays = self._kind.loop if loop is None else loop
         self._rate = max(Fraction(fps).limit_denominator(1001), Fraction(1, 1001))  # 29.97 is 30000/1001
-        self._shape: tuple[int, ...] = ()
         self._encoding: Future[None] | None = None
         self._stack = contextlib.ExitStack()
 
@@ -134,15 +130,15 @@ class VideoWriter:
             self._encoder = self._open(*frame.shape[:2])
             self._stack.callback(self._encoder.close)
             self._aside = self._stack.enter_context(ThreadPoolExecutor(1))
-            self._shape = tuple(frame.shape)
-        if tuple(frame.shape) != self._shape:
-            raise ValueError(f"frame {self.frames} is {tuple(frame.shape)}, the first one was {self._shape}")
+            self._shape = frame.shape
+        if frame.shape != self._shape:
+            raise ValueError(f"frame {self.frames} is {tuple(frame.shape)}, the first one was {tuple(self._shape)}")
         self._wait()
         self._encoding = self._aside.submit(self._encoder.add, to_bytes(frame).numpy())
         self.frames += 1
 
     def _wait(self) -> None:
-        """Until the last frame is encoded, which goes on while the caller makes the next one; raises what that did."""
+        """Until the last frame is encoded; raises what that did."""
         if self._encoding is not None:
             self._encoding.result()
 
@@ -158,14 +154,14 @@ class VideoWriter:
             self._wait()
             self._encoder.finish()
 
-    def _open(self, height: int, width: int) -> StreamEncoder | GifEncoder:
-        if max(height, width) > self._kind.max_side:
-            raise InputError(
-                f"{self.path}: {width}×{height} is too large for this format (at most {self._kind.max_side})"
-            )
-        if self._kind is GIF:
-            return GifEncoder(self._temporary, width, height, self._rate, self._plays)
-        return StreamEncoder(self._kind, self._temporary, width, height, self._rate, self._plays)
+    def _open(self, height: int, width: int) -> Any:
+        kind, largest = self._kind, self._kind.max_side
+        if max(height, width) > largest:
+            raise InputError(f"{self.path}: {width}×{height} is too large for this format (at most {largest})")
+        if kind is GIF:  # by its name: other videos never load it
+            gif = import_module("spackle.formats.video_gif")
+            return gif.GifEncoder(self._temporary, width, height, self._rate, self._plays)
+        return StreamEncoder(kind, self._temporary, width, height, self._rate, self._plays)
 
 
 def save_video(
@@ -205,17 +201,12 @@ class StreamEncoder:
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
         """Append [H, W, 3]; in yuv420p an odd side grows by one."""
+        colors = {}
         if self._kind.pixels == "yuv420p":
             rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
-            picture = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(
-                format="yuv420p",
-                src_colorspace="ITU709",
-                dst_colorspace="ITU709",
-                src_color_range="JPEG",
-                dst_color_range="MPEG",
-            )
-        else:
-            picture = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=self._kind.pixels)
+            colors = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"}
+            colors |= {"src_color_range": "JPEG", "dst_color_range": "MPEG"}
+        picture = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=self._kind.pixels, **colors)
         picture.pts, picture.time_base = self._count, 1 / self._rate
         self._write(self._stream.encode(picture))
         self._count += 1

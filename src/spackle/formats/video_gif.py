@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import tempfile
-import zlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -29,15 +29,14 @@ class GifEncoder:
     def __init__(self, path: Path, width: int, height: int, rate: Fraction, plays: int) -> None:
         self._path, self._size, self._rate, self._plays = path, (width, height), rate, plays
         self._waiting = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  # closed by `close`
-        self._lengths: list[int] = []
+        self._packed, self._count = gzip.GzipFile(fileobj=self._waiting, mode="wb", compresslevel=1), 0
         self._colors = Histogram()
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
         """Append [H, W, 3]."""
         self._colors.add(rgb)
-        packed = zlib.compress(rgb.tobytes(), 1)
-        self._waiting.write(packed)
-        self._lengths.append(len(packed))
+        self._packed.write(rgb.tobytes())
+        self._count += 1
 
     def finish(self) -> None:
         """Choose the palette and write the file."""
@@ -76,11 +75,12 @@ class GifEncoder:
         yield from _pulled(sink)
 
     def _frames(self) -> Iterator[NDArray[np.uint8]]:
+        self._packed.close()
         self._waiting.seek(0)
         width, height = self._size
-        for length in self._lengths:
-            content = zlib.decompress(self._waiting.read(length))
-            yield np.frombuffer(content, np.uint8).reshape(height, width, 3)
+        with gzip.GzipFile(fileobj=self._waiting) as packed:
+            for _ in range(self._count):
+                yield np.frombuffer(packed.read(3 * width * height), np.uint8).reshape(height, width, 3)
 
 
 class Histogram:
