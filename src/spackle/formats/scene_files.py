@@ -20,6 +20,7 @@ Floats = NDArray[np.float32]
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 SMALLEST_SCALE, LARGEST_SCALE = 1e-37, 1e37  # keep the logarithm, and float32 after it, finite
+_FLIP = np.array([1, 1, -1, -1], np.float32)
 SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
 
@@ -81,7 +82,7 @@ class Columns:
 
     def flipped(self) -> Columns:
         """Half a turn about x: y up, z backward, as OpenGL and glTF have it."""
-        means, quats = self.means * np.float32([1, -1, -1]), self.quats * np.float32([1, 1, -1, -1])
+        means, quats = self.means * _FLIP[1:], self.quats * _FLIP
         return dataclasses.replace(self, means=means, quats=quats)
 
     def select(self, rows: NDArray[np.int64] | slice) -> Columns:

@@ -112,7 +112,7 @@ def _sections(columns: Columns, bits: int, detail: _Detail) -> list[bytes]:
     colors = (columns.srgb - np.float32(0.5)) * np.float32(COLOR_SCALE * 255 / SH_C0) + np.float32(127.5)
     step = detail.opacity_step
     ball = (scales == scales[:, :1]).all(axis=1, keepdims=True)  # it looks the same however it is turned
-    quats = np.where(ball, np.float32([1, 0, 0, 0]), columns.quats)
+    quats = np.where(ball, np.array([1, 0, 0, 0], np.float32), columns.quats)
     return [
         _positions(columns, bits, detail.position).tobytes(),
         np.minimum(255, np.round(columns.opacities * (255 / step)) * step).astype(np.uint8).tobytes(),

@@ -201,7 +201,7 @@ class StreamEncoder:
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
         """Append [H, W, 3]; in yuv420p an odd side grows by one."""
-        colors = {}
+        colors: dict[str, Any] = {}
         if self._kind.pixels == "yuv420p":
             rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
             colors = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"}

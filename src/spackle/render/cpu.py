@@ -15,7 +15,7 @@ from spackle.camera import Camera
 from spackle.device import run_chunks, thread_count
 from spackle.gaussians import Gaussians
 from spackle.render.blend import TileLists, blend_tiles
-from spackle.render.project import Arrays, KernelCamera, Splats, count_before, project_chunk
+from spackle.render.project import RECORD, Arrays, KernelCamera, Splats, count_before, project_chunk
 from spackle.render.protocol import Rendering, check_tiles
 
 PROJECT_GRAIN = 1 << 16  # Gaussians a thread projects at a time
@@ -72,18 +72,21 @@ def draw(
 
     The other tiles are black and empty where `onto` is None. The gradient needs the colour before sRGB (`keep_linear`).
     """
-    splats, spans = project(sets, view, wanted)
-    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
+    splats, lists = deal_out(sets, view, wanted)
     return blend(splats, lists, view, wanted, onto, keep_linear)
 
 
 def touched_tiles(gaussians: Gaussians, camera: Camera) -> Tensor:
     """[ceil(H/16), ceil(W/16)] bool: the tiles whose pixels can change when these Gaussians come or go."""
     view = KernelCamera.of(camera, 0.0)
-    everywhere = wanted_tiles(view, None)
-    splats, spans = project([gaussians], view, everywhere)
-    lists = list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, everywhere)
+    _, lists = deal_out([gaussians], view, wanted_tiles(view, None))
     return torch.from_numpy(np.diff(lists.starts) > 0).reshape(view.tiles)
+
+
+def deal_out(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tuple[Splats, TileLists]:
+    """All of drawing but the blending."""
+    splats, spans = project(sets, view, wanted)
+    return splats, list_tiles(sort_by_depth(splats.keys, splats.ids, spans), splats.boxes, wanted)
 
 
 def as_array(tensor: Tensor) -> Array:
@@ -105,8 +108,9 @@ def project(sets: Sequence[Gaussians], view: KernelCamera, wanted: Array) -> tup
     Returns:
         The splats, and the spans (start, count) [C, 2] of their keys and ids that are in use.
     """
-    splats = Splats.allocate(sum(len(part) for part in sets))
-    before, first = count_before(wanted), 0
+    n, before, first = sum(len(part) for part in sets), count_before(wanted), 0
+    records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.uint16)
+    splats = Splats(records, boxes, np.empty(n, np.uint32), np.empty(n, np.int32))  # unwritten parts take no memory
     spans: list[tuple[int, int]] = []
     for part in sets:
         scene = tuple(as_array(tensor) for tensor in part.tensors)

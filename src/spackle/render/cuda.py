@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -37,9 +37,7 @@ class Material:
     def of(part: Gaussians, device: torch.device) -> Material:
         """Bring a set there; what is not finite becomes a transparent point: to take it out would wait for the GPU."""
         there = [tensor.to(device, torch.float32, non_blocking=True) for tensor in part.tensors]
-        finite = torch.stack(
-            [t.detach().isfinite() if t.ndim == 1 else t.detach().isfinite().all(-1) for t in there]
-        ).all(0)
+        finite = torch.stack([t.detach().isfinite().unsqueeze(-1).flatten(1).all(1) for t in there]).all(0)
         usable = Gaussians(*(torch.where(finite if t.ndim == 1 else finite[:, None], t, 0) for t in there))
         return Material(usable.means, upper_covariances(usable), usable.opacities, usable.colors)
 
@@ -190,12 +188,11 @@ class GsplatRenderer:
             for image, alpha in zip(drawn, alphas[..., 0], strict=True)
         ]
 
-    def _matrices(self, cameras: Sequence[Camera]) -> list[tuple[Tensor, Tensor]]:
+    def _matrices(self, cameras: Sequence[Camera]) -> Iterator[tuple[Tensor, Tensor]]:
         """Of each camera extrinsics [1, 4, 4] and intrinsics [1, 3, 3]: one upload for all."""
         numbers = [(*c.world_to_camera.flatten().tolist(), *c.K.flatten().tolist()) for c in cameras]
         there = torch.tensor(numbers, dtype=torch.float32).to(self.device, non_blocking=True)
-        views, lenses = there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3)
-        return list(zip(views, lenses, strict=True))
+        return zip(there[:, :16].reshape(-1, 1, 4, 4), there[:, 16:].reshape(-1, 1, 3, 3), strict=True)
 
 
 def load_gsplat(device: torch.device) -> ModuleType:

@@ -113,17 +113,16 @@ def pixel_sums(drawing: Drawing, gradients: Arrays, rows: Array, count: int) -> 
 
 def set_gradients(fields: Sequence[Tensor], view: KernelCamera, table: Array) -> list[Tensor | None]:
     """The gradients of one set's five tensors."""
-    scene = tuple(as_array(t) for t in fields)
-    gradients = tuple(np.zeros(tuple(t.shape), np.float32) for t in fields)
+    scene, gradients = tuple(as_array(t) for t in fields), tuple(np.zeros(t.shape, np.float32) for t in fields)
     run_chunks(lambda a, b: project_backward(a, b, scene, view, table, gradients), len(table), PROJECT_GRAIN)
     return [torch.from_numpy(g) for g in gradients]
 
 
 @kernel
 def replay_row(work: Array, offset: np.uint64, notes: Array, note: np.uint64, peak: np.float32, bell: Numbers) -> None:
-    """Draw one row as `blend_patch` does; note alpha (0 where nothing is drawn) and the light before it.
+    """Draw one row, across which a Gaussian falls as `bell` says (how fast, from where), as `blend_patch` does.
 
-    `bell` is how fast the Gaussian falls across the row, and where its middle lies.
+    Note alpha, 0 where nothing is drawn, and the light before it.
     """
     across, center = bell
     for x in range(TILE):

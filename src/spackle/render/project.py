@@ -77,12 +77,6 @@ class Splats(NamedTuple):
     keys: Array  # [N] uint32, the bits of the depth of visible Gaussians, packed to the front of each chunk
     ids: Array  # [N] int32, the Gaussians that the keys belong to
 
-    @staticmethod
-    def allocate(n: int) -> Splats:
-        """Room for n Gaussians; what is not written to takes no memory."""
-        boxes, keys, ids = np.empty((n, 4), np.uint16), np.empty(n, np.uint32), np.empty(n, np.int32)
-        return Splats(np.empty((n, RECORD), np.float32), boxes, keys, ids)
-
 
 @inlined_kernel
 def in_tile(record: Array, left: int, top: int) -> Numbers:
