@@ -31,6 +31,7 @@ from spackle.dataset import DatasetFiles
 from spackle.dataset.inspect import problems
 from spackle.dataset.photos import find_photos
 from spackle.dataset.shards import load_manifest
+from spackle.errors import one_line
 from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import read_cases
 from spackle.folders import digest_of
@@ -88,6 +89,10 @@ def _sealed(name: str, data: bytes) -> bytes:
 def _only(folder: Path) -> Path:
     (path,) = folder.iterdir()
     return path
+
+
+def _say(line: str) -> None:
+    one_line(line).encode()  # as a report does
 
 
 def _writes(name: str, data: bytes | str) -> Maker:
@@ -211,7 +216,7 @@ def _saved(folder: Path) -> None:
 
 def _read_weights(folder: Path) -> None:
     if (folder / "checkpoint.pt").exists():
-        load_checkpoint(folder, print)
+        load_checkpoint(folder, _say)
         read_tensors(folder / "checkpoint.pt", "give others")
     else:
         read_tensors(_only(folder), "give others")
@@ -266,7 +271,7 @@ READERS: dict[str, Reader] = {
     "keyframes": Reader([_writes("a.json", _keyframes())], lambda folder: load_path(_only(folder))),
     "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),
     "recipes": Reader([_writes("a.yaml", RECIPE)], lambda folder: load_recipe(Recipe, _only(folder))),
-    "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", print)),
+    "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", _say)),
     "datasets": Reader([_dataset], _read_dataset),
     "weights": Reader(
         [_checkpoint, lambda folder: save_file(TENSORS, folder / "a.safetensors"), _saved], _read_weights
