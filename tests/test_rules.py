@@ -13,7 +13,7 @@ import torch
 from holes import CPU, random_network
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import away, box_before_wall, psnr, same_bits, shifted, slanted_plane
+from scenes import away, box_before_wall, psnr, same_bits, slanted_plane
 
 import spackle
 from spackle.camera import Camera
@@ -66,7 +66,7 @@ def test_the_base_comes_first_and_unchanged_in_what_is_merged(name: str, network
 # Rule 2: an aux Gaussian comes from a masked cell, or it is not there.
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=10)
 @given(st.sampled_from(sorted(SCENES)), st.floats(-0.6, 0.6), st.floats(-0.3, 0.3), st.booleans())
 def test_each_aux_gaussian_stands_in_a_masked_cell(name: str, right: float, down: float, guarded: bool) -> None:
     subject = context_of(name)
@@ -107,27 +107,18 @@ def test_a_view_without_holes_gets_nothing_and_stays_bit_for_bit(name: str, netw
 # Rule 4: completion does not damage the photo.
 
 
-def keeps_the_photo(subject: FillContext, aux: Gaussians) -> bool:
-    before = CPU.render(subject.base, subject.photo_camera)
-    after = CPU.render([subject.base, aux], subject.photo_camera)
-    return len(aux) > 0 and psnr(after.rgb, before.rgb) >= 45 and hole_area_ratio(after.alpha) == 0
-
-
 @pytest.mark.parametrize(
     ("name", "network", "kind", "disparity"),
     [*itertools.product(SCENES, [False], TRAJECTORIES, [0.3, 0.6]), ("box", True, "swipe", 0.3)],
 )
 def test_a_completed_scene_keeps_the_photo(name: str, network: bool, kind: str, disparity: float) -> None:
     subject = context_of(name, network)
-    assert keeps_the_photo(subject, fill_scene(subject, path_of(subject, kind, disparity, frames=8)).aux)
-
-
-@pytest.mark.parametrize("right", [-1.5, -1.0, 0.5, 1.5])
-@pytest.mark.parametrize("name", ["box", "odd"])
-def test_a_view_behind_the_photos_guard_keeps_the_photo(name: str, right: float) -> None:
-    """As far as disparity 0.6 and a little, but looking elsewhere than a trajectory does."""
-    subject = context_of(name)
-    assert keeps_the_photo(subject, fill_view(subject, shifted(subject.photo_camera, right)).aux)
+    path = path_of(subject, kind, disparity, frames=8)
+    before = CPU.render(subject.base, subject.photo_camera)
+    for aux in (fill_scene(subject, path).aux, fill_view(subject, path[0]).aux):
+        after = CPU.render([subject.base, aux], subject.photo_camera)
+        assert psnr(after.rgb, before.rgb) >= 45
+        assert hole_area_ratio(after.alpha) == 0
 
 
 # Rule 5: every numeric kernel has an independent oracle, and a test that holds the two together.

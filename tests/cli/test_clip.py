@@ -24,7 +24,7 @@ pytest.importorskip("cv2")
 CPU = CpuRenderer()
 
 
-def test_a_hole_moves_as_the_camera_does_and_not_as_what_hides_it() -> None:
+def test_a_hole_moves_as_the_camera_does() -> None:
     camera = Camera.from_focal(90, 96, 64)
     inverse = torch.full((64, 96), 0.2)
     inverse[20:44, 30:50] = 0.8  # something near that goes its own way
@@ -89,7 +89,7 @@ def frame_of(right: float) -> tuple[Camera, Tensor, BasePrediction]:
     return camera, rgb, lifted(rgb, torch.where(box, BOX, WALL))
 
 
-def test_propagated_holes_are_calmer_and_no_worse_by_the_true_motion() -> None:
+def test_propagated_holes_are_calmer_and_no_worse() -> None:
     completer = ClipCompleter("rotate", 0.3, 80, CPU, OpenCV("this").flow, align=False)
     past: tuple[CompletedView, Camera] | None = None
     flickers, errors = torch.zeros(2), torch.zeros(2)  # alone, and with the past

@@ -123,7 +123,7 @@ def depths(folder: Path, count: int) -> Path:
     return folder
 
 
-def test_a_clip_becomes_a_clip_of_the_same_frames_times_and_sound(tmp_path: Path) -> None:
+def test_a_clip_becomes_one_of_the_same_times_and_sound(tmp_path: Path) -> None:
     write_clip(tmp_path / "a.mp4", moving(5), ticks=[0, 1, 2, 5, 6], sound="aac")
     done = run(
         *("predict", "-i", tmp_path / "a.mp4", "-o", tmp_path / "out", "--depth", depths(tmp_path / "d", 5)),

@@ -11,7 +11,7 @@ from scenes import shifted
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
 from spackle.residual import Seeds
-from spackle.residual.complete import OPACITY, compose
+from spackle.residual.complete import compose
 from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS
 
 CAMERA = shifted(Camera.from_focal(60, 64, 48), 0.4)
@@ -29,29 +29,20 @@ def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
     torch.testing.assert_close(uv, SEEDS.uv, rtol=0, atol=1e-3)
     torch.testing.assert_close(z, 1 / SEEDS.inverse_depth)
     torch.testing.assert_close(linear_to_srgb(BEFORE.colors), SEEDS.rgb)
-    assert torch.equal(BEFORE.opacities, torch.full((20,), OPACITY))
-    for deltas in (None, zeros[:0]):
-        assert len(compose(SEEDS.select(torch.zeros(20, dtype=torch.bool)), deltas, CAMERA)) == 0
+    assert len(compose(SEEDS.select(torch.zeros(20, dtype=torch.bool)), zeros[:0], CAMERA)) == 0
     extremes = dataclasses.replace(SEEDS, rgb=(DRAWN[:, 5:] > 0.5).float())  # black and white
     found = linear_to_srgb(compose(extremes, zeros, CAMERA).colors)
     assert float((found - extremes.rgb).abs().max()) <= COLOR_MARGIN * 1.01  # within a step of 8 bits
 
 
 @pytest.mark.parametrize("by", [-1e4, -20.0, -1.0, 1.0, 20.0, 1e4])
-def test_deltas_move_what_their_channels_say_and_keep_bounds(by: float) -> None:
-    deltas = torch.zeros(3, 20, DELTA_CHANNELS)
-    deltas[0, :, :2] = torch.tensor([by, -2 * by])
-    deltas[1, :, 2] = by
-    deltas[2, :, 10:] = by
-    on_image, along_ray, looks = (compose(SEEDS, part, CAMERA) for part in deltas)
-    uv, z = CAMERA.project(on_image.means)
-    torch.testing.assert_close(uv, SEEDS.uv + deltas[0, :, :2], rtol=1e-4, atol=1e-3)
-    torch.testing.assert_close(z, 1 / SEEDS.inverse_depth, rtol=1e-2, atol=0)
-    uv, z = CAMERA.project(along_ray.means)
+def test_deltas_keep_bounds(by: float) -> None:
+    deltas = torch.zeros(20, DELTA_CHANNELS)
+    deltas[:, 2] = deltas[:, 10:] = by
+    after = compose(SEEDS, deltas, CAMERA)
+    _, z = CAMERA.project(after.means)
     assert float(z.min()) > 0  # never behind the eye
     assert bool(((z < 1 / SEEDS.inverse_depth) == (by > 0)).all())  # inverse depth: more is nearer
-    if abs(by) < 100:
-        torch.testing.assert_close(uv, SEEDS.uv, rtol=0, atol=1e-2)
-    for one, other in ((BEFORE.colors, looks.colors), (BEFORE.opacities, looks.opacities)):
+    for one, other in ((BEFORE.colors, after.colors), (BEFORE.opacities, after.opacities)):
         assert 0 <= float(other.min()) <= float(other.max()) <= 1
         assert bool(((other > one) == (by > 0)).all())

@@ -9,13 +9,9 @@ import pytest
 import torch
 from holes import CPU, box_view, features_of, random_network
 from safetensors.torch import save_file
-from scenes import box_before_wall
 
-from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError
-from spackle.gaussians import Gaussians
 from spackle.residual import ResidualNet
-from spackle.residual.complete import compose
 from spackle.residual.network import DELTA_CHANNELS, IN_CHANNELS, load_residual, network_input
 
 
@@ -46,25 +42,6 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
     assert found[0].shape == (1, IN_CHANNELS, 36, 48)
     assert bool(found[0].isfinite().all())
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0.02)
-
-
-def test_a_rendered_loss_trains_the_network_alone() -> None:
-    scene = box_before_wall(width=48, height=36, focal=40)
-    base = Gaussians(*(t.requires_grad_() for t in scene.base().tensors))
-    camera = extremes(scene.camera, 0.2, DepthRange.of(base))[1]
-    network = random_network()
-    cues, seeds, rim = features_of(base, camera, scene.camera)
-    features = network_input(cues, seeds, rim)
-    deltas = network(features)[0].permute(1, 2, 0)[cues.mask]
-    aux = compose(seeds.select(cues.mask), deltas, camera)
-    assert not features.requires_grad
-    view = CPU.render([base.detach(), aux], camera)
-    (view.rgb.mean() + view.depth.mean() + view.alpha.mean()).backward()
-    for name, parameter in network.named_parameters():
-        assert parameter.grad is not None, name
-        assert bool(parameter.grad.isfinite().all()), name
-        assert bool((parameter.grad != 0).any()), name
-    assert all(t.grad is None for t in base.tensors)
 
 
 def test_weights_that_are_no_numbers_are_named(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_images_travel_down_once_and_gaussians_up_once(monkeypatch: pytest.Monke
     assert sum(value is context.base for value in moved) == 1
 
 
-def test_an_underlay_is_hidden_and_closes_holes_of_neighbouring_views() -> None:
+def test_an_underlay_is_hidden_and_closes_neighbours_holes() -> None:
     context, _ = box_view(width=160, height=120)
     path = path_of(context)
     index = farthest_first(path, context.photo_camera)[0]

