@@ -20,8 +20,10 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, ViewFeatures, hole_area_ratio, hole_mask, make_seeds
+from spackle.residual.base_values import inside_photo
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
 from spackle.scene_fill.fill import COARSE, REACH_CELLS, WIDEST, farthest_first, rim_underlay
+from spackle.scene_fill.texture import in_cells
 
 FRAMES = 60
 
@@ -179,6 +181,22 @@ def test_no_underlay_is_seen_in_the_other_views_holes(monkeypatch: pytest.Monkey
     found = torch.cat([rgb[hole] for rgb, hole in zip(shown, holes, strict=True)])
     assert len(found) > 5000
     assert float((found[:, 1] > found[:, ::2].amax(-1)).float().mean()) < 0.01
+
+
+def test_an_underlay_shows_nowhere_beyond_the_photos_border(monkeypatch: pytest.MonkeyPatch) -> None:
+    context, _ = box_view()
+    sides = extremes(context.photo_camera, 0.6, DepthRange.of(context.base))
+    aux = fill_scene(context, sides, exact=True).aux
+    monkeypatch.setattr(fill, "rim_underlay", lambda *given: Gaussians.empty())
+    bare = fill_scene(context, sides, exact=True).aux
+    assert len(bare) < len(aux)
+    for camera in sides:
+        features = ViewFeatures.of(CPU.render(context.base, camera))
+        seeds = make_seeds(features, camera, context.photo_camera)
+        beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, context.photo_camera)
+        with_rims, without = (CPU.render([context.base, part], camera).rgb for part in (aux, bare))
+        assert int(beyond.sum()) > 500
+        assert float(in_cells(with_rims - without)[beyond].abs().max()) < 0.03
 
 
 class Counting(CpuRenderer):
