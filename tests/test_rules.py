@@ -122,7 +122,7 @@ def test_a_completed_scene_keeps_the_photo(name: str, network: bool, kind: str, 
     assert keeps_the_photo(subject, fill_scene(subject, path_of(subject, kind, disparity, frames=8)).aux)
 
 
-@pytest.mark.parametrize(("name", "right"), itertools.product(["box", "odd"], [-1.5, -1.0, 0.5, 1.5]))
+@pytest.mark.parametrize(("name", "right"), [*itertools.product(["box", "odd"], [-1.5, -1.0, 0.5, 1.5])])
 def test_a_view_that_looks_elsewhere_keeps_the_photo(name: str, right: float) -> None:
     subject = context_of(name)
     assert keeps_the_photo(subject, fill_view(subject, shifted(subject.photo_camera, right)).aux)

@@ -1,23 +1,25 @@
-"""The paper's method for one view, held to eq. 2 to 9 written out cell by cell."""
+"""The paper's method for one view, held to eqs. 2 to 9 written out cell by cell; bounds of what deltas do."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
 import torch
 from holes import CPU, random_network
-from scenes import away, box_before_wall
+from scenes import away, box_before_wall, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
-from spackle.color import srgb_to_linear
+from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, make_seeds
-from spackle.residual.network import find_rim, network_input
+from spackle.residual.complete import compose
+from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS, find_rim, network_input
 from spackle.surface import surface_gaussians
 
 R = ReferenceRenderer()
@@ -93,3 +95,37 @@ def test_without_holes_or_network_there_is_nothing_or_the_seeds() -> None:
     seeds, untrained = (complete_view(base, camera, scene.camera, CPU, network) for network in (None, ResidualNet()))
     assert len(seeds) == 24 * 18  # every cell: nothing is seen there
     torch.testing.assert_close(seeds.means, untrained.means, rtol=1e-3, atol=1e-3)
+
+
+VIEW = shifted(Camera.from_focal(60, 64, 48), 0.4)
+DRAWN = torch.rand(20, 8, generator=torch.Generator().manual_seed(0))
+UV = DRAWN[:, :2] * torch.tensor([64.0, 48.0])
+SEEDS = Seeds(UV, 0.1 + DRAWN[:, 2], 0.01 * (DRAWN[:, 3:5] - 0.5), 0.1 + 0.8 * DRAWN[:, 5:])
+BEFORE = compose(SEEDS, None, VIEW)
+
+
+def test_no_deltas_and_zero_deltas_both_give_the_seeds() -> None:
+    zeros = torch.zeros(20, DELTA_CHANNELS)
+    for one, other in zip(BEFORE.tensors, compose(SEEDS, zeros, VIEW).tensors, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    uv, z = VIEW.project(BEFORE.means)
+    torch.testing.assert_close(uv, SEEDS.uv, rtol=0, atol=1e-3)
+    torch.testing.assert_close(z, 1 / SEEDS.inverse_depth)
+    torch.testing.assert_close(linear_to_srgb(BEFORE.colors), SEEDS.rgb)
+    assert len(compose(SEEDS.select(torch.zeros(20, dtype=torch.bool)), zeros[:0], VIEW)) == 0
+    extremes = dataclasses.replace(SEEDS, rgb=(DRAWN[:, 5:] > 0.5).float())  # black and white
+    found = linear_to_srgb(compose(extremes, zeros, VIEW).colors)
+    assert float((found - extremes.rgb).abs().max()) <= COLOR_MARGIN * 1.01  # within a step of 8 bits
+
+
+@pytest.mark.parametrize("by", [-1e4, -20.0, -1.0, 1.0, 20.0, 1e4])
+def test_deltas_keep_bounds(by: float) -> None:
+    deltas = torch.zeros(20, DELTA_CHANNELS)
+    deltas[:, 2] = deltas[:, 10:] = by
+    after = compose(SEEDS, deltas, VIEW)
+    _, z = VIEW.project(after.means)
+    assert float(z.min()) > 0  # never behind the eye
+    assert bool(((z < 1 / SEEDS.inverse_depth) == (by > 0)).all())  # inverse depth: more is nearer
+    for one, other in ((BEFORE.colors, after.colors), (BEFORE.opacities, after.opacities)):
+        assert 0 <= float(other.min()) <= float(other.max()) <= 1
+        assert bool(((other > one) == (by > 0)).all())
