@@ -367,8 +367,7 @@ main()
     assert evaluate(scenes, killed, *choices).code == 0
     assert before == {path.name: path.stat().st_mtime_ns for path in (killed / "images").iterdir()}
     same_files(whole, killed, ("rows.jsonl", "worst.png", "best.png", *TABLES))
-    refused = evaluate(scenes, killed, *choices[:-1], "0.5")
-    assert (refused.code, "disparities: [0.4] -> [0.5]" in refused.err) == (2, True)
+    refuses(evaluate(scenes, killed, *choices[:-1], "0.5"), "disparities: [0.4] -> [0.5]")
 
 
 def test_a_broken_image_is_named_and_the_others_go_on(
@@ -379,15 +378,15 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     photo = root / "Chair" / "left.png"
     whole = photo.read_bytes()
     choices = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
-    for content in (whole[: len(whole) // 2], b""):  # the second has not even a header
-        photo.write_bytes(content)
-        for where, more in ((output, choices), (tmp_path / "near", (*choices[:4], "--protocol", "near-view"))):
-            done = evaluate(root, where, *more)
-            assert done.code == 0, done.err
-            (line,) = [line for line in done.lines if "passed over:" in line]
-            assert "Chair/left.png: " in line
-            assert list(load_run(where).problems) == ["Chair"]
-            assert str(tmp_path) not in (where / "rows.jsonl").read_text()
+    near = (*choices[:4], "--protocol", "near-view")
+    for content, where, more in ((whole[: len(whole) // 2], output, choices), (b"", tmp_path / "near", near)):
+        photo.write_bytes(content)  # the second has not even a header
+        done = evaluate(root, where, *more)
+        assert done.code == 0, done.err
+        (line,) = [line for line in done.lines if "passed over:" in line]
+        assert "Chair/left.png: " in line
+        assert list(load_run(where).problems) == ["Chair"]
+        assert str(tmp_path) not in (where / "rows.jsonl").read_text()
     assert "1 of 3 images gave no figures: Chair." in (output / "tables.md").read_text()
     photo.write_bytes(whole)
     assert evaluate(root, output, *choices).code == 0
@@ -401,7 +400,7 @@ def test_a_broken_image_is_named_and_the_others_go_on(
     monkeypatch.setattr(
         "spackle.evaluation.evaluate.load_case", lambda case: dataclasses.replace(load(case), lacks=(lack,))
     )
-    done = evaluate(scenes, tmp_path / "lacks", *choices[:4], "--protocol", "near-view", "--limit", 1)
+    done = evaluate(scenes, tmp_path / "lacks", *near, "--limit", 1)
     remark = "without one of its second photos: Chair/third.png: not an image"
     assert f"Chair: {remark}" in done.lines
     assert [row.value for row in load_run(tmp_path / "lacks").rows if row.metric == "remark"] == [remark]

@@ -111,7 +111,7 @@ def evaluate(
         limit=limit,
         download=download_metrics,
     )
-    if options.near and "--disparity" in _given(context):
+    if options.near and _has_disparities(context):
         raise InputError(
             f"--disparity {disparity}: --protocol near-view looks from where the true second photos were taken: "
             "leave one of them out"
@@ -179,10 +179,10 @@ def bench(
         raise typer.Exit(INTERRUPTED)
 
 
-def _given(context: typer.Context) -> set[str]:
-    """The options that stand on the command line, by their long names."""
-    sources = {p.opts[-1]: context.get_parameter_source(p.name) for p in context.command.params if p.name}
-    return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+def _has_disparities(context: typer.Context) -> bool:
+    """Whether --disparity stands on the command line."""
+    source = context.get_parameter_source("disparity")
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _sorted_words(
@@ -190,8 +190,7 @@ def _sorted_words(
 ) -> tuple[Path | None, str]:
     """The folder, and the disparities with numbers that follow as words; InputError for a word that belongs nowhere."""
     words = [*([] if folder is None else [str(folder)]), *context.args]
-    source = context.get_parameter_source("disparity")
-    listed = source is not None and source.name == "COMMANDLINE"
+    listed = _has_disparities(context)
     others = [word for word in words if not (listed and NUMBER.fullmatch(word))]
     if not others and root is None:
         others = words[:1]  # a folder may be named by a number
