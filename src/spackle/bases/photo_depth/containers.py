@@ -21,7 +21,7 @@ class BrokenDepth(Exception):
 
 
 XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
-MAX_SCANS = 10_000
+MAX_MARKERS = 10_000
 MAX_PICTURES = 64
 _GUID = re.compile(rb"HasExtendedXMP\s*(?:=\s*[\"']|>\s*)([0-9A-Fa-f]{32})")
 _PICTURE_LIST = 0xB002
@@ -60,7 +60,7 @@ def extended_xmp_of(image: JpegImageFile) -> tuple[bytes, bool]:
 def end_of_picture(data: bytes) -> int | None:
     """The first byte behind the JPEG that the file begins with; None where it has no end."""
     at = 2
-    for _ in range(MAX_SCANS):
+    for _ in range(MAX_MARKERS):
         if (found := _MARKER.search(data, at)) is None:
             return None
         if found[1] == _END:
