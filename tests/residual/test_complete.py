@@ -17,7 +17,7 @@ from spackle.color import linear_to_srgb, srgb_to_linear
 from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
-from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, make_seeds
+from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, hole_area_ratio, make_seeds
 from spackle.residual.complete import compose
 from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS, find_rim, network_input
 from spackle.surface import surface_gaussians
@@ -61,8 +61,7 @@ def paper(base: Gaussians, camera: Camera, photo: Camera, f_res: ResidualNet) ->
     chosen = []
     for row in range(deltas.shape[1]):
         for column in range(deltas.shape[2]):
-            pixels = [(2 * row + dy, 2 * column + dx) for dy in (0, 1) for dx in (0, 1)]
-            if any(holes[y][x] for y, x in pixels if y < camera.height and x < camera.width):  # eq. 7
+            if holes[2 * row][2 * column]:  # eq. 7, on a grid of every second pixel
                 chosen.append(augmented(seeds, row, column, deltas[:, row, column].tolist(), camera))
     aux = Gaussians.cat(chosen)
     return aux, R.render(Gaussians.cat([base, aux]), camera)  # eqs. 8 and 9
@@ -85,6 +84,17 @@ def test_a_view_is_completed_as_the_equations_say(size: tuple[int, int]) -> None
     found = CPU.render([base, aux], camera)
     assert float((found.rgb - final.rgb).abs().mean()) < 1e-3
     assert float((found.alpha - final.alpha).abs().mean()) < 1e-3
+
+
+def test_cells_are_as_many_as_holes_and_the_paper_keeps_64() -> None:
+    scene = box_before_wall(width=96, height=72)
+    base, size = scene.base(), 48 * 36
+    for side, disparity in ((0, 0.2), (1, 0.5)):
+        camera = extremes(scene.camera, disparity, DepthRange.of(base))[side]
+        har = hole_area_ratio(CPU.render(base, camera).alpha)
+        assert len(complete_view(base, camera, scene.camera, CPU, None)) / (har * size) == pytest.approx(1, abs=0.05)
+    for network in (None, random_network()):
+        assert len(complete_view(base, scene.camera, scene.camera, CPU, network, least=64)) == 64
 
 
 def test_without_holes_or_network_there_is_nothing_or_the_seeds() -> None:

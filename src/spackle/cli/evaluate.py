@@ -60,9 +60,9 @@ def evaluate(
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Of base, spackle, spackle-scene, network, seeds, dense, inpaint2d, direct-ft; with commas.",
+            help="Of base, paper, spackle, spackle-scene, seeds, dense, inpaint2d, direct-ft; with commas.",
         ),
-    ] = "base,spackle",
+    ] = "base,paper,spackle",
     disparity: Disparity = "0.3,0.4,0.5",
     metrics: Annotated[
         str | None,

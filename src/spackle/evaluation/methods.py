@@ -14,7 +14,7 @@ from spackle.camera import Camera
 from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render.protocol import Rendering
-from spackle.residual import hole_mask
+from spackle.residual import complete_view, hole_mask
 from spackle.residual.base_values import make_seeds
 from spackle.residual.complete import compose
 from spackle.residual.network import find_rim, predict_deltas
@@ -33,11 +33,15 @@ class MethodView(NamedTuple):
 
 # (cameras, the base's renderings from them) to a view for each, one at a time: there may be many.
 Method = Callable[[Sequence[Camera], Sequence[Rendering]], Iterator[MethodView]]
+LEAST_AUX = 64  # that the paper keeps in each view (training details)
 METHODS = {  # title in tables, description in captions
     "base": ("base alone", "the base's render, holes black"),
-    "spackle": ("Spackle", "aux Gaussians for each view by itself, as in the paper"),
+    "paper": (
+        "Spackle, eqs. 2 to 9",
+        "the paper's method: one pass for each view, an aux Gaussian for each masked cell",
+    ),
+    "spackle": ("Spackle", "ours: each view by itself in two passes, behind what the photo shows, with texture"),
     "spackle-scene": ("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
-    "network": ("network", "as Spackle, without the exemplar's texture: the paper's method"),
     "seeds": ("seeds", "as Spackle, without a network: deltas of zero"),
     "dense": ("dense grid", "an aux Gaussian for every cell, in one pass"),
     "inpaint2d": ("2D inpainting", "the base's render, its hole inpainted as a flat picture"),
@@ -67,13 +71,24 @@ def make_method(
         return partial(_inpaint_2d, inpainter)
     methods: dict[str, Method] = {
         "base": lambda cameras, before: (MethodView(view.rgb, view.alpha, 0) for view in before),
+        "paper": partial(_paper, context),
         "spackle": partial(_per_view, context),
         "spackle-scene": partial(_one_scene, context),
-        "network": partial(_per_view, dataclasses.replace(context, texture=None)),
         "seeds": partial(_per_view, context.seeds_alone),
         "dense": partial(_dense, context),
     }
     return methods[name]
+
+
+def _paper(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+    """Aux Gaussians for each view, as eqs. 2 to 9 say."""
+    placed = context.placed
+    given = (placed.photo_camera, placed.renderer, placed.network)
+    for camera, rendering in zip(cameras, before, strict=True):
+        aux = complete_view(
+            placed.base, camera, *given, threshold=placed.threshold, least=LEAST_AUX, precision=placed.precision
+        )
+        yield _drawn(placed, aux, camera, rendering)
 
 
 def _per_view(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:

@@ -24,7 +24,7 @@ STYLES = {
     "base": ("#5b6066", "o"),
     "spackle": ("#0072b2", "D"),
     "spackle-scene": ("#3a9fd8", "P"),
-    "network": ("#7a4fb5", "<"),
+    "paper": ("#7a4fb5", "<"),
     "seeds": ("#008a66", "^"),
     "dense": ("#b5568c", "s"),
     "inpaint2d": ("#c87f00", "v"),

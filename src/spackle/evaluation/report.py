@@ -47,7 +47,7 @@ QUALITY = 85  # of WebP
 MOST = 8  # images of a page
 LEAST = 2  # of each evaluation, however many there are
 # A slider has the first of these that there are: all methods of all images would make a page too large.
-SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "network", "seeds", "direct-ft", "spackle-scene", "dense")
+SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "paper", "seeds", "direct-ft", "spackle-scene", "dense")
 MOST_SHOWN = 6
 HEADLINES = {  # figures of near views: what they are, their unit, digits
     "psnr_hole": ("PSNR in the hole, higher is better", " dB", 2),

@@ -43,7 +43,7 @@ class EvaluateOptions:
     dataset: str
     root: Path
     protocol: str = "large-view"
-    methods: Sequence[str] = ("base", "spackle")
+    methods: Sequence[str] = ("base", "paper", "spackle")
     disparities: Sequence[float] = DISPARITIES  # of the large views
     metrics: Sequence[str] | None = None  # the protocol's where None
     base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too

@@ -19,7 +19,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import Renderer
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim, predict_deltas
-from spackle.residual.view_features import MASK_THRESHOLD, ViewFeatures
+from spackle.residual.view_features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
 from spackle.surface import surface_gaussians
 
 SPREAD_PX = 1.3  # standard deviation; cells two pixels apart close to alpha 0.95 at the worst spot
@@ -40,9 +40,13 @@ def complete_view(
     network: ResidualNet | None,
     *,
     threshold: float = MASK_THRESHOLD,
+    least: int = 0,
     precision: Precision = "auto",
 ) -> Gaussians:
     """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell, on top of the base, which is only read.
+
+    A cell of the grid is masked as its first pixel is, so that there are about HAR × grid of them, as in the paper's
+    tables.
 
     Args:
         base: N Gaussians in the world's frame, 𝒢_base.
@@ -51,10 +55,16 @@ def complete_view(
         renderer: ℛ.
         network: f_res, which runs on the device where it lies; None: the base values alone, as if its deltas were 0.
         threshold: τ_α.
+        least: so many Gaussians come in any case, where few cells are masked those of the least opaque cells; 64 in
+            the paper (training details), 0 where a view without holes shall stay as it is.
         precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
     """
-    features = ViewFeatures.of(renderer.render(base, camera), threshold)  # eqs. 2 to 4
-    mask = features.mask
+    view = renderer.render(base, camera)  # eqs. 2 and 3
+    features = ViewFeatures.of(view, threshold)
+    mask = hole_mask(view.alpha, threshold)[::CELL, ::CELL].cpu()  # eq. 4
+    if int(mask.count_nonzero()) < least:
+        mask = torch.zeros_like(mask)
+        mask.view(-1)[features.alpha.flatten().argsort(stable=True)[:least]] = True
     if not bool(mask.any()):
         return Gaussians.empty(base.means.device)
     seeds, deltas = make_seeds(features, camera, photo_camera), None
