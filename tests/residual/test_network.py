@@ -1,15 +1,54 @@
-"""f_res (eq. 5): its size, and what it is given."""
+"""f_res (eq. 5) and what it is given: the mask of a view (eq. 4) and what its cells show."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
-from holes import CPU, box_view, features_of, random_network
+from holes import CPU, box_view, features_of, random_network, random_view
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from spackle.residual import ResidualNet
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.render.protocol import Rendering
+from spackle.residual import ResidualNet, ViewFeatures, hole_area_ratio, hole_mask
 from spackle.residual.network import DELTA_CHANNELS, IN_CHANNELS, network_input
+
+
+def test_a_hole_is_where_alpha_is_below_the_threshold() -> None:
+    alpha = torch.tensor([[0.0, 0.9499, 0.95, 1.0]])
+    assert hole_mask(alpha).tolist() == [[True, True, False, False]]
+    assert (hole_area_ratio(alpha), hole_area_ratio(alpha, threshold=0.5)) == (0.5, 0.25)
+
+
+def plain_cell(view: Rendering, row: int, column: int) -> tuple[list[float], float, float, bool]:
+    """One cell of the cues in plain Python; an odd last row or column counts twice."""
+    height, width = view.alpha.shape
+    pixels = [(min(2 * row + dy, height - 1), min(2 * column + dx, width - 1)) for dy in (0, 1) for dx in (0, 1)]
+    alphas = [float(view.alpha[p]) for p in pixels]
+    light = [sum(float(srgb_to_linear(view.rgb[p])[c]) for p in pixels) for c in range(3)]
+    rgb = [float(linear_to_srgb(torch.tensor(x / max(sum(alphas), 1e-6)))) for x in light]
+    covered = [1 / float(view.depth[p]) for p, alpha in zip(pixels, alphas, strict=True) if alpha >= 0.95]
+    return rgb, min(covered, default=0.0), sum(alphas) / 4, len(covered) < 4
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 7), st.integers(1, 7)))
+def test_features_match_a_plain_loop_and_are_detached(seed: int, size: tuple[int, int]) -> None:
+    view = random_view(seed, *size)
+    cues = ViewFeatures.of(Rendering(*(t.clone().requires_grad_() for t in (view.rgb, view.depth, view.alpha))))
+    assert not any(t.requires_grad for t in (cues.rgb, cues.inverse_depth, cues.alpha))
+    rows, columns = math.ceil(size[0] / 2), math.ceil(size[1] / 2)
+    assert cues.mask.shape == (rows, columns)
+    for row in range(rows):
+        for column in range(columns):
+            rgb, inverse, alpha, mask = plain_cell(view, row, column)
+            assert cues.rgb[row, column].tolist() == pytest.approx(rgb, abs=1e-4)
+            assert float(cues.inverse_depth[row, column]) == pytest.approx(inverse, rel=1e-5)
+            assert float(cues.alpha[row, column]) == pytest.approx(alpha, abs=1e-6)
+            assert bool(cues.mask[row, column]) == mask
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31)])

@@ -8,16 +8,13 @@ import math
 from collections.abc import Sequence
 
 import torch
-from holes import random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import away, same_bits, shifted
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.residual import hole_mask
 from spackle.scene_fill import OcclusionGuard
 from spackle.scene_fill.occlusion_guard import (
     CLEARANCE,
@@ -107,15 +104,6 @@ def test_nothing_is_pushed_without_a_reason() -> None:
     assert len(push_behind(Gaussians.empty(), eye, [guard])) == 0
     behind = dataclasses.replace(random_aux(1, 0), means=torch.tensor([[0.1, 0.2, -3.0]]))
     assert same_bits(push_behind(behind, eye, [guard]), behind)
-
-
-@PROPERTY
-@given(SEEDS, st.tuples(st.integers(1, 90), st.integers(1, 30)))
-def test_a_guard_is_the_farthest_depth_in_a_window(seed: int, size: tuple[int, int]) -> None:
-    view = random_view(seed, *size)
-    guard = OcclusionGuard.of(view, Camera.from_focal(20, size[1], size[0]))
-    seen = torch.where(hole_mask(view.alpha), 0.0, view.depth)[None, None]
-    assert torch.equal(guard.depth, max_pool2d(seen, 2 * WINDOW_PX + 1, stride=1, padding=WINDOW_PX)[0, 0])
 
 
 @PROPERTY
