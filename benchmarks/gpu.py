@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import torch
-from suite_scenes import SIDE, find_view, holed_scene, photo_scene
+from suite_scenes import SIDE, commit, find_view, holed_scene, photo_scene
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import to_metric
@@ -34,7 +34,7 @@ from spackle.evaluation.bench import TOTAL, Task, measure
 from spackle.files import write_whole
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.machine import commit, hardware, versions
+from spackle.machine import hardware, versions
 from spackle.render import CpuRenderer
 from spackle.render.cpu import project, wanted_tiles
 from spackle.render.cuda import GsplatRenderer, Material, load_gsplat

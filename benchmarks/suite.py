@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from naive_renderer import naive_render
-from suite_scenes import SIDE, find_view, holed_scene, photo_scene
+from suite_scenes import SIDE, commit, find_view, holed_scene, photo_scene
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
@@ -43,7 +43,7 @@ from spackle.folders import make_folder
 from spackle.formats import save_ply, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import Photo
-from spackle.machine import commit, hardware, load_average, versions
+from spackle.machine import hardware, load_average, versions
 from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.cpu import blend, list_tiles, project, sort_by_depth, wanted_tiles
 from spackle.render.project import KernelCamera

@@ -1,10 +1,14 @@
-"""Synthetic scenes of SHARP's size for benchmarks, and views of them with holes."""
+"""Synthetic scenes of SHARP's size for benchmarks, views of them with holes, and the commit that is measured."""
 
 from __future__ import annotations
+
+import subprocess
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+import spackle
 from spackle.camera import Camera
 from spackle.camera_path import MAX_DISPARITY, DepthRange, extremes
 from spackle.errors import InputError
@@ -81,3 +85,14 @@ def find_view(base: Gaussians, camera: Camera, renderer: Renderer, share: float 
         if abs(found / share - 1) < CLOSE:
             return middle, view
     raise InputError(f"no view up to disparity {MAX_DISPARITY:g} has {share:.0%} holes")
+
+
+def commit() -> str:
+    """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
+    git = ["git", "-C", str(Path(spackle.__file__).parent)]
+    try:  # a project that this package is only installed into does not track it
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
+        found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
+        return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

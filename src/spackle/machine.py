@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -37,23 +35,3 @@ def hardware(device: torch.device) -> dict[str, Any]:
 def load_average() -> float | None:
     """Of the machine over the last minute, where it tells."""
     return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
-
-
-def commit() -> str:
-    """Of the checkout that this package runs from, with a + where files were changed since; "unknown" without one."""
-    git = ["git", "-C", str(Path(spackle.__file__).parent)]
-    try:  # a project that this package is only installed into does not track it
-        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], capture_output=True, check=True)
-        found = [*git, "describe", "--always", "--dirty=+", "--exclude=*"]
-        return subprocess.run(found, capture_output=True, check=True, text=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
-def without_nan(value: Any) -> Any:
-    """JSON knows no NaN."""
-    if isinstance(value, dict):
-        return {key: without_nan(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -36,7 +36,7 @@ from spackle.errors import InputError, reading
 from spackle.files import write_json
 from spackle.folders import results_folder
 from spackle.formats import save_png
-from spackle.machine import hardware, versions, without_nan
+from spackle.machine import hardware, versions
 from spackle.progress import Reporter, asked_to_stop
 from spackle.training.checkpoint import (
     BAD,
@@ -193,7 +193,7 @@ def _learn(
 
     def report(ended: str | None = None) -> None:
         if rank() == 0:
-            write_json(without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
+            write_json(_without_nan({**facts, "ended": ended, **dataclasses.asdict(progress)}), folder / RUN)
 
     def parts(step: int) -> list[list[int]]:
         """This process's items of a step, as they go through the network."""
@@ -391,3 +391,12 @@ def sum_of_ranks(numbers: Mapping[str, float], device: torch.device) -> dict[str
     if rank_count() > 1:
         dist.all_reduce(tensor)
     return dict(zip(numbers, tensor.tolist(), strict=True))
+
+
+def _without_nan(value: Any) -> Any:
+    """The value with None for what is not finite, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
