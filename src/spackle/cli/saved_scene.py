@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import mimetypes
 import os
 import time
@@ -26,7 +25,7 @@ from spackle.formats.ply import PlyFile
 from spackle.formats.scene_files import Encoder, SceneFile, encoder_of
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.formats.video import FORMATS
-from spackle.image import DEFAULT_FOCAL_MM, film_to_pixels
+from spackle.image import DEFAULT_FOCAL_MM, focal_length
 from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
@@ -57,18 +56,18 @@ def render_scene(
     with reporter.stage("load"):
         given, keyframes = path.load()
         loaded = PlyFile(scene).scene()
-        gaussians, stored, reach = loaded.gaussians, loaded.camera, loaded.disparity
+        gaussians, reach = loaded.gaussians, loaded.disparity
         if given:
             cameras = given
         else:
-            camera = _photo_camera(stored, path.video.size, focal_px)
+            camera = _photo_camera(loaded, path.video.size, focal_px)
             try:
                 cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
             except PathError as error:
                 raise InputError(f"{path.path}: {error}") from error
             except ValueError as error:
                 raise InputError(f"{scene}: no camera path: {error}: give views with --cameras") from error
-            if stored is None and focal_px is None:
+            if loaded.camera is None and focal_px is None:
                 reporter.log(
                     f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
                     f"{camera.width}×{camera.height} (--focal-px, --size)"
@@ -104,10 +103,8 @@ def render_scene(
     seconds = reporter.seconds["video"]
     result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
     if max(holes) > TOLERATED:
-        mean, far = (
-            sum(holes) / len(holes),
-            "" if reach is None else f": the scene was completed for --disparity {reach:g}",
-        )
+        mean = sum(holes) / len(holes)
+        far = "" if reach is None else f": the scene was completed for --disparity {reach:g}"
         reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average{far}")
     if problem:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
@@ -118,16 +115,14 @@ def render_scene(
         reporter.result({"file": target, **result})
 
 
-def _photo_camera(stored: Camera | None, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
+def _photo_camera(file: SceneFile, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
     """The stored camera, changed as the options say; else a lens of 30 mm."""
+    stored = file.camera
     width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
-    if focal_px is not None:
-        if not (math.isfinite(focal_px) and focal_px > 0):
-            raise InputError(f"--focal-px must be a positive number, got {focal_px:g}")
-        return Camera.from_focal(focal_px, width, height)
-    if stored is not None:
+    if stored is not None and focal_px is None:
         return cover(stored, width, height)
-    return Camera.from_focal(film_to_pixels(DEFAULT_FOCAL_MM, width, height), width, height)
+    focal, _ = focal_length(file.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=None)
+    return Camera.from_focal(focal, width, height)
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:

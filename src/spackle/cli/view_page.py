@@ -51,17 +51,9 @@ def view_page(
 ) -> bool:
     """Show a scene or a photo until somebody stops it; False where work is left over that cannot be interrupted.
 
-    Args:
-        target: the scene or the photo.
-        uploads: what completes photos; its base's depth and calibration are those of `target`.
-        lens: `focal_px` and `fov` of `target`.
-        host: where to listen.
-        port: 0 takes any that is free.
-        token: only who knows the page's address gets in.
-        browser: open one.
-
-    Raises:
-        InputError: a file that is neither, or an option that cannot be used.
+    `uploads` completes photos, the first with the depth and calibration of its base and with `lens`, `focal_px` and
+    `fov`. With `token` only who knows the page's address gets in. InputError for a file that is neither, or an option
+    that cannot be used.
     """
     reporter, base = uploads.reporter, uploads.first
     begin: Callable[[ViewerServer], object]
