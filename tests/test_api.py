@@ -56,9 +56,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
         spackle.nonsense  # noqa: B018
 
 
-def test_files_names_and_values_are_the_same_input_and_the_base_comes_first(
-    scene: spackle.Scene, pair: tuple[Path, Path]
-) -> None:
+def test_files_names_and_values_are_the_same_input(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
     photo, depth = pair
     loaded = spackle.load_photo(photo), spackle.load_depth(depth)
     assert same_bits(spackle.predict(*loaded).gaussians, scene.gaussians)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import signal
+import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from command import FILES, SHORT, decode, names_in, predicted, report_of, run
+from command import FILES, SHORT, Run, decode, names_in, predicted, report_of, run
 from photos import metres, write_depth, write_photo
 
 import spackle
@@ -40,58 +39,49 @@ def test_help_does_not_wait_for_torch(words: str, shown: str) -> None:
     assert (result.returncode, shown in result.stdout) == (0, True), result.stderr
 
 
-def test_ctrl_c_is_one_line(tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("at", ["pipeline.fill_views", "cli.photo.save_views", "cli.photo.write_json"])
+def test_ctrl_c_is_one_line_and_leaves_an_old_set_whole(
+    tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
     def interrupted(*args: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spackle.pipeline.fill_views", interrupted)
-    result = run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path / "new" / "out", "-v", *SHORT)
-    assert result.code == 130
-    assert [line.split(":")[0] for line in result.lines[:2]] == ["  load", "  prepare"]  # -v times every stage
-    assert result.lines[-1] == "interrupted"
+    old = shutil.copytree(plain[0], tmp_path / "old" / "photo")
+    monkeypatch.setattr(f"spackle.{at}", interrupted)
+    for out in (tmp_path / "new" / "out", tmp_path / "old"):
+        result = run("predict", pair[0], "--depth", pair[1], "-o", out, "-v", "--disparity", "0.5", *SHORT)
+        assert result.code == 130
+        assert [line.split(":")[0] for line in result.lines[:2]] == ["  load", "  prepare"]  # -v times every stage
+        assert result.lines[-1] == "interrupted"
     assert not (tmp_path / "new").exists()
+    assert {name: (old / name).read_bytes() for name in names_in(old)} == {
+        name: (plain[0] / name).read_bytes() for name in FILES
+    }
 
 
-@pytest.fixture
-def started(tmp_path: Path, pair: tuple[Path, Path]) -> Iterator[Callable[[str], subprocess.Popen[bytes]]]:
-    """Starts a long prediction into `out` as a process, which has come as far as a file of `out/photo`."""
-    processes: list[subprocess.Popen[bytes]] = []
-
-    def start(pattern: str) -> subprocess.Popen[bytes]:
-        words = ["predict", pair[0], "--depth", pair[1], "-o", tmp_path / "out", "--frames", "1500"]
-        processes.append(process := subprocess.Popen([*COMMAND, *map(str, words)], stderr=subprocess.DEVNULL))
-        deadline = time.monotonic() + 240
-        while not list((tmp_path / "out" / "photo").glob(pattern)):
-            assert process.poll() is None, "ended before it could be stopped"
-            assert time.monotonic() < deadline
-            time.sleep(0.005)
-        return process
-
-    yield start
-    for process in processes:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal here")
-def test_a_killed_run_leaves_whole_files_and_the_next_one_finishes(
-    tmp_path: Path, pair: tuple[Path, Path], started: Callable[[str], subprocess.Popen[bytes]]
-) -> None:
-    folder, process = tmp_path / "out" / "photo", started(".new/.video.*.mp4")
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
+@pytest.mark.parametrize(("end", "code"), [("terminate", 128 + 15), ("kill", -9)])
+def test_an_ended_run_leaves_nothing_half_done(tmp_path: Path, pair: tuple[Path, Path], end: str, code: int) -> None:
+    folder = tmp_path / "out" / "photo"
+    words = ["predict", pair[0], "--depth", pair[1], "-o", tmp_path / "out", "--frames", "1500"]
+    with subprocess.Popen([*COMMAND, *map(str, words)], stderr=subprocess.DEVNULL) as process:
+        try:
+            deadline = time.monotonic() + 240
+            while not list(folder.glob(".new/.video.*.mp4")):
+                assert process.poll() is None, "ended before it could be stopped"
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+            getattr(process, end)()
+            assert process.wait(timeout=120) == code
+        finally:
+            process.kill()
+    if end == "terminate":
+        assert not (tmp_path / "out").exists()
+        return
     assert names_in(folder) == {".lock", ".new"}  # nothing has taken its place before all is whole
     (folder / ".other.0123456789ab.ply").touch()  # somebody else's
     predicted(*pair, tmp_path / "out")
     assert names_in(folder) == {*FILES, ".other.0123456789ab.ply"}
     assert len(decode(folder / "video.mp4")) == 3
-
-
-def test_sigterm_leaves_no_folder(tmp_path: Path, started: Callable[[str], subprocess.Popen[bytes]]) -> None:
-    process = started(".new")
-    process.terminate()
-    assert process.wait(timeout=120) == 128 + signal.SIGTERM
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_full_standard_output_is_one_line(scene: Path, tmp_path: Path) -> None:
@@ -128,7 +118,7 @@ def test_every_command_has_a_help() -> None:
     assert len(run("--help").out.splitlines()) <= 24
 
 
-def test_each_result_and_each_error_is_a_line_of_json_on_the_standard_output(tmp_path: Path) -> None:
+def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     write_photo(photos / "photo.png", 32, 24)
     write_depth(photos / "photo.npy", metres(32, 24))

@@ -22,7 +22,7 @@ def size_of(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def test_the_demo_leaves_a_scene_and_fills_the_hole_better_than_2d_inpainting(tmp_path: Path) -> None:
+def test_the_demo_fills_the_hole_better_than_2d_inpainting(tmp_path: Path) -> None:
     pytest.importorskip("skimage.data")
     folder = tmp_path / "out"
     result = run("demo", "-o", folder)

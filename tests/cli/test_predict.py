@@ -77,9 +77,12 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    predicted(*pair, tmp_path, "--residual", "none", "--no-render")
+    predicted(*pair, tmp_path, "--residual", "none", "--no-render", "--fov", 90)
     assert names_in(tmp_path / "photo") == FILES - {"video.mp4"}
     report, bare = report_of(tmp_path / "photo"), read_ply(tmp_path / "photo" / "scene.ply")
+    assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
+    row = bare.row(0)
+    assert row["x"] / row["z"] * WIDTH / 2 == pytest.approx(0.5 - WIDTH / 2, abs=1e-3)
     assert (report["aux"], report["residual"]) == ({"gaussians": 0, "share": 0.0}, {"weights": "none", "fill": "none"})
     assert ("video" in report["seconds"], report["video"]) == (False, None)
     assert bare == read_ply(tmp_path / "photo" / "base.ply")
@@ -129,36 +132,34 @@ def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Pa
     assert 0 < report["aux"]["gaussians"] == merged.count - base.count <= 6 * cells
 
 
-def test_weights_are_named_or_left_out(
+def test_weights_and_texture_are_named_and_change_the_scene(
     tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.manual_seed(0)
     weights = tmp_path / "random.safetensors"
     save_file({name: 0.02 * torch.randn_like(value) for name, value in ResidualNet().state_dict().items()}, weights)
-    scenes = [(plain[0] / "scene.ply").read_bytes()]
-    for words, says in ((("--residual", "seeds"), "seeds"), ((), "seeds"), (("--residual", weights), str(weights))):
+    requests, scenes = list[str](), list[bytes]()
+    for words, named, texture in (
+        (("--workers", 4), "shipped", "exemplar"),  # a single photo needs none
+        (("--fill", "exemplar"), "shipped", "exemplar"),
+        (("--fill", "network"), "shipped", "network"),
+        (("--fill", "none"), "none", "none"),
+        (("--residual", weights), str(weights), "exemplar"),
+        (("--residual", "seeds"), "seeds", "exemplar"),
+        ((), "seeds", "exemplar"),  # no weights are shipped
+    ):
         if not words:
             monkeypatch.setattr("spackle.pipeline.SHIPPED", tmp_path / "none.safetensors")
-        predicted(*pair, tmp_path / "out", *words)
-        residual = report_of(tmp_path / "out" / "photo")["residual"]
-        assert (residual["weights"], "no trained weights" in residual.get("note", "")) == (says, says == "seeds")
-        assert (tmp_path / "out" / "photo" / "base.ply").read_bytes() == (plain[0] / "base.ply").read_bytes()
-        scenes.append((tmp_path / "out" / "photo" / "scene.ply").read_bytes())
-    shipped, seeds, without, random = scenes
-    assert seeds == without
-    assert len({shipped, seeds, random}) == 3
-
-
-def test_the_texture_is_chosen_and_part_of_the_request(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    found = {}
-    for fill in ("auto", "none", "network", "exemplar"):
-        predicted(*pair, tmp_path, "--no-render", "--fill", fill)
+        predicted(*pair, tmp_path, "--no-render", *words)
         report = report_of(tmp_path / "photo")
-        weights, texture = "none" if fill == "none" else "shipped", "exemplar" if fill == "auto" else fill
-        assert report["residual"] == {"weights": weights, "fill": texture}
-        found[fill] = report["request"], (tmp_path / "photo" / "scene.ply").read_bytes()
-    assert found["auto"] == found["exemplar"]
-    assert all(len(set(column)) == 3 for column in zip(*found.values(), strict=True))
+        note = {"note": "no trained weights: the seeds alone filled the holes"} if named == "seeds" else {}
+        assert report["residual"] == {"weights": named, "fill": texture, **note}
+        assert (tmp_path / "photo" / "base.ply").read_bytes() == (plain[0] / "base.ply").read_bytes()
+        requests.append(report["request"])
+        scenes.append((tmp_path / "photo" / "scene.ply").read_bytes())
+    assert scenes[0] == (plain[0] / "scene.ply").read_bytes()
+    for found in (requests, scenes):
+        assert (found[0], found[-2], len(set(found))) == (found[1], found[-1], 5)
 
 
 def test_lama_paints_where_its_weights_are(
@@ -173,14 +174,6 @@ def test_lama_paints_where_its_weights_are(
     assert [choice.texture for choice in choices] == ["lama", "exemplar", "lama", "none"]
     refuses(run(*command), published_weights("lama").file)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_given_focal_length_is_used_and_named(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    predicted(*pair, tmp_path, "--no-render", "--fov", 90)
-    report = report_of(tmp_path / "photo")
-    assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
-    row = read_ply(tmp_path / "photo" / "base.ply").row(0)
-    assert row["x"] / row["z"] * WIDTH / 2 == pytest.approx(0.5 - WIDTH / 2, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -220,27 +213,36 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
     assert result.lines[-1] == "4 of 8 photos failed"
 
 
-def test_a_folder_goes_on_and_changed_requests_are_redone(tmp_path: Path) -> None:
+def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> None:
     photos, out, depth = tmp_path / "photos", tmp_path / "out", write_depth(tmp_path / "d.npy")
     for name in "abc":
         write_photo(photos / f"{name}.png")
-    times: dict[str, int] = {}
 
-    def redone(map_: Path, *options: object) -> str:
+    def redone(map_: Path, *options: object, out: Path = out) -> str:
         """Whose scenes are new, which nobody says are done."""
+        before = {path.parent.name: path.stat().st_mtime_ns for path in out.glob("*/scene.ply")}
         result = predicted(photos, map_, out, *options)
-        now = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "abc"}
-        new = "".join(name for name in "abc" if now[name] != times.get(name))
-        times.update(now)
+        times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "abc"}
+        new = "".join(name for name in "abc" if times[name] != before.get(name))
         done = [line for line in result.lines if line.endswith("done already (--overwrite does it again)")]
         assert [line[0] for line in done] == [name for name in "abc" if name not in new]
         return new
 
     assert redone(depth) == "abc"
+    assert set(report_of(out / "a")["files"]) == FILES - {"report.json"}
+    whole = {name: hashes(out / name) for name in "abc"}
     (out / "b" / "report.json").unlink()  # what is written last is missing: b was not finished
     assert redone(depth) == "b"
     (out / "c" / "video.mp4").unlink()
     assert redone(depth) == "c"
+    shutil.copytree(out, tmp_path / "copy")  # all files are newer than their reports, which then read them
+    assert redone(depth, out=tmp_path / "copy") == ""
+    os.truncate(out / "a" / "scene.ply", 1000)
+    data = bytearray((out / "b" / "scene.ply").read_bytes())
+    data[-1] ^= 1
+    (out / "b" / "scene.ply").write_bytes(data)
+    assert redone(depth) == "ab"
+    assert {name: hashes(out / name) for name in "abc"} == whole
     assert redone(depth, "--disparity", "0.2") == redone(depth, "--overwrite", "--disparity", "0.2") == "abc"
     write_depth(depth, metres(far=7))
     disparity = write_depth(tmp_path / "disp0.npy")
@@ -248,37 +250,6 @@ def test_a_folder_goes_on_and_changed_requests_are_redone(tmp_path: Path) -> Non
         calibration(tmp_path / "calib.txt", focal, 200, 0)
         for map_, options in ((depth, ()), (disparity, ()), (depth, ("--stereo", "ou")), (depth, ("--format", "gif"))):
             assert redone(map_, *options) == "abc"
-
-
-def test_a_report_vouches_for_its_files_alone(tmp_path: Path) -> None:
-    photos, out, depth = tmp_path / "photos", tmp_path / "out", write_depth(tmp_path / "d.npy")
-    for name in "abc":
-        write_photo(photos / f"{name}.png")
-    predicted(photos, depth, out)
-    assert set(report_of(out / "a")["files"]) == FILES - {"report.json"}
-    whole = {name: hashes(out / name) for name in "abc"}
-    shutil.copytree(out, tmp_path / "copy")  # all files are newer than their reports, which then read them
-    assert sum("done already" in line for line in predicted(photos, depth, tmp_path / "copy").lines) == 3
-    os.truncate(out / "a" / "scene.ply", 1000)
-    data = bytearray((out / "b" / "scene.ply").read_bytes())
-    data[-1] ^= 1
-    (out / "b" / "scene.ply").write_bytes(data)
-    assert [line[:6] for line in predicted(photos, depth, out).lines if "done already" in line] == ["c.png:"]
-    assert {name: hashes(out / name) for name in "abc"} == whole
-
-
-@pytest.mark.parametrize("failing", ["save_views", "write_json"])
-def test_an_interrupted_run_leaves_the_old_set_whole(
-    tmp_path: Path, pair: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
-    def interrupted(*args: object) -> None:
-        raise KeyboardInterrupt
-
-    predicted(*pair, tmp_path)
-    before = hashes(tmp_path / "photo")
-    monkeypatch.setattr(f"spackle.cli.photo.{failing}", interrupted)
-    assert run("predict", "-i", pair[0], "--depth", pair[1], "-o", tmp_path, "--disparity", "0.5", *SHORT).code == 130
-    assert (hashes(tmp_path / "photo"), names_in(tmp_path / "photo")) == (before, FILES)
 
 
 def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:

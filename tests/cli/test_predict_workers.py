@@ -14,8 +14,7 @@ from typing import Any
 
 import dataset_builds  # noqa: F401  # sets what a cluster wants
 import pytest
-from clips import moving, write_clip
-from command import SHORT, Run, names_in, predicted, refuses, report_of, run
+from command import SHORT, Run, names_in, report_of, run
 from photos import HEIGHT, WIDTH, metres, write_depth, write_photo
 
 from spackle.cli.photos import Predictor
@@ -109,21 +108,7 @@ def test_killed_workers_are_a_line_and_the_same_command_goes_on(
     assert list(content(out)) == list(content(place / "alone"))
 
 
-def test_a_single_photo_needs_no_workers(tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run]) -> None:
-    predicted(*pair, tmp_path / "out", "--workers", 4)
-    assert (tmp_path / "out" / "photo" / "scene.ply").read_bytes() == (plain[0] / "scene.ply").read_bytes()
-
-
-def test_a_clip_takes_no_workers_and_no_texture(tmp_path: Path) -> None:
-    clip = write_clip(tmp_path / "clip.mp4", moving())
-    for option in ("--workers 2", "--ray auto", "--fill lama", "--path p.json"):
-        refuses(run("predict", clip, "-o", tmp_path / "out", *option.split()), f"{option}: not for a clip")
-    assert not (tmp_path / "out").exists()
-
-
-def test_workers_on_ray_give_the_same_files_where_all_nodes_see_them(
-    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_on_ray_give_the_same_files(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ray")
     ray = ("--ray", "local", "--workers", 2)
     done = predict(place, tmp_path / "out", *ray)

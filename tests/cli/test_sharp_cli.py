@@ -10,23 +10,17 @@ from command import FILES, SHORT, names_in, report_of, run
 from photos import picture, read_ply, write_photo
 from PIL import Image
 from sharp_weights import gaussians_of, tiny_weights, write_tiny
+from stand_in import QUICK
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import load_network
 from spackle.bases.sharp.encoder import TINY
 from spackle.device import pick_dtype
 
-QUICK = ("--no-render", "--residual", "none")
 
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny(tmp_path_factory.mktemp("weights") / "tiny.pt")
-
-
-@pytest.fixture(autouse=True)
-def _no_weights_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path / "weights"))
+@pytest.fixture
+def weights(made: dict[str, Path]) -> Path:
+    return made["sharp"]
 
 
 @pytest.mark.parametrize("size", [(64, 48), (3000, 3)])
@@ -43,12 +37,12 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
     expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(TINY)}
-    assert report["base"] == expected | {"precision": "bf16" if native else "fp32", "weights": "tiny.pt"}
+    assert report["base"] == expected | {"precision": "bf16" if native else "fp32", "weights": weights.name}
     if size == (64, 48):
         assert all(row["after"] < 0.01 < row["before"] for row in report["hole_area_ratio"])
 
 
-def test_a_folder_goes_on_and_other_weights_do_it_again_but_other_speed_does_not(
+def test_other_weights_do_a_folder_again_but_other_speed_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_photo(tmp_path / "photos" / "a.png")
