@@ -66,10 +66,14 @@ class GifEncoder:
         palette.link_to(use, 0, 1)
         use.link_to(sink)
         graph.configure()
-        palette.push(_timed(_palette_frame(self._colors.palette()), 0, tick))
+        colors = _palette_frame(self._colors.palette())
+        colors.pts, colors.time_base = 0, tick
+        palette.push(colors)
         palette.push(None)
         for index, rgb in enumerate(self._frames()):
-            source.push(_timed(av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format="bgra"), index, tick))
+            frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format="bgra")
+            frame.pts, frame.time_base = index, tick
+            source.push(frame)
             yield from _pulled(sink)
         source.push(None)
         yield from _pulled(sink)
@@ -135,11 +139,6 @@ def _palette_frame(colors: NDArray[np.float64]) -> av.VideoFrame:
     pixels[: len(colors), :3] = np.round(colors)[:, ::-1]
     pixels[len(colors) : PALETTE, :3] = pixels[0, :3]
     return av.VideoFrame.from_ndarray(pixels.reshape(16, 16, 4), format="bgra")
-
-
-def _timed(frame: av.VideoFrame, index: int, tick: Fraction) -> av.VideoFrame:
-    frame.pts, frame.time_base = index, tick
-    return frame
 
 
 def _pulled(sink: av.filter.context.FilterContext) -> Iterator[av.VideoFrame]:
