@@ -146,22 +146,43 @@ def install(made: dict[str, Path], tmp_path: Path) -> Path:
     return Path(shutil.copy(made["sharp"], tmp_path / "weights"))
 
 
-def test_a_folder_is_done_again_when_better_weights_come(
-    tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path
+def test_a_folder_is_done_again_when_weights_come_or_go(
+    tmp_path: Path, made: dict[str, Path], shipped: Path, photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def base() -> str:
-        result = predict(tmp_path, "-i", photos)
+    def bad(path: Path, **options: Any) -> None:
+        raise InputError(f"{path}: cut off")
+
+    def again(*options: object) -> tuple[str, list[str]]:
+        """The base of what is made now, and the warnings that it is rougher."""
+        result = predict(tmp_path, "-i", photos, *options)
         assert result.code == 0, result.err
         name: str = report_of(tmp_path / "out" / "a")["base"]["name"]
-        return "done already" if "done already" in result.err else name
+        warned = [line for line in result.lines if "was made by sharp" in line]
+        return "done already" if "done already" in result.err else name, warned
 
-    assert [base(), base()] == ["lite", "done already"]
+    done = ("done already", list[str]())
+    assert [again(), again()] == [("lite", []), done]
     save_file({name: 2 * tensor for name, tensor in load_file(shipped).items()}, shipped)
-    assert [base(), base()] == ["lite", "done already"]
-    weights = install(made, tmp_path)
-    assert [base(), base()] == ["sharp", "done already"]
-    weights.unlink()
-    assert [base(), base()] == ["lite", "done already"]
+    assert [again(), again()] == [("lite", []), done]
+    sharp = install(made, tmp_path)
+    assert [again(), again()] == [("sharp", []), done]
+    sharp.write_bytes(b"cut")
+    with monkeypatch.context() as patch:
+        patch.setattr(SharpBase, "load", bad)
+        base, (first, second) = again()
+        assert (base, again()) == ("lite", done)
+    assert str(tmp_path / "out" / "a") in first
+    assert second.endswith(f"by lite: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
+    install(made, tmp_path)
+    assert again() == ("sharp", [])
+    sharp.unlink()
+    base, (first, second) = again()
+    assert (base, second.endswith(NO_MODEL)) == ("lite", True)
+    # With depth no network counts.
+    words = ("--depth", write_depth(tmp_path / "d.npy"))
+    assert again(*words) == ("rgbd", [])
+    install(made, tmp_path)
+    assert again(*words, "--base", "rgbd") == done
 
 
 def test_disparity_of_the_person_then_of_the_base(tmp_path: Path) -> None:
@@ -188,33 +209,6 @@ def test_disparity_of_the_person_then_of_the_base(tmp_path: Path) -> None:
     for file, options in zip(files, ((), ("--disparity", 0.15)), strict=True):
         assert run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options).code == 0
     assert files[0].read_bytes() == files[1].read_bytes()
-
-
-def test_results_of_sharp_that_give_way_to_lite_are_named(
-    tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def bad(path: Path, **options: Any) -> None:
-        raise InputError(f"{path}: cut off")
-
-    def warned() -> list[str]:
-        return [line for line in predict(tmp_path, "-i", photos).lines if "was made by sharp" in line]
-
-    sharp = install(made, tmp_path)
-    assert warned() == []
-    sharp.write_bytes(b"cut")
-    with monkeypatch.context() as patch:
-        patch.setattr(SharpBase, "load", bad)
-        first, second = warned()
-        assert str(tmp_path / "out" / "a") in first
-        assert second.endswith(f"by lite: {NO_DEPTH}, SHARP cannot be used, {NO_MODEL} ({sharp})")
-        assert warned() == []  # done already
-    install(made, tmp_path)
-    assert warned() == []
-    # With depth no network counts.
-    words = ("-i", photos, "--depth", write_depth(tmp_path / "d.npy"))
-    assert predict(tmp_path, *words).code == 0
-    sharp.unlink()
-    assert "done already" in predict(tmp_path, *words, "--base", "rgbd").err
 
 
 @pytest.mark.parametrize("when", ["load", "predict"])

@@ -11,7 +11,7 @@ import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import pytest
 import torch
@@ -22,11 +22,9 @@ from scenes import box_before_wall
 from viewer_client import ask, events, send
 
 import spackle
-from spackle.bases.settings import ROUGH, BaseSettings
-from spackle.cli.view_page import Teller, Uploads, complete_for_page
+from spackle.bases.settings import ROUGH
 from spackle.formats import save_ply
-from spackle.image import film_to_pixels, load_photo
-from spackle.progress import Reporter
+from spackle.image import film_to_pixels
 
 # The command line in a process of its own; a photo takes for ever.
 DEAF = """
@@ -43,20 +41,11 @@ cli.main()
 """
 
 
-@pytest.fixture(autouse=True)
-def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test may end the process."""
-
-    def refuse(code: int) -> NoReturn:
-        raise AssertionError("the job did not end")
-
-    monkeypatch.setattr(os, "_exit", refuse)
-
-
 @pytest.fixture
 def visit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
     """Runs `spackle view` until a browser, which is a function here, has seen enough; then a signal ends it."""
     monkeypatch.setenv("BROWSER", "anything")
+    monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("the job did not end"))
 
     def run_view(browse: Callable[[str], object], *arguments: object, end: int = signal.SIGINT) -> Run:
         failed: list[BaseException] = []
@@ -123,6 +112,7 @@ def test_a_photo_is_completed_as_predict_completes_it(
         seen.append(ask(url, told[0][-1]["ready"]).json)
         told.append(events(url, send(url, apple_jpeg(codes()), "my%20other.jpg").json["job"]))
         seen.append(ask(url, ask(url, "/scene.json").json["scene"]).json)
+        seen.append(ask(url, events(url, send(url, name="rough.png").json["job"])[-1]["ready"]).json)
 
     result = visit(browse, photo, *given)
     assert result.code == 130, result.err
@@ -130,8 +120,10 @@ def test_a_photo_is_completed_as_predict_completes_it(
     assert counts(seen[0]) == {"base": report["base"]["gaussians"], "aux": report["aux"]["gaussians"]}
     assert any("focal length" in event.get("line", "") for event in told[0])
     assert "ready" in told[1][-1], told
-    assert [description["name"] for description in seen] == ["photo.png", "my other.jpg"]
-    first, other = ([line for line in result.lines if line.startswith(f"{each['name']}: ")] for each in seen)
+    assert [description["name"] for description in seen] == ["photo.png", "my other.jpg", "rough.png"]
+    assert [description["note"] for description in seen] == ["", "", ROUGH]  # by lite, which stays near
+    assert seen[2]["orbit"]["free"] == 0.15
+    first, other = ([line for line in result.lines if line.startswith(f"{each['name']}: ")] for each in seen[:2])
     assert any("Gaussians from rgbd" in line for line in first)
     assert any("--fov" in line for line in first)
     assert other[0].startswith("my other.jpg: base rgbd (the depth in the photo)")
@@ -142,13 +134,6 @@ def test_a_photo_is_completed_as_predict_completes_it(
     result = visit(lambda url: told.append(events(url, "/jobs/1")), photo, "--base", "rgbd")
     assert told[-1][-1]["error"].startswith(f"{photo}: --base rgbd needs depth")
     assert (result.code, any(line.startswith("error: ") for line in result.lines)) == (130, True)
-
-
-def test_the_page_says_that_lite_is_rough_and_stays_near(tmp_path: Path) -> None:
-    photo = load_photo(write_pair(tmp_path)[0])
-    completer = Uploads(settings := BaseSettings("lite"), None, False, Reporter()).open(settings)
-    description: Any = complete_for_page(photo, "p", completer, Teller(Reporter(), lambda event: None)).description
-    assert (description["note"], description["orbit"]["free"]) == (ROUGH, 0.15)
 
 
 @pytest.fixture
