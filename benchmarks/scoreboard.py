@@ -6,6 +6,9 @@
     python benchmarks/scoreboard.py --photos FOLDER [--without NAME] -o sheet.jpg
 
 PAIRS holds one folder a scene: two photos, a disparity map and a `scene.json` (`spackle.training.sources.load_pair`).
+In a folder of photos each has a fifth of its width cut off at either side: the middle is lifted by lite's depth of the
+whole, and the whole is the view that is completed.
+
 The left photo is lifted by its true depth, and the right camera's view is completed and compared with the right photo.
 The hole is where the lifted photo's opacity in that view is below 0.95; the band is what lies within 8 pixels of it.
 
@@ -56,10 +59,12 @@ from spackle import Camera, get_renderer, hole_area_ratio, hole_mask
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.edges import Edges
 from spackle.bases.lift import lift
+from spackle.bases.lite import FARTHEST, NEAREST_M, nearest
 from spackle.bases.silhouettes import Layers
 from spackle.camera_path import DepthRange, extremes
 from spackle.evaluation.metrics import GREY, sharpness
 from spackle.filters import FAR_BIAS, far_fill, greatest_around
+from spackle.image import load_photo, resize_photo
 from spackle.training.losses import FeatureNet, covered, hole_psnr, load_features
 from spackle.training.sources import load_pair
 
@@ -74,6 +79,7 @@ STEPS = 255  # of a phone's inverse depth
 DIGITS = dict.fromkeys(("distance", "texture", "seam", "HAR", "NIQE"), 3)  # others 2
 SECONDS = ("s lift", "s fill")
 PHOTOS, PHOTO_HEIGHT = 8, 256  # of a sheet
+CUT_PHOTOS = 24  # of a folder, whose sides are cut off
 DEFAULT = "default"
 RENDERER = get_renderer()
 
@@ -95,10 +101,6 @@ def filled_from_around(own: Any) -> Any:
     )
 
 
-def all_covered(own: Any) -> Any:
-    return lambda features: features.inverse_depth > 0 if bool(features.mask.all()) else ~features.mask
-
-
 def no_edges(own: Any) -> Any:
     return lambda depth, known, focal: Edges(np.zeros_like(depth), np.zeros_like(known), np.zeros_like(known))
 
@@ -113,7 +115,6 @@ def one_surface(own: Any) -> Any:
     return layers
 
 
-NO_SKY: dict[str, Replace] = {"base_values._sky": lambda own: lambda rgb, known: torch.zeros_like(rgb[..., 0])}
 # What is switched off while a photo is lifted, and while it is completed: names in the package, and what replaces them.
 LIFT: dict[str, dict[str, Replace]] = {
     "smooth_noise": {"smooth_noise": first},
@@ -130,22 +131,10 @@ FILL: dict[str, dict[str, Replace]] = {
     "network": {"shipped_network": lambda own: lambda: None},
     "texture": {"open_texture": lambda own: lambda fill: None},
     "half texture": {"_in_proportion": lambda own: lambda *given: 0.5 * own(*given)},
-    "TEXTURE_FADING 0.12": {"texture.TEXTURE_FADING": lambda own: 0.12},
     "sharpened": {"sharpened": first},
-    "sky rule": NO_SKY,
     "beyond_border": {"fill_around": filled_from_around},
-    "beyond_border's colours": {
-        **NO_SKY,
-        "base_values.MIXED": lambda own: 10.0,
-        "base_values.CARRIED": lambda own: 20.0,
-    },
-    "patches beyond the border": {"texture.SHARE": lambda own: 0.0},
     "in proportion": {"_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)},
-    "repeat count": {"texture.REPEATS": lambda own: math.inf},
     "extended": {"extended": lambda own: lambda view: view.structure},
-    "widened": {"widened": first},
-    "ALIKE": {"network.ALIKE": lambda own: math.inf},
-    "solid sources": {"_sources": all_covered},
 }
 MECHANISMS = (*FILL, *LIFT)
 
@@ -203,8 +192,9 @@ class Perception:
 class Pair:
     """A stereo pair, and what all runs share: hole, band and former border of the right camera's view."""
 
-    def __init__(self, folder: Path, small: int) -> None:
-        self.left, self.right, depth, self.camera, self.beside = load_pair(folder)
+    def __init__(self, place: Path, small: int) -> None:
+        pair = load_pair(place) if place.is_dir() else load_cut(place)
+        self.left, self.right, depth, self.camera, self.beside = pair
         self.depth = smaller(depth, small) if small > 1 else depth
         prediction = lift(self.left, self.depth, self.camera)
         self.hole = hole_mask(RENDERER.render(prediction.gaussians, self.beside).alpha)
@@ -221,7 +211,8 @@ class Pair:
         with switched_off(run, FILL):
             scene = spackle.complete(prediction, [self.beside], exact=True, fill="exemplar")
         seconds = (lifted - began, time.process_time() - lifted)
-        view, photo, everywhere = scene.render(self.beside), scene.render(self.camera).rgb, torch.ones_like(self.hole)
+        view, photo = scene.render(self.beside), scene.render(self.camera).rgb
+        everywhere = torch.ones(photo.shape[:2], dtype=torch.bool)
         row = perception.compare(view.rgb, self.right, self.hole) if perception else {}
         row["sharpness"] = sharpness(view.rgb, self.right, self.hole)
         row["PSNR"] = hole_psnr(view.rgb, self.right, self.hole)
@@ -236,6 +227,18 @@ class Pair:
             row["NIQE"] = niqe(view.rgb, model) / niqe(self.right, model)
         row |= {"base": len(scene.base) / 1000, "aux": len(scene.aux) / 1000}
         return row | dict(zip(SECONDS, seconds, strict=True))
+
+
+def load_cut(file: Path) -> tuple[Tensor, Tensor, DepthMap, Camera, Camera]:
+    """A photo without a fifth of its width at either side, as `load_pair` has a pair: the photo is the right one."""
+    photo = resize_photo(load_photo(file))
+    inverse, side = spackle.LiteBase.load().inverse_depth(photo.rgb), photo.width // 5
+    inverse = F.interpolate(inverse[None, None], (photo.height, photo.width), mode="bilinear")[0, 0]
+    middle = slice(side, photo.width - side)
+    depth = NEAREST_M / (inverse[:, middle] / nearest(inverse.flatten())).clamp(1 / FARTHEST, 1)
+    cut = photo.camera.cropped(side, 0, depth.shape[1], photo.height)
+    known = DepthMap(depth, depth > 0, None, None, "disparity", file)
+    return photo.rgb[:, middle].contiguous(), photo.rgb, known, cut, photo.camera
 
 
 def smaller(depth: DepthMap, times: int) -> DepthMap:
@@ -327,11 +330,16 @@ def ledger(runs: dict[str, Rows]) -> str:
     return markdown(["without", *measures], rows)
 
 
+def pictures_in(folder: Path, most: int) -> list[Path]:
+    """Photos of a folder, spread evenly over their names."""
+    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".jpg", ".jpeg", ".png")]
+    return [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, most)})] if files else []
+
+
 def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
     """A row a photo: at the left and the right end of its move the lifted photo, and what each run makes of it."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
     base, rows = spackle.LiteBase.load(), []
-    for file in [files[i] for i in sorted({round(i) for i in np.linspace(0, len(files) - 1, PHOTOS)})]:
+    for file in pictures_in(folder, PHOTOS):
         pictures = []
         for run in runs:
             with switched_off(run, LIFT, FILL):
@@ -371,10 +379,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.photos:
         sheet(chosen.photos, names).save(chosen.output or "sheet.jpg")
         return
-    folders = [path.parent for path in sorted((chosen.folder or Path()).glob("*/scene.json"))]
+    folder = chosen.folder or Path()
+    folders = [path.parent for path in sorted(folder.glob("*/scene.json"))] or pictures_in(folder, CUT_PHOTOS)
     folders = [path for path in folders if any(word in path.name for word in chosen.scenes.split(","))]
     if not folders:
-        parser.error(f"{chosen.folder}: no folder with a scene.json in it")
+        parser.error(f"{chosen.folder}: no folder with a scene.json in it, and no photo")
     before = json.loads(chosen.against.read_text()) if chosen.against else None
     if before and before["small"] != chosen.small:
         parser.error(f"{chosen.against}: its depth maps are {before['small']} times smaller, not {chosen.small}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 
 import numpy as np
 import pytest
@@ -109,35 +108,12 @@ def flat_view(mask: Tensor, rgb: Tensor, pixels: Tensor, beyond: Tensor, matches
 
 def test_the_texture_leaves_low_frequencies_to_the_structure() -> None:
     view, _, _ = hole_view()
-    rim = dataclasses.replace(view.rim, beyond=torch.zeros_like(view.rim.beyond))
     bad = dataclasses.replace(view.patches, mismatch=view.patches.mismatch + 100)
-    found, plain = (
-        exemplar_texture(dataclasses.replace(view, rim=rim, patches=patches)) for patches in (view.patches, bad)
-    )
+    found, plain = (exemplar_texture(dataclasses.replace(view, patches=patches)) for patches in (view.patches, bad))
     fine, mask = found - plain, view.features.mask
     assert float(room.in_cells(fine)[mask].abs().mean()) > 1e-3
     assert float(blurred(fine, 4 * room.TEXTURE_PX).abs().max()) < 0.1 * float(fine.abs().max())
     assert torch.equal(room.in_cells(plain)[~mask], room.in_cells(view.rendering.rgb)[~mask])
-
-
-def test_beyond_the_border_patches_get_a_share_but_nothing_broad() -> None:
-    """Stripes on a wall, brighter where patches come from; the structure that meets them is grey."""
-    stripes = (0.5 + 0.1 * torch.sin(torch.arange(192) * math.tau / 16)).view(1, -1, 1).repeat(96, 1, 3)
-    stripes[:, :96] += 0.2
-    mask = torch.zeros(48, 96, dtype=torch.bool)
-    mask[:, 56:] = True
-    rows, columns = torch.meshgrid(torch.arange(48), torch.arange(96), indexing="ij")
-    matches = torch.stack([torch.zeros_like(rows), rows, columns - 48], dim=-1).where(mask[..., None], torch.tensor(-1))
-    inner = slice(24, 72), slice(144, 176)
-    amplitudes, means = [], []
-    for beyond in (mask, torch.zeros_like(mask)):
-        view = flat_view(mask, room.in_cells(stripes).mean((2, 3)), stripes, beyond, matches)
-        found = exemplar_texture(view)[inner]
-        amplitudes.append(float((found - found.mean()).abs().mean() / (stripes[inner] - 0.5).abs().mean()))
-        means.append(float(found.mean()))
-    fine, broad = (1 - math.exp(-2 * (math.pi * width / 16) ** 2) for width in (room.TEXTURE_PX, room.BROAD * 192))
-    assert amplitudes == pytest.approx([(1 - room.SHARE) * fine + room.SHARE * broad, fine], rel=0.1)
-    assert means == pytest.approx([0.5, 0.5], abs=0.02)
 
 
 def test_beyond_the_border_the_nearest_cells_are_extended() -> None:
@@ -168,17 +144,6 @@ def test_texture_is_no_stronger_than_what_is_around_the_hole() -> None:
     assert float(factors[20:28, 16:32].mean()) == pytest.approx(0.1, abs=0.04)
     assert float(factors[20:28, 64:80].mean()) > 0.85
     assert float(factors.max()) <= 1
-
-
-def test_repeats_are_counted_by_squares_of_picture_and_mirror() -> None:
-    matches = torch.full((8, 10, 3), -1)
-    matches[0, :3] = torch.tensor([0, 5, 2])
-    matches[1, 0] = torch.tensor([1, 4, 9 - 3])  # the same square, in the mirror
-    matches[7, 9] = torch.tensor([0, 1, 9])
-    expected = torch.zeros(8, 10)
-    expected[0, :3] = expected[1, 0] = 4 / 16
-    expected[7, 9] = 1 / 16
-    assert torch.equal(room.repeat_counts(Patches(torch.zeros(8, 10, 3), torch.zeros(8, 10), matches)), expected)
 
 
 def test_blocks_are_those_of_the_matches_around_a_cell() -> None:

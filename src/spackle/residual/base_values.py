@@ -11,12 +11,10 @@ import dataclasses
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from spackle.camera import Camera, beside
-from spackle.color import bright_or_blue
-from spackle.filters import FAR_BIAS, broadly_blurred, distance_to, far_fill, greatest_around, nearest_known
-from spackle.residual.epipolar_walk import WIDENING, walk, widened
+from spackle.filters import FAR_BIAS, distance_to, far_fill, greatest_around, nearest_known
+from spackle.residual.epipolar_walk import walk
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers
 from spackle.surface import surface_slope
 
@@ -24,10 +22,7 @@ BEHIND = 0.005  # relative distance behind everything seen close by: an aux Gaus
 BLOB_CELLS = 2  # "close by": as far as a blob reaches
 AT_BORDER = 0.03  # of the photo's width: what ends farther inside is not extended beyond it
 DETOUR = 2.0  # how many times farther than the nearest seen cell a line's far rim may lie
-MIXED, CARRIED = 0.1, 0.2  # of the view's width from the border: colours of all around; those traced along the line
 FEW = 0.005  # share of a view's cells: so few lie between others, and what is around them closes them
-SKY, CALM, CALM_CELLS = 0.85, 0.2, 4.0  # a sky is so bright, or blue; its colours vary so little among so many cells
-AT_ONCE = 0.03  # of the view's width from the border: from there a sky is extended as it is
 LEAST = 1e-9
 
 
@@ -52,7 +47,9 @@ class Seeds:
 
 def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> Seeds:
     """Seeds for every cell of a view; covered cells keep what they show."""
-    known, uv = _sources(features), beside(cell_centers(camera), features.rgb)
+    known, uv = ~features.mask, beside(cell_centers(camera), features.rgb)
+    if not bool(known.any()):
+        known = features.inverse_depth > 0
     if not bool(known.any()):
         # Nothing is seen at all: a grey wall, ten metres away, is as good a guess as any.
         grey = torch.full_like(features.rgb, 0.5)
@@ -63,16 +60,6 @@ def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
     inverse_depth = placed_behind(filled, features.mask, features.inverse_depth, BLOB_CELLS)
     slope = surface_slope(inverse_depth) / CELL
     return Seeds(uv, inverse_depth, slope, rgb.permute(1, 2, 0), float(inverse_depth.median()))
-
-
-def _sources(features: ViewFeatures) -> Tensor:
-    """[h, w] bool: cells to start from. Specks are none: a stray far one would colour a whole hole."""
-    covered = ~features.mask
-    share = avg_pool2d(covered.float()[None], 3, stride=1, padding=1, count_include_pad=False)[0]
-    solid = covered & (share > 0.5)
-    if bool(solid.any()):
-        return solid
-    return covered if bool(covered.any()) else features.inverse_depth > 0
 
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
@@ -113,7 +100,7 @@ def fill_around(
     camera: Camera,
     photo_camera: Camera,
 ) -> tuple[Tensor, Tensor]:
-    """Inverse depth [h, w] and colours [3, h, w] of all cells, the photo extended beyond its border.
+    """Inverse depth [h, w], extended beyond the photo's border, and colours [3, h, w] of all cells.
 
     Args:
         features: of the view.
@@ -123,46 +110,31 @@ def fill_around(
         inside: [h, w] bool: cells whose points lie in the photo's frame; there what is behind is extended.
         camera, photo_camera: the view's and the photo's.
     """
-    mask, bias = features.mask, FAR_BIAS * inside
+    mask, bias, colors = features.mask, FAR_BIAS * inside, features.rgb.movedim(-1, 0)
     beyond = mask & ~inside
     if int(beyond.count_nonzero()) <= FEW * beyond.numel():
-        return far_fill(features.inverse_depth, features.rgb.permute(2, 0, 1), known, far_bias=bias)
+        return far_fill(features.inverse_depth, colors, known, far_bias=bias)
     rays, motion = _rays_in_photo(uv, camera, photo_camera)
     points, lens = rays + motion[:3, 3] * across[..., None], beside(photo_camera.K, uv)
     depth = points[..., 2:].clamp_min(LEAST)
     place = points[..., :2] / depth * lens.diagonal()[:2] + lens[:2, 2]
     size = beside(torch.tensor([photo_camera.width, photo_camera.height]), place)
     ends = torch.minimum(place, size - place).amin(-1) < AT_BORDER * photo_camera.width
-    looks = torch.cat([features.rgb, _sky(features.rgb, known)[..., None]], dim=-1)
-    values = torch.cat([looks, (across / depth[..., 0])[..., None], ends[..., None].float()], dim=-1)
+    values = torch.stack([across / depth[..., 0], ends.to(across)], dim=-1)
 
     far, _, steps = walk(uv, values, across, mask, camera, photo_camera.position)
-    apart = distance_to(nearest_known(mask.numpy()))
-    traced = beyond & (steps > 0) & (steps <= DETOUR * apart)
-    hidden = traced & (far[..., 5] == 0)  # by something nearer, beside which the photo is extended
-    far = widened(far, traced & ~hidden, WIDENING * steps)
-    away = 1 / far[..., 4].clamp_min(LEAST) - motion[2, 3]
+    traced = beyond & (steps > 0) & (steps <= DETOUR * distance_to(nearest_known(mask.numpy())))
+    hidden = traced & (far[..., 1] == 0)  # by something nearer, beside which the photo is extended
+    away = 1 / far[..., 0].clamp_min(LEAST) - motion[2, 3]
     traced = traced & ~hidden & (away > 0) & (rays[..., 2] > 0)
     nearest = torch.where(known, features.inverse_depth, 0).amax()
     extended = torch.minimum((rays[..., 2] / away.clamp_min(LEAST)).clamp_min(LEAST), nearest)
 
     bias = torch.where(hidden, FAR_BIAS, bias)
-    depths, mixed = far_fill(features.inverse_depth, looks.movedim(-1, 0), known, far_bias=bias)
-    depths, colors = torch.where(traced, extended, depths), torch.where(traced, far[..., :4].movedim(-1, 0), mixed)
+    filled, mixed = far_fill(features.inverse_depth, colors, known, far_bias=bias)
+    filled = torch.where(traced, extended, filled)
     others = beyond & ~traced
     if bool(others.any()):
-        refilled = far_fill(depths, colors, traced | known, far_bias=bias)
-        depths, colors = (torch.where(others, *both) for both in zip(refilled, (depths, colors), strict=True))
-    out = apart / mask.shape[1]
-    sky = colors[3] * (rays[..., 1] < 0) * (out / AT_ONCE).clamp_max(1)  # there is none below the middle of the photo
-    share = torch.maximum((out - MIXED) / (CARRIED - MIXED), sky).clamp(0, 1) * beyond
-    return depths, torch.lerp(mixed[:3], colors[:3], share)
-
-
-def _sky(rgb: Tensor, known: Tensor) -> Tensor:
-    """How much known cells [h, w], of sRGB colours [h, w, 3], look like a sky: [h, w] from 0 to 1."""
-    seen = known[..., None].float()
-    sums = broadly_blurred(torch.cat([rgb * seen, rgb.square() * seen, seen], dim=-1), CALM_CELLS)
-    means = sums[..., :6] / sums[..., 6:].clamp_min(LEAST)
-    variance = (means[..., 3:] - means[..., :3].square()).sum(-1).clamp_min(0)
-    return bright_or_blue(rgb, SKY) * torch.exp(-variance / CALM**2)
+        refilled, _ = far_fill(filled, colors[:0], traced | known, far_bias=bias)
+        filled = torch.where(others, refilled, filled)
+    return filled, mixed

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
 from spackle._numba import kernel
 from spackle.camera import Camera
@@ -16,8 +15,6 @@ from spackle.residual.view_features import CELL, GRAIN
 
 SAME_DEPTH = 1.1  # what is mirrored at the rim may differ from the rim in inverse depth by this factor
 SAME_EYE = 1e-9 * CELL  # the epipole's part of a cell's offset from it, below which there is no line
-WIDENING = 0.3  # cells of a rim that are looked at to either side, for each cell that it lies away
-WIDEST_LEVEL = 6  # halvings of a picture: no cell looks at more than 64 to either side
 
 
 def walk(
@@ -46,27 +43,6 @@ def walk(
     run_chunks(lambda start, stop: _walk(start, stop, *view, epipole, SAME_DEPTH, *grids), len(mask), GRAIN)
     far, mirrored, distance = map(torch.from_numpy, grids)
     return far, mirrored, distance
-
-
-def widened(values: Tensor, mask: Tensor, radius: Tensor) -> Tensor:
-    """Values [h, w, c], those of masked cells the mean of the masked ones within about `radius` [h, w] cells.
-
-    A small thing at a rim would become a streak to the other side of the hole; so it fades as far off as it is large.
-    """
-    level = radius.clamp(1, 2**WIDEST_LEVEL).log2()[..., None]
-    sums = (torch.cat([values, level, torch.ones_like(level)], dim=-1) * mask[..., None]).permute(2, 0, 1)
-    halvings = [sums]
-    for _ in range(WIDEST_LEVEL):
-        halvings.append(avg_pool2d(halvings[-1], 2, ceil_mode=True, count_include_pad=False))
-    wide = torch.zeros_like(halvings[-1][:-1])
-    for number, sums in reversed(list(enumerate(halvings))):
-        *_, height, width = sums.shape
-        means = sums / sums[-1:].clamp_min(1e-9)  # the last: whether a masked cell is there
-        share = (means[-2] - number).clamp(0, 1)
-        coarser = interpolate(wide[None], scale_factor=2, mode="bilinear")[0, :, :height, :width]
-        own = torch.lerp(means[:-2], coarser[:-1] / coarser[-1:].clamp_min(1e-6), share)
-        wide = torch.cat([own, means[-1:]])
-    return torch.where(mask[..., None], wide[:-1].permute(1, 2, 0), values)
 
 
 @kernel

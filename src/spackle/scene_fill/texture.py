@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from spackle.filters import FAR_BIAS, blurred, broadly_blurred, distance_to, far_fill, nearest_known
+from spackle.filters import FAR_BIAS, blurred, distance_to, far_fill, nearest_known
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.patches import Patches
 from spackle.render.protocol import Rendering
@@ -23,12 +23,8 @@ from spackle.residual.network import Rim
 from spackle.residual.view_features import CELL, ViewFeatures, hole_mask
 
 TEXTURE_PX = 3.0  # standard deviation: what this blur takes away is texture, what it leaves is structure
-TEXTURE_FADING = 0.5  # mismatch at which a third of the texture is left
-SHARE, SHARE_FADING = 0.4, 0.36  # of patches beyond the photo's border; mismatch at which a third of it is left
-REPEATS = 4.0  # what is repeated more often is a pattern, and fades
-BROAD = 0.022  # standard deviation, of the view's width: what this blur leaves of patches gets no share
-BLOCK = 4  # cells along the side of a square, all of which count as repeated when one is
-BLOCK_CHOICE, FAINTEST_VOTE = 3.0, 1e-6  # how much harder votes for blocks depend on their costs; least vote
+TEXTURE_FADING = 0.12  # mismatch at which a third of the texture is left
+BLOCK_CHOICE, FAINTEST_VOTE = 3.0, 1e-6  # how strongly a block's vote depends on its cost; the least vote
 LEAST_COST = 1e-8
 EXTENDED_CELLS, SAME_DEPTH = 4.0, 0.05  # reach of the photo's own colours beyond its border; relative depth
 CALM_CELLS, COARSE = 4.0, 2  # standard deviation of the means that strengths of texture are compared by; cells in one
@@ -53,24 +49,15 @@ Texture = Callable[[HoleView], Tensor]  # colours [2h, 2w, 3] sRGB of the view's
 
 
 def exemplar_texture(view: HoleView) -> Tensor:
-    """High frequencies of the view itself over the residual's structure.
-
-    Beyond the photo's border that structure is fog: patches get a share, but for what is broad in them.
-    """
-    features, rim, patches = view.features, view.rim, view.patches
+    """High frequencies of the view itself over the residual's structure."""
+    features, patches = view.features, view.patches
     pixels = in_cells(view.rendering.rgb)
     painted = from_cells(patch_blocks(patches, pixels))
     fine = painted - blurred(painted, TEXTURE_PX)
-    repeats = (repeat_counts(patches) / REPEATS).clamp_min(1)
-    gain = (-patches.mismatch / TEXTURE_FADING).exp() / repeats * _in_proportion(fine, view)
+    gain = (-patches.mismatch / TEXTURE_FADING).exp() * _in_proportion(fine, view)
     smooth = in_cells(_magnified(extended(view), features.mask))
     picture = from_cells(torch.where(features.mask[..., None, None, None], smooth, pixels))
-    broad = broadly_blurred(painted - picture, BROAD * painted.shape[1])
-    share = SHARE * (-patches.mismatch / SHARE_FADING).exp() / repeats * rim.beyond
-    gain, share = (
-        from_cells(factor[..., None, None, None].expand(*factor.shape, CELL, CELL, 1)) for factor in (gain, share)
-    )
-    return fine.mul_(gain).add_(picture).lerp_(painted.sub_(broad), share)
+    return fine.mul_(from_cells(gain[..., None, None, None].expand(*gain.shape, CELL, CELL, 1))).add_(picture)
 
 
 def painted_texture(painter: Inpainter, view: HoleView) -> Tensor:
@@ -104,17 +91,6 @@ def patch_blocks(patches: Patches, blocks: Tensor) -> Tensor:
     filled = blocks.clone()
     filled[y, x] = total / mass[:, None, None, None]
     return filled
-
-
-def repeat_counts(patches: Patches) -> Tensor:
-    """How often what is around each cell's match is repeated, for each of its cells: [H, W]; 0 outside of the hole."""
-    matched = patches.matches[..., 0] >= 0
-    source, row, column = patches.matches.long().unbind(-1)
-    height, width = matched.shape
-    column = torch.where(source > 0, width - 1 - column, column)
-    number = row // BLOCK * width + column // BLOCK
-    counts = torch.bincount(number[matched], minlength=height * width)
-    return torch.where(matched, counts[number.clamp_min(0)] / BLOCK**2, 0)
 
 
 def _in_proportion(fine: Tensor, view: HoleView) -> Tensor:
