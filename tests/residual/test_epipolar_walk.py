@@ -77,6 +77,8 @@ def plain_rim(mask: Tensor, depth: Tensor, rgb: Tensor, camera: Camera) -> tuple
                         best = float(depth[v, u])
                         color[y, x], distance[y, x] = rgb[v, u], k
                     break
+        if 1.4 * float(depth[y, x]) < best < math.inf:  # what stands in front does not continue behind
+            color[y, x] = rgb[y, x]
     return color, distance
 
 

@@ -27,6 +27,8 @@ from spackle.residual.base_values import Seeds, inside_photo
 from spackle.residual.epipolar_walk import walk
 from spackle.residual.view_features import ViewFeatures
 
+ALIKE = 1.4  # factor by which the inverse depths of a line's far rim and of the seed there may differ
+
 # Channels of the features.
 VIEW_CHANNELS = 10  # rendered colour 3, depth, opacity, mask, seed colour 3, seed depth
 FAR_RIM = slice(VIEW_CHANNELS, VIEW_CHANNELS + 3)  # what turns the seed's colour into that of the far rim
@@ -66,13 +68,16 @@ def find_rim(features: ViewFeatures, seeds: Seeds, camera: Camera, photo_camera:
 
     What moves in front of what, moves along the lines through the epipole, where the view sees the photo's eye. So
     that line leads from a hole to the surface that continues behind it, and structure at the rim continues along it
-    more often than not. Where a line meets nothing, the seeds stay.
+    more often than not. Where a line meets nothing, or something much nearer than the seed, the seeds stay.
 
     Also returns patches of the view that match its masked cells: by the seeds' colours behind an object, by what is
     mirrored beyond the photo's border, where the seeds mix all that reaches the border into a fog.
     """
     rgb, depths = seeds.rgb.detach(), seeds.inverse_depth.detach()
-    far, near, steps = walk(seeds.uv.detach(), rgb, depths, features.mask, camera, photo_camera.position)
+    values = torch.cat([rgb, depths[..., None]], dim=-1)
+    far, near, steps = walk(seeds.uv.detach(), values, depths, features.mask, camera, photo_camera.position)
+    in_front = (features.mask & (far[..., 3] > ALIKE * depths))[..., None]  # what stands there does not continue behind
+    far, near = (torch.where(in_front, rgb, met[..., :3]) for met in (far, near))
     beyond = features.mask & ~inside_photo(seeds.inverse_depth, camera, photo_camera)
     tone = torch.where(features.mask[..., None], rgb, features.rgb)
     patches = match_patches(torch.where(beyond[..., None], near, tone), features.mask, depths)
