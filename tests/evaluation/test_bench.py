@@ -117,7 +117,7 @@ def test_each_table_has_a_label_of_its_own() -> None:
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
-    view = large_views(prediction, (0.3,))[0]
+    view = large_views(prediction, (0.3,), 1280)[0]
     rows = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
     assert dict(rows)["aux"] == len(fill_view(context, view.camera).aux) > 0
     for stage in STAGES:

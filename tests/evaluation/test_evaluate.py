@@ -253,7 +253,9 @@ def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
 
 def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     prediction = box_before_wall(width=95, height=71).lift()
-    views = large_views(prediction, (0.3, 0.5))
+    views = large_views(prediction, (0.3, 0.5), 1280)
+    small = large_views(prediction, (0.3,), 64)[0].camera
+    assert (small.width, small.height) == (64, 48)
     assert [(view.setting, view.name) for view in views] == [(s, n) for s in ("0.3", "0.5") for n in ("left", "right")]
     reach = DepthRange.of(prediction.gaussians)
     for view, sign in zip(views, (-1, 1, -1, 1), strict=True):
@@ -382,7 +384,7 @@ def test_a_broken_image_is_named_and_the_others_go_on(
 
     load, lack = load_case, f"{scenes}/Chair/third.png: not\nan image"
     monkeypatch.setattr(
-        "spackle.evaluation.evaluate.load_case", lambda case: dataclasses.replace(load(case), lacks=(lack,))
+        "spackle.evaluation.evaluate.load_case", lambda case, side: dataclasses.replace(load(case, side), lacks=(lack,))
     )
     done = evaluate(scenes, tmp_path / "lacks", *near, "--limit", 1)
     remark = "without one of its second photos: Chair/third.png: not an image"

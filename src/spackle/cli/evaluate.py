@@ -40,6 +40,10 @@ Residual = Annotated[
     str | None,
     typer.Option(metavar="PATH|seeds", help="Weights of the residual; default: shipped ones, else seeds."),
 ]
+Side = Annotated[
+    int | None,
+    typer.Option(min=16, max=8192, help="Long side of the views. [default: 1280; near-view: 1536]", show_default=False),
+]
 Disparity = Annotated[
     str, typer.Option(metavar="A,B,…", help="Of the large views, with commas or spaces; the paper's S1, S2, S3.")
 ]
@@ -64,6 +68,7 @@ def evaluate(
         ),
     ] = "base,paper,spackle",
     disparity: Disparity = "0.3,0.4,0.5",
+    side: Side = None,
     metrics: Annotated[
         str | None,
         typer.Option(
@@ -102,6 +107,7 @@ def evaluate(
         protocol=protocol,
         methods=split_words(methods),
         disparities=parse_disparities(numbers),
+        side=side,
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
         base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
         residual=residual,
@@ -141,6 +147,7 @@ def bench(
     folder: Folder = None,
     root: Root = None,
     disparity: Disparity = "0.3,0.4,0.5",
+    side: Side = None,
     base: BaseName = "sharp",
     checkpoint: Checkpoint = None,
     precision: PrecisionOption = "auto",
@@ -169,6 +176,7 @@ def bench(
         root=given_input("FOLDER", source, root),
         methods=("spackle",),
         disparities=parse_disparities(numbers),
+        side=side,
         metrics=(),
         base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
         residual=residual,

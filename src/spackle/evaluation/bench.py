@@ -35,7 +35,16 @@ from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext, fill_view
 
 FILES = ("bench.md", "bench.tex")
-SHARED = ("dataset", "title", "terms", "images", "disparities", "base", "residual")  # of an evaluation's configuration
+SHARED = (
+    "dataset",
+    "title",
+    "terms",
+    "images",
+    "side",
+    "disparities",
+    "base",
+    "residual",
+)  # of an evaluation's configuration
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")
@@ -95,7 +104,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
         BaseError: no image can be worked on.
     """
     load, device, options = load_average(), torch.device(config["base"]["device"]), evaluation.options
-    loaded = load_case(dataclasses.replace(case, seconds=()))
+    loaded = load_case(dataclasses.replace(case, seconds=()), options.max_side)
     opened = evaluation.open(loaded)
     opened.load(loaded.full)  # before the clock starts
     latest: dict[str, BasePrediction] = {}
@@ -110,7 +119,7 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     facts |= {"warm": int(warm or not counts), "base_gaussians": len(prediction.gaussians)}
     facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
     rows = [Row(config["title"], case.name, "", "", "", metric, value) for metric, value in facts.items()]
-    for view in large_views(prediction, options.disparities):
+    for view in large_views(prediction, options.disparities, options.max_side):
         if view.name == SIDE:
             figures = time_view(seconds, context, view, config["runs"], device)
             row = Row(config["title"], case.name, view.setting, SIDE, "spackle", "", None)

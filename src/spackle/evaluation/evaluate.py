@@ -92,14 +92,14 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     options = evaluation.options
     if options.near and not case.seconds and case.problem is None:
         raise InputError(f"{case.name}: has no second photo")
-    loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()))
+    loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()), options.max_side)
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, not options.base.network) if options.near else None
     if alignment:
         lenses = loaded.camera, prediction.camera, alignment.scale
         views = [view._replace(camera=to_base(view.camera, *lenses)) for view in loaded.seconds]
     else:
-        views = large_views(prediction, options.disparities)
+        views = large_views(prediction, options.disparities, options.max_side)
 
     def direct_ft() -> tuple[Gaussians, float]:
         """The other base, and what its cameras' paths are to be multiplied by."""

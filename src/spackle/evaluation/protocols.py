@@ -19,6 +19,7 @@ from spackle.evaluation.case import Case, Points, Viewpoint
 from spackle.evaluation.methods import Method
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.rows import REMARK, Row
+from spackle.image import working_size
 from spackle.residual import hole_area_ratio, hole_mask
 from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
@@ -61,18 +62,19 @@ class Gauges:
                 yield name, hole_distance(self.features, rgb, truth, hole)
 
 
-def large_views(prediction: BasePrediction, disparities: Sequence[float]) -> list[Viewpoint]:
+def large_views(prediction: BasePrediction, disparities: Sequence[float], side: int) -> list[Viewpoint]:
     """The paper's controlled rendering (section 4.1); it says which disparities, but not which views.
 
     Here they are the two ends of the `swipe` path at each disparity m: the eye moves sideways by m · ‖(W/f, H/f)‖ ·
-    z_near, once to the left and once to the right, and looks at the focus point. The lens stays the photo's; both sides
-    of the picture are even, as the paper's dense counts have it.
+    z_near, once to the left and once to the right, and looks at the focus point. The lens stays the photo's; the long
+    side is at most `side`, and both sides of the picture are even, as the paper's dense counts have it.
 
     Raises:
         InputError: no Gaussian stands in front of the camera, or a disparity that no path has.
     """
     try:
-        even, reach = prediction.camera.even(), DepthRange.of(prediction.gaussians)
+        camera, reach = prediction.camera, DepthRange.of(prediction.gaussians)
+        even = camera.resized(*working_size(camera.width, camera.height, side)).even()
         return [
             Viewpoint(f"{disparity:g}", name, camera)
             for disparity in disparities

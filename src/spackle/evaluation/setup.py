@@ -24,6 +24,7 @@ from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, OW
 from spackle.evaluation.protocols import Gauges
 from spackle.evaluation.rows import DISPARITIES
 from spackle.folders import digest_of
+from spackle.image import MAX_SIDE
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.pipeline import FillOptions
 from spackle.render import Renderer, get_renderer
@@ -33,6 +34,7 @@ from spackle.training.losses import load_features
 from spackle.weights import weights_digest, weights_digests
 
 BASE = BaseSettings("sharp")
+LARGE_SIDE = 1280  # of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
 MAX_DISPARITIES = 6  # columns of a table
 
 
@@ -51,12 +53,18 @@ class EvaluateOptions:
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
+    side: int | None = None  # long side of the views; the paper's where None: 1280 for large views, 1536 for near ones
     limit: int | None = None  # so many images, spread over the dataset
     download: bool = False  # pyiqa may fetch weights
 
     @property
     def near(self) -> bool:
         return self.protocol == "near-view"
+
+    @property
+    def max_side(self) -> int:
+        """Long side of the views, in pixels."""
+        return self.side or (MAX_SIDE if self.near else LARGE_SIDE)
 
     @property
     def wanted(self) -> tuple[str, ...]:
@@ -180,6 +188,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
         "terms": dataset.terms,
         "images": {"count": len(cases), "limit": limit, "names": digest_of([case.name for case in cases])},
         "protocol": options.protocol,
+        "side": options.max_side,
         "disparities": None if options.near else list(options.disparities),
         "base": {
             "name": base.public_name,
