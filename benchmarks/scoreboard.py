@@ -134,6 +134,7 @@ FILL: dict[str, dict[str, Replace]] = {
     "sharpened": {"sharpened": first},
     "beyond_border": {"fill_around": filled_from_around},
     "in proportion": {"_in_proportion": lambda own: lambda fine, view: torch.ones_like(view.features.alpha)},
+    "in front": {"network.ALIKE": lambda own: math.inf},
     "extended": {"extended": lambda own: lambda view: view.structure},
 }
 MECHANISMS = (*FILL, *LIFT)
