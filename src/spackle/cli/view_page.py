@@ -33,11 +33,6 @@ from spackle.weights import installed
 
 DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
-OPEN_TO_ALL = (
-    "warning: everybody in the network can see this photo at --host {host}, send photos of their own and use this "
-    "machine to complete them; the connection is not encrypted"
-)
-ELSEWHERE = ("192.0.2.1", 9)  # an address of documentation: asking for the way there sends nothing
 
 
 def view_page(
@@ -205,7 +200,10 @@ class Teller(Reporter):
 def announce(server: ViewerServer, name: str, reporter: Reporter, *, browser: bool) -> None:
     """Print the page's address, warn if it is open to the network, and open a browser if there is a screen."""
     if not server.local:
-        reporter.log(OPEN_TO_ALL.format(host=server.host))
+        reporter.log(
+            f"warning: everybody in the network can see this photo at --host {server.host}, send photos of their own "
+            "and use this machine to complete them; the connection is not encrypted"
+        )
         reporter.log(f"{name}: from other machines {server.url_at(address_in_network(server.host))}")
     reporter.log(f"{name}: {server.url} (Ctrl-C ends)")
     reporter.result({"url": server.url})
@@ -223,6 +221,6 @@ def address_in_network(host: str) -> str:
     if host not in ("0.0.0.0", "::", ""):
         return host
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(ELSEWHERE)
+        probe.connect(("192.0.2.1", 9))  # an address of documentation: asking for the way there sends nothing
         return str(probe.getsockname()[0])
     return socket.gethostname()  # no network
