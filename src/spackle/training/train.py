@@ -361,6 +361,8 @@ def joined_ranks(kind: str) -> Iterator[torch.device]:
         with reading("RANK and WORLD_SIZE are set", "but the processes cannot join: {reason}"):
             local = int(os.environ.get("LOCAL_RANK", "0"))
             dist.init_process_group("nccl" if kind == "cuda" else "gloo", timeout=PATIENCE)
+    if kind == "cuda":
+        torch.cuda.set_device(local)  # of renderers and features, too, which name no number
     try:
         yield torch.device(kind, local) if kind == "cuda" else torch.device(kind)
     finally:
