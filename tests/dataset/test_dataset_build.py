@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command import names_in, run
-from dataset_builds import SHORT, VIEWS, build, content, dying_build, is_alive, refused, write_inputs
+from command import names_in, refuses, run
+from dataset_builds import SHORT, build, content, dying_build, is_alive, write_inputs
 from photos import metres, picture, write_depth
 from PIL import Image
-from scenes import psnr
 from sharp_weights import write_tiny
 
 from spackle.dataset import ViewDataset
@@ -35,19 +34,13 @@ from spackle.training.samples import digest_of_samples
 from spackle.training.sources import find_sources, open_pseudo, pseudo_view, views_with_holes
 from spackle.workers import results_of
 
-# The same bytes, however --------------------------------------------------------------------------
 
-
-def test_a_build_leaves_shards_and_a_manifest(whole: Path) -> None:
+def test_one_worker_and_two_leave_the_same_shards(whole: Path, place: Path, tmp_path: Path) -> None:
     assert names_in(whole) == {"manifest.json", "shard-000000.tar", "shard-000001.tar", "shard-000002.tar"}
     manifest = load_manifest(whole)
     assert [sample.photo for _, sample in manifest.samples] == ["0.png", "2.png", "3.png", "4.png", "deep/1.png"]
     assert [len(shard.samples) for shard in manifest.shards] == [2, 2, 1]
-    assert manifest.views == 5 * VIEWS
     assert all(sample.holes[0] == 0 < 0.02 < max(sample.holes) for _, sample in manifest.samples)
-
-
-def test_two_workers_make_the_same_bytes_as_one(whole: Path, place: Path, tmp_path: Path) -> None:
     assert build(place, tmp_path / "two", "--workers", 2).code == 0
     assert content(tmp_path / "two") == content(whole)
 
@@ -76,25 +69,22 @@ def test_a_killed_build_goes_on_and_ends_the_same(
     assert content(out) == content(whole)
 
 
-def test_workers_end_with_a_killed_build(place: Path, tmp_path: Path) -> None:
-    note = tmp_path / "processes"
-    patch = f"""
+def test_workers_end_with_a_killed_build_and_it_with_them(
+    place: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    patch = """
 def dying(*arguments):
-    with open({str(note)!r}, "w") as file:
-        print(*(child.pid for child in multiprocessing.active_children()), file=file)
+    print(*(child.pid for child in multiprocessing.active_children()), flush=True)
     die()
 build._Build._keep = dying"""
     process = dying_build(tmp_path / "script.py", patch, place, tmp_path / "out", "--workers", 2)
     assert process.wait() == -signal.SIGKILL
-    workers = [int(pid) for pid in note.read_text().split()]
+    workers = [int(pid) for pid in capfd.readouterr().out.split()]
     assert len(workers) == 2
     deadline = time.monotonic() + 30
     while any(is_alive(pid) for pid in workers):
         assert time.monotonic() < deadline, "a worker goes on without its main process"
         time.sleep(0.05)
-
-
-def test_a_worker_that_dies_is_a_line() -> None:
     dead: Future[Made] = Future()
     dead.set_exception(BrokenProcessPool("gone"))
     with pytest.raises(InputError, match="a worker process died"):
@@ -131,9 +121,6 @@ def test_a_lost_shard_is_made_again(whole: Path, place: Path, copy: Path) -> Non
     assert content(copy) == content(whole)
 
 
-# Photos -------------------------------------------------------------------------------------------
-
-
 def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -154,7 +141,7 @@ def test_odd_photos_are_used_and_bad_ones_are_named(tmp_path: Path) -> None:
     manifest = load_manifest(tmp_path / "out")
     assert [sample.photo for _, sample in manifest.samples] == ["grey.png", "moving.gif", "one.png"]
     assert sum(line.startswith("passed over: ") for line in done.lines) == 5
-    for words in ("tiny.png: 8×8 pixels", "cut.png: ", "empty.jpg: ", "two.png: the same photo as", "cmyk.jpg: "):
+    for words in ("tiny.png: 8×8 pixels", "cut.png: ", "empty.jpg: ", "two.png: the same photo as"):
         assert words in done.err
     (entry,) = [line for shard in manifest.shards for line in shard.passed_over]
     assert entry.startswith("cmyk.jpg: no depth map in --depth: ")
@@ -165,24 +152,14 @@ def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
     names = ["4.png", "gone.jpg", "0.png", "lost.jpg", "4.png"]
     file.write_text(json.dumps({"images": [{"file_name": name, "id": 1} for name in names]}))
     options = ["--depth", place / "depth", *SHORT, "--views", 2, "-o", tmp_path / "out"]
-    done = run("dataset", "build", "--photos", file, *options)
-    assert done.code == 0, done.err
-    assert "gone.jpg, lost.jpg" in done.err
+    assert "gone.jpg, lost.jpg" in run("dataset", "build", "--photos", file, *options).err
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["0.png", "4.png"]
     moved = shutil.move(file, tmp_path / "coco.json")
     assert run("dataset", "build", "--photos", moved, "--images", place / "photos", *options).code == 0
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "[]", '{"images": []}', '{"images": [{}]}', '{"images": [{"file_name": "../a.png"}]}',
-     '{"images": [{"file_name": "/etc/passwd"}]}', '{"images": [{"file_name": "no.jpg"}]}'],
-)  # fmt: skip
-def test_bad_annotations_are_a_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / "coco.json").write_text(text)
-    options = ["--photos", tmp_path / "coco.json", "--depth", tmp_path, "-o", tmp_path / "o", *SHORT]
-    refused(run("dataset", "build", *options), "coco.json")
-    assert not (tmp_path / "o").exists()
+    wrong = [[{"file_name": name}] for name in ("", "../a.png", "/etc/passwd", "no.jpg")]
+    for images in ([], [{}], None, *wrong):
+        moved.write_text(json.dumps({"images": images}))
+        refuses(run("dataset", "build", "--photos", moved, *options), "coco.json")
 
 
 def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
@@ -199,18 +176,14 @@ def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
 def test_no_photos_is_a_line(tmp_path: Path) -> None:
     for folder in ("photos", "depth"):
         (tmp_path / folder).mkdir()
-    refused(build(tmp_path, tmp_path / "out"), "no photos in this folder")
+    refuses(build(tmp_path, tmp_path / "out"), "no photos in this folder")
     (tmp_path / "photos" / "a.png").write_bytes(b"no")
     assert "none of 1 photos can be used" in build(tmp_path, tmp_path / "out").lines[-1]
     Image.fromarray(picture(72, 54)).save(tmp_path / "photos" / "0.png")
-    for _ in range(2):  # nothing stays of the first, and the second says why again
-        done = build(tmp_path, tmp_path / "out")
-        assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
-        assert "none of 1 photos gave a sample, such as 0.png: no depth map in --depth: " in done.lines[-1]
-        assert not (tmp_path / "out").exists()
-
-
-# Options ------------------------------------------------------------------------------------------
+    done = build(tmp_path, tmp_path / "out")
+    assert (done.code, len(done.lines)) == (2, 3)  # a.png, 0.png, and what it comes to
+    assert "none of 1 photos gave a sample, such as 0.png: no depth map in --depth: " in done.lines[-1]
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -226,10 +199,8 @@ def test_no_photos_is_a_line(tmp_path: Path) -> None:
         (("--inpainter", "propainter", "--inpainter-side", 64), "--inpainter-side must be between 128 and 1536"),
     ],
 )  # fmt: skip
-def test_bad_options_are_a_line_and_leave_nothing(
-    place: Path, tmp_path: Path, options: tuple[object, ...], said: str
-) -> None:
-    refused(build(place, tmp_path / "out", *options), said)
+def test_bad_options_leave_nothing(place: Path, tmp_path: Path, options: tuple[object, ...], said: str) -> None:
+    refuses(build(place, tmp_path / "out", *options), said)
     assert not (tmp_path / "out").exists()
 
 
@@ -238,20 +209,19 @@ def test_too_many_photos_and_a_missing_package_are_a_line(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(building, "MAX_PHOTOS", 4)
-        refused(build(place, tmp_path / "out"), "5 photos are too many for a dataset (at most 4): give --sample")
+        refuses(build(place, tmp_path / "out"), "5 photos are too many for a dataset (at most 4): give --sample")
     for package, extra, option, name in (("cv2", "opencv", "--inpainter", "opencv"), ("ray", "ray", "--ray", "local")):
         monkeypatch.setitem(sys.modules, package, None)
-        refused(build(place, tmp_path / "out", option, name), f"pip install 'spackle-nvs[{extra}]'")
+        refuses(build(place, tmp_path / "out", option, name), f"pip install 'spackle-nvs[{extra}]'")
     assert not (tmp_path / "out").exists()
 
 
-def test_another_configuration_and_a_held_folder_are_refused(place: Path, copy: Path) -> None:
-    before = content(copy)
+def test_another_configuration_and_a_held_folder_are_refused(whole: Path, place: Path, copy: Path) -> None:
     done = build(place, copy, "--inpainter", "none", "--disparity", "0.2", "0.3")
-    refused(done, 'inpainter.name: "geometry" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
-    assert content(copy) == before
+    refuses(done, 'inpainter.name: "geometry" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
+    assert content(copy) == content(whole)
     with hold(copy / ".lock"):
-        refused(build(place, copy), "another run is at work")
+        refuses(build(place, copy), "another run is at work")
 
 
 def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -> None:
@@ -266,15 +236,12 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -
     assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
 
 
-# As a source of training -------------------------------------------------------------------------
-
-
 def test_training_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     (tmp_path / "recipe.yaml").write_text("optim: {precision: fp32}\nloss: {features: none}")
-    words = ["views=4", "validation_views=2", "crops=2", "cells=16", f"pseudo={whole}"]
-    options = [f"data.{word}" for word in words] + ["optim.steps=2", "optim.batch=2", "run.validate_every=2"]
-    done = run("train", "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out", *options)
+    data = ["data.views=4", "data.validation_views=2", "data.crops=2", "data.cells=16", f"data.pseudo={whole}"]
+    options = ["optim.steps=2", "optim.batch=2", "run.validate_every=2"]
+    done = run("train", "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out", *data, *options)
     assert done.code == 0, done.err
     assert json.loads((tmp_path / "out" / "run.json").read_text())["samples"]["train"] > 0
 
@@ -284,8 +251,6 @@ def test_a_sample_of_a_dataset_is_one_of_its_views(whole: Path) -> None:
     sample, again = (pseudo_view(np.random.default_rng(3), files, views_with_holes(files)) for _ in range(2))
     assert torch.equal(sample.target, again.target)
     assert bool(sample.hole.any())
-    drawn = get_renderer().render(sample.base, sample.camera)
-    assert psnr(drawn.rgb, sample.rendering.rgb) > 55
     (view,) = [view for view in ViewDataset(whole) if torch.equal(view.target, sample.target)]
     assert torch.equal(view.mask, sample.hole)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import Run, names_in
-from dataset_builds import build, content, refused
+from command import Run, names_in, refuses
+from dataset_builds import build, content
 
 from spackle import workers as on_ray
 from spackle.bases.settings import BaseSettings
@@ -43,22 +43,20 @@ def address() -> Iterator[str]:
 def dying(times: int, notes: Path, where: str = "make") -> type[RemoteWorker]:
     """Workers of which the first few are killed when they have made the photo number 2, or as they begin."""
 
-    def turn() -> None:
+    def turn(here: str) -> None:
         turns = len(list(notes.iterdir()))
-        if turns < times:
+        if here == where and turns < times:
             (notes / str(turns)).touch()
             os.kill(os.getpid(), signal.SIGKILL)
 
     class Dying(RemoteWorker):
         def begin(self, expected: Any) -> None:
-            if where == "begin":
-                turn()
+            turn("begin")
             super().begin(expected)
 
         def make(self, job: PhotoFile, expected: object) -> Any:
             answer = super().make(job, expected)
-            if where == "make" and job.index == 2:
-                turn()
+            turn("make" if job.index == 2 else "")
             return answer
 
     notes.mkdir()
@@ -67,9 +65,6 @@ def dying(times: int, notes: Path, where: str = "make") -> type[RemoteWorker]:
 
 def on(address: str, place: Path, output: Path, *more: object) -> Run:
     return build(place, output, "--ray", address, "--workers", 2, *more)
-
-
-# The same bytes -----------------------------------------------------------------------------------
 
 
 def test_a_local_cluster_makes_the_same_bytes_and_ends(place: Path, whole: Path, tmp_path: Path) -> None:
@@ -108,19 +103,16 @@ def test_what_kills_every_worker_ends_the_build(
     assert content(tmp_path / "out") == content(whole)
 
 
-# What cannot be -----------------------------------------------------------------------------------
-
-
 def test_a_silent_address_and_a_full_cluster_are_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused(on(address, place, tmp_path / "out", "--workers", 3), f"--ray {address}: room for 2 of 3 workers")
-    refused(on("nowhere", place, tmp_path / "out"), "--ray nowhere: no cluster: ValueError: ")
+    refuses(on(address, place, tmp_path / "out", "--workers", 3), f"--ray {address}: room for 2 of 3 workers")
+    refuses(on("nowhere", place, tmp_path / "out"), "--ray nowhere: no cluster: ValueError: ")
     monkeypatch.setattr(on_ray, "ANSWER_S", 1.0)
     with socket.socket() as nobody:  # takes the port, and no calls
         nobody.bind(("127.0.0.1", 0))
         closed = f"127.0.0.1:{nobody.getsockname()[1]}"
-        refused(on(closed, place, tmp_path / "out"), f"--ray {closed}: no cluster: no answer within 1 seconds")
+        refuses(on(closed, place, tmp_path / "out"), f"--ray {closed}: no cluster: no answer within 1 seconds")
     assert not (tmp_path / "out").exists()
 
 
@@ -136,17 +128,16 @@ def test_a_node_that_is_not_like_the_others_is_a_line(
     place: Path, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, instead: Any, line: str
 ) -> None:
     monkeypatch.setattr(Maker, name, instead if name == "setup" else lambda *arguments: instead)
-    refused(on(address, place, tmp_path / "out"), line.format(node=socket.gethostname()))
+    refuses(on(address, place, tmp_path / "out"), line.format(node=socket.gethostname()))
     assert names_in(tmp_path / "out" / "parts") == set()
 
 
 def test_a_worker_takes_a_gpu_only_where_a_network_uses_one() -> None:
-    def gpus(
-        base: str, device: str = "auto", inpainter: str = "geometry", here: float = 1.0, alive: bool = True
-    ) -> int:
+    def gpus(base: str, device: str = "auto", inpainter: str = "geometry", **node: Any) -> int:
         options = DatasetOptions(BaseSettings(base, device=device), inpainter=inpainter)
         without = {"Alive": True, "Resources": {"CPU": 4.0}}
-        return on_ray.gpus_of(options.processes, [without, {"Alive": alive, "Resources": {"CPU": 4.0, "GPU": here}}])
+        return on_ray.gpus_of(options.processes, [without, {"Alive": True, "Resources": {"GPU": 1.0}} | node])
 
     assert (gpus("sharp"), gpus("rgbd", inpainter="propainter")) == (1, 1)
-    assert (gpus("rgbd"), gpus("sharp", "cpu"), gpus("sharp", here=0.0), gpus("sharp", alive=False)) == (0, 0, 0, 0)
+    assert (gpus("rgbd"), gpus("sharp", "cpu")) == (0, 0)
+    assert (gpus("sharp", Resources={"GPU": 0.0}), gpus("sharp", Alive=False)) == (0, 0)

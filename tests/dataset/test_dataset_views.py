@@ -29,11 +29,6 @@ def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind
         path_cameras(kind, 0.0, camera, DepthRange(2.0, 3.0), views)
 
 
-def completed(name: str, stack: ViewStack) -> Tensor:
-    inpainter = get_inpainter(name, InpainterOptions()) if name in INPAINTERS else None
-    return complete_views(stack, name, inpainter, get_renderer())
-
-
 def stack_of(*rights: float) -> ViewStack:
     scene = box_before_wall()
     views = [scene.camera, *(shifted(scene.camera, right) for right in rights)]
@@ -45,11 +40,12 @@ def test_completion_touches_the_holes_alone(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")
     stack = stack_of(0.4, -0.3)
-    targets = completed(name, stack)
+    inpainter = get_inpainter(name, InpainterOptions()) if name in INPAINTERS else None
+    targets = complete_views(stack, name, inpainter, get_renderer())
     assert torch.equal(targets[~stack.mask], stack.rgb[~stack.mask])
     assert bool((targets[stack.mask].amax(-1) > 0.2).all()) == (name != "none")
     whole = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
-    assert torch.equal(completed(name, whole), stack.rgb)
+    assert torch.equal(complete_views(whole, name, inpainter, get_renderer()), stack.rgb)
 
 
 class Numbering:
