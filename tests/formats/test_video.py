@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -37,19 +36,20 @@ def decoded(path: Path) -> tuple[tuple[str, Fraction | None], list[av.VideoFrame
 
 
 CUES, CLUSTER = b"\x1c\x53\xbb\x6b", b"\x1f\x43\xb6\x75"
+SIZES = [(48, 64), (47, 65), (1, 1)]
 
 
 @pytest.mark.parametrize(("name", "codec", "index"), [("a.mp4", "h264", b"moov"), ("a.webm", "vp9", CUES)])
-@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
+@pytest.mark.parametrize(("height", "width"), SIZES)
 def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
     tmp_path: Path, name: str, codec: str, index: bytes, height: int, width: int
 ) -> None:
-    given, path = frames(12, height, width), tmp_path / name
-    save_video(iter(given), path, fps=25)
+    given, path = frames(7, height, width), tmp_path / name
+    save_video(iter(given), path, fps=25, loop=2)
     kind, shown, colors = decoded(path)
     assert kind[0] == codec
-    assert [round(frame.time * 25) for frame in shown] == list(range(12))
-    for sent, frame, rgb in zip(given, shown, colors, strict=True):
+    assert [round(frame.time * 25) for frame in shown] == list(range(14))  # each repetition is stored
+    for sent, frame, rgb in zip(given * 2, shown, colors, strict=True):
         assert (frame.height, frame.width) == (height + height % 2, width + width % 2)
         assert frame.format.name == "yuv420p"
         assert (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range) == (1, 1, 1, 1)
@@ -62,18 +62,13 @@ def test_a_video_decodes_to_what_went_in_and_plays_while_it_loads(
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="fills new memory by glibc")
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "a.webp"])
 def test_the_same_frames_give_the_same_bytes_whatever_memory_held(tmp_path: Path, name: str) -> None:
-    wall = torch.rand(1, 3, 12, 16, generator=torch.Generator().manual_seed(0))
-    wall = torch.nn.functional.interpolate(wall, size=(96, 128), mode="bilinear")[0].permute(1, 2, 0)
-    views = [wall[k : k + 48, 2 * k : 2 * k + 64].clone() for k in range(20)]
-    for view in views:
-        view[16:32, 16:40] = 0.3  # what stands before the wall
-    perturb, found = -6, set()
+    perturb, found, mallopt = -6, set(), ctypes.CDLL(None).mallopt
     for byte in (1, 85, 254):
-        ctypes.CDLL(None).mallopt(perturb, byte)
+        mallopt(perturb, byte)
         try:
-            save_video(views, tmp_path / name)
+            save_video(frames(20, 48, 64), tmp_path / name)
         finally:
-            ctypes.CDLL(None).mallopt(perturb, 0)
+            mallopt(perturb, 0)
         found.add((tmp_path / name).read_bytes())
     assert len(found) == 1
 
@@ -96,22 +91,14 @@ def test_strange_values_are_clamped_and_odd_rates_kept(tmp_path: Path) -> None:
     assert kind == ("h264", Fraction(30000, 1001))
 
 
-def failing() -> Iterator[Tensor]:
-    yield from frames(3, 16, 16)
-    raise RuntimeError("the renderer broke")
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.webp", "a.webm"])
 def test_a_failed_video_leaves_the_old_file(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
+    path, one = tmp_path / name, torch.zeros(16, 16, 3)
     path.write_bytes(b"old")
-    with pytest.raises(RuntimeError, match="renderer"):
-        save_video(failing(), path)
-    one = torch.zeros(16, 16, 3)
     for wrong, says in (
         ([], "at least one"),
         ([one, torch.zeros(16, 18, 3)], "frame 1 is"),
-        ([one[..., 0]], "a video frame"),
+        ([one, one, one[..., 0]], "a video frame"),
     ):
         with pytest.raises(ValueError, match=says):
             save_video(wrong, path)
@@ -133,7 +120,7 @@ def animation(path: Path) -> tuple[list[Tensor], list[int], int | None]:
     return shown, times, loop
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65), (1, 1)])
+@pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize(("name", "least"), [("a.gif", 22), ("a.webp", 33)])
 def test_animations_decode_to_what_went_in(tmp_path: Path, name: str, least: float, height: int, width: int) -> None:
     given = frames(6, height, width)
@@ -161,16 +148,15 @@ def test_an_animation_says_how_often_it_plays(tmp_path: Path, name: str) -> None
 
 def test_a_gif_keeps_rare_colours_and_spreads_a_gradient(tmp_path: Path) -> None:
     """One palette for all frames: a small orange lamp stays orange, and grey steps are not seen as bands."""
-    ramp = torch.linspace(0.1, 0.6, 160).expand(90, 160)[..., None].repeat(1, 1, 3)
-    pictures = [ramp.clone() for _ in range(3)]
+    ramp, orange = torch.linspace(0.1, 0.6, 160), torch.tensor([1.0, 0.5, 0.1])
+    pictures = [ramp[:, None].repeat(90, 1, 3) for _ in range(3)]
     for k, picture in enumerate(pictures):
-        picture[40:46, 20 * k : 20 * k + 6] = torch.tensor([1.0, 0.5, 0.1])
+        picture[40:46, 20 * k : 20 * k + 6] = orange
     save_video(pictures, tmp_path / "a.gif", fps=10)
     for k, got in enumerate(animation(tmp_path / "a.gif")[0]):
         lamp = got[41:45, 20 * k + 1 : 20 * k + 5].mean(dim=(0, 1))
-        torch.testing.assert_close(lamp, torch.tensor([1.0, 0.5, 0.1]), atol=0.03, rtol=0)
-        columns = got[:30].mean(dim=(0, 2))
-        assert float((columns - ramp[0, :, 0]).abs().max()) < 0.01
+        torch.testing.assert_close(lamp, orange, atol=0.03, rtol=0)
+        torch.testing.assert_close(got[:30].mean(dim=(0, 2)), ramp, atol=0.01, rtol=0)
 
 
 def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
@@ -180,16 +166,6 @@ def test_what_moves_leaves_no_trace_in_a_gif(tmp_path: Path) -> None:
     save_video(pictures, tmp_path / "a.gif")
     for sent, got in zip(pictures, animation(tmp_path / "a.gif")[0], strict=True):
         assert torch.equal(got, sent)
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.webm"])
-def test_a_video_without_a_count_holds_every_repetition(tmp_path: Path, name: str) -> None:
-    given = frames(7, 32, 32)
-    save_video(given, tmp_path / name, fps=30, loop=3)
-    _, shown, colors = decoded(tmp_path / name)
-    assert [frame.time for frame in shown] == pytest.approx([k / 30 for k in range(21)], abs=0.002)
-    for k, rgb in enumerate(colors):
-        assert psnr(rgb, given[k % 7]) > 30
 
 
 UNKNOWN = [
@@ -227,4 +203,3 @@ def test_colour_and_grey_png(tmp_path: Path) -> None:
             save(torch.zeros(shape), tmp_path / "bad.png")
     with pytest.raises(InputError, match="cannot write"):
         save_png(rgb, tmp_path)
-    assert sorted(os.listdir(tmp_path)) == ["a.png", "g.png"]

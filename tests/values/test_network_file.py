@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import warnings
@@ -11,7 +10,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -129,22 +127,6 @@ def test_code_in_a_file_is_not_run(tmp_path: Path) -> None:
     assert mark.exists()
 
 
-@pytest.mark.parametrize("write", WRITERS[:4])
-def test_cut_and_damaged_files_are_a_line(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
-    path, random = tmp_path / "weights", np.random.default_rng(0)
-    write(WHOLE, path)
-    whole = path.read_bytes()
-    for size in [1, 3, 4, 9, *(len(whole) * np.arange(1, 30) // 30), len(whole) - 1]:
-        path.write_bytes(whole[:size])
-        refused(path)
-    for _ in range(30):  # a byte that does not matter may change
-        damaged = bytearray(whole)
-        damaged[random.integers(len(whole))] ^= 1 << random.integers(8)
-        path.write_bytes(damaged)
-        with contextlib.suppress(InputError):
-            read(path)
-
-
 STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQ"
 TENSOR = b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE + b"K\x00(%s(%stR"
 NAME = b"X\x01\x00\x00\x00a"
@@ -173,13 +155,12 @@ def test_archives_that_are_not_as_torch_packs_them_are_a_line(tmp_path: Path) ->
     path = tmp_path / "a.pt"
     torch.save(GOOD, path)
     records = records_of(path)
-    for change, how, said in (
-        ({}, zipfile.ZIP_DEFLATED, "is packed"),
-        ({"data/0": records["data/0"][:-4]}, zipfile.ZIP_STORED, "has not the 24 bytes"),
-        ({"byteorder": b"big"}, zipfile.ZIP_STORED, "not little-endian"),
-    ):
-        archive(path, records | change, how)
-        assert said in refused(path)
+    archive(path, records, zipfile.ZIP_DEFLATED)
+    assert "is packed" in refused(path)
+    archive(path, records | {"data/0": records["data/0"][:-4]})
+    assert "has not the 24 bytes" in refused(path)
+    archive(path, records | {"byteorder": b"big"})
+    assert "not little-endian" in refused(path)
     archive(path, {name: data for name, data in records.items() if name != "data/0"})
     assert "data/0" in refused(path)
     archive(path, records)  # packed again without compression
@@ -189,32 +170,23 @@ def test_archives_that_are_not_as_torch_packs_them_are_a_line(tmp_path: Path) ->
     assert "damaged at " in refused(path)
 
 
-OTHERS: dict[str, object] = {  # bytes, or what is saved
-    "empty": b"",
-    "text": b"<html>not found</html>",
-    "answer": b'{"data":{"error": "gone"}}',
-    "noise": bytes(range(256)) * 40,
-    "header": (2**62).to_bytes(8, "little") + b"{}",
-    "padded": b"\x40\0\0\0\0\0\0\0{" + b" " * 9,
-    "list": [1, 2, 3],
-    "tensor": torch.ones(3),
-    "numbered": {0: torch.zeros(2)},
-}
+OTHERS: list[tuple[object, str]] = [  # bytes, or what is saved
+    (b"", "the file is empty"),
+    *((content, "not a file of weights, or damaged (") for content in (
+        b"<html>not found</html>", b'{"data":{"error": "gone"}}', bytes(range(256)) * 40,
+        (2**62).to_bytes(8, "little") + b"{}", b"\x40\0\0\0\0\0\0\0{" + b" " * 9,
+        [1, 2, 3], torch.ones(3), {0: torch.zeros(2)},
+    )),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", OTHERS)
-def test_files_of_other_kinds_are_a_line(tmp_path: Path, kind: str) -> None:
-    content = OTHERS[kind]
-    if isinstance(content, bytes):
-        (tmp_path / "a").write_bytes(content)
-    else:
-        torch.save(content, tmp_path / "a")
-    assert ("the file is empty" if kind == "empty" else "not a file of weights, or damaged (") in refused(
-        tmp_path / "a"
-    )
-
-
-def test_what_is_no_file_is_a_line(tmp_path: Path) -> None:
+def test_files_of_other_kinds_are_a_line(tmp_path: Path) -> None:
+    for content, said in OTHERS:
+        if isinstance(content, bytes):
+            (tmp_path / "a").write_bytes(content)
+        else:
+            torch.save(content, tmp_path / "a")
+        assert said in refused(tmp_path / "a")
     assert "no such weight file" in refused(tmp_path / "missing")
     assert "not a plain file" in refused(tmp_path)
     archive(tmp_path / "a.zip", {"hello.txt": b"hello"})
@@ -230,14 +202,12 @@ DIFFERENCES: list[tuple[dict[str, Tensor | None], str]] = [
     ({"more": torch.ones(1)}, "1 unknown (more)"),
     ({f"more{n}": torch.ones(1) for n in range(5)}, "5 unknown (more0, more1, more2, and 2 more)"),
     ({"linear.bias": torch.ones(3)}, "1 of another shape (linear.bias [3] instead of [2])"),
-    ({"linear.bias": torch.tensor(1.0)}, "(linear.bias [] instead of [2])"),
     ({"linear.bias": torch.ones(2).int()}, "1 not of floats (linear.bias)"),
     ({"linear.bias": torch.ones(2).to_sparse()}, "1 missing (linear.bias)"),
     ({"linear.bias": torch.ones(2, device="meta")}, "1 missing (linear.bias)"),
     ({"linear.bias": hiding}, "1 missing (linear.bias)"),
     ({"linear.bias": torch.tensor([0, torch.nan])}, "not finite (linear.bias): give another"),
-    ({"\x1b[31mred\x1b[0m\r\n\u202e": torch.ones(1)}, "1 unknown ("),
-    ({"\x07" * 100_000: torch.ones(1)}, "1 unknown ("),
+    ({"\x1b[31mred\x1b[0m\r\n\u202e" * 10_000: torch.ones(1)}, "1 unknown ("),
 ]
 
 
@@ -251,18 +221,18 @@ def test_each_difference_is_listed(tmp_path: Path, change: dict[str, Tensor | No
 
 @pytest.mark.parametrize("write", WRITERS[:2])
 def test_a_filled_network_is_frozen_and_leaves_its_file(tmp_path: Path, write: Callable[[Weights, Path], None]) -> None:
-    large = torch.tensor([3e38, 3e38])  # finite, but their sum is not
-    write(GOOD | {"linear.bias": large, "places": torch.tensor([9] * 4)}, tmp_path / "a.pt")
-    network = load_strict(Small(), read(tmp_path / "a.pt"), tmp_path / "a.pt", "give another")
-    with open(tmp_path / "a.pt", "r+b") as file:  # changed later
-        file.write(bytes((tmp_path / "a.pt").stat().st_size))
+    large, path = torch.tensor([3e38, 3e38]), tmp_path / "a.pt"  # finite, but their sum is not
+    write(GOOD | {"linear.bias": large, "places": torch.tensor([9] * 4)}, path)
+    network = load_strict(Small(), read(path), path, "give another")
+    with open(path, "r+b") as file:  # changed later
+        file.write(bytes(path.stat().st_size))
     assert torch.equal(network.linear.weight, GOOD["linear.weight"])
     assert torch.equal(network.linear.bias, large)
     assert network.get_buffer("places").tolist() == [0, 1, 2, 3]
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
-    write({name: tensor.half() for name, tensor in GOOD.items()}, tmp_path / "a.pt")
-    network = load_strict(Small(), read(tmp_path / "a.pt"), tmp_path / "a.pt", "give another")
+    write({name: tensor.half() for name, tensor in GOOD.items()}, path)
+    network = load_strict(Small(), read(path), path, "give another")
     assert torch.equal(network.linear.weight, GOOD["linear.weight"])
     assert network.linear.weight.dtype == torch.float32
 
