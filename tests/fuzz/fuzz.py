@@ -1,24 +1,23 @@
 """Feeds damaged files to the readers: `make fuzz N=5000`, or `python tests/fuzz/fuzz.py --replay CASE.json`.
 
 Each case follows from its reader's name and its number alone. A reader may raise `InputError` and nothing else, within
-10 s and 1.5 GB. All run in one child process whose memory the kernel bounds; the parent goes on behind a case that
-kills it.
+10 s and 1.5 GB. They run in forked processes of bounded memory; a new one goes on behind a case that fails.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import ctypes
 import faulthandler
 import json
+import multiprocessing
 import os
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 import zlib
@@ -29,7 +28,8 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "evaluation"), str(HERE.parents[1] / "src")]
+ROOMS = [HERE.parent / room for room in ("", "evaluation", "formats", "values")]  # which have builders of files
+sys.path[:0] = map(str, [HERE, *ROOMS, HERE.parents[1] / "src"])
 
 SECONDS, BYTES = 10, 1_500_000_000  # at most, of a case
 FAILURES = Path("fuzz-failures")
@@ -124,52 +124,6 @@ def save(name: str, number: int, files: Files, path: Path) -> Path:
     return path
 
 
-# The child ----------------------------------------------------------------------------------------
-
-
-def child(names: Sequence[str], first: int, count: int, case: Path) -> None:
-    """Run the cases: the file `case` holds the one in hand, FAILURES those that failed, `problems` a line for each."""
-    from readers import READERS, contents, sealed
-
-    seeds: dict[str, list[Files]] = {name: [] for name in names}
-    for name in names:  # also loads all that is needed, before memory is bounded
-        for make in READERS[name].makers:
-            with tempfile.TemporaryDirectory() as place:
-                make(Path(place))
-                seeds[name].append(contents(Path(place)))
-            problem_of(name, seeds[name][-1])
-    bound_memory()
-    for name in names:
-        began = time.perf_counter()
-        for number in range(first, first + count):
-            rng = np.random.default_rng([zlib.crc32(name.encode()), number])
-            files = mutated(seeds[name][number % len(seeds[name])], rng)
-            files = sealed(files) if rng.random() < 0.8 else files
-            save(name, number, files, case)
-            if problem := bounded(name, files):
-                kept = save(name, number, files, FAILURES / f"{name}-{number}.json")
-                with open(case.with_name("problems"), "a") as lines:
-                    lines.write(json.dumps([str(kept), problem]) + "\n")
-        print(f"{name}: {count} cases, {time.perf_counter() - began:.1f} s", file=sys.stderr)
-
-
-def bound_memory() -> None:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    faulthandler.register(signal.SIGPROF, chain=True)  # a traceback, then the end
-
-
-def bounded(name: str, files: Files) -> str | None:
-    """What was wrong; the process ends where it takes too long."""
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of the processor: others may be at work, too
-    faulthandler.dump_traceback_later(20 * SECONDS, exit=True)  # waits for something
-    problem = problem_of(name, files)
-    faulthandler.cancel_dump_traceback_later()
-    signal.setitimer(signal.ITIMER_PROF, 0)
-    return problem
-
-
 def problem_of(name: str, files: Files) -> str | None:
     """What a reader did that it must not do."""
     from av import FFmpegError
@@ -197,56 +151,76 @@ def problem_of(name: str, files: Files) -> str | None:
     return None
 
 
-# The parent ---------------------------------------------------------------------------------------
+def bound_memory() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    faulthandler.register(signal.SIGPROF, chain=True)  # a traceback, then the end
 
 
-def fuzz(names: Sequence[str], count: int, first: int = 0) -> dict[str, str]:
-    """Run `count` cases of each reader: the files of FAILURES that were written, and what is wrong with each."""
-    found: dict[str, str] = {}
-    waiting = [(list(names), first, count)]
-    few = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+def bounded(name: str, files: Files) -> str | None:
+    """What was wrong; the process ends where it takes too long."""
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of the processor: others may be at work, too
+    faulthandler.dump_traceback_later(20 * SECONDS, exit=True)  # waits for something
+    problem = problem_of(name, files)
+    faulthandler.cancel_dump_traceback_later()
+    signal.setitimer(signal.ITIMER_PROF, 0)
+    return problem
+
+
+def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, said: Path) -> None:
+    """Up to the first that fails: the file `case` then holds it, and `said` what was wrong."""
+    from readers import sealed
+
+    with open(said, "w") as file:
+        os.dup2(file.fileno(), sys.stderr.fileno())
+    bound_memory()
+    for number in numbers:
+        rng = np.random.default_rng([zlib.crc32(name.encode()), number])
+        files = mutated(seeds[number % len(seeds)], rng)
+        files = sealed(files) if rng.random() < 0.8 else files
+        save(name, number, files, case)
+        if problem := bounded(name, files):
+            sys.exit(problem)
+
+
+def fuzz(name: str, count: int) -> int:
+    """How many cases of a reader failed: they are written to FAILURES, and what was wrong is printed."""
+    from readers import READERS, contents
+
+    seeds: list[Files] = []
+    for make in READERS[name].makers:  # also loads all that is needed, before memory is bounded
+        with tempfile.TemporaryDirectory() as place:
+            make(Path(place))
+            seeds.append(contents(Path(place)))
+        problem_of(name, seeds[-1])
+    first = failed = 0
     with tempfile.TemporaryDirectory() as place:
-        case, problems = Path(place, "case.json"), Path(place, "problems")
-        problems.touch()
-        while waiting:
-            now, start, many = waiting.pop()
+        case, said = Path(place, "case.json"), Path(place, "said")
+        while first < count:
             case.unlink(missing_ok=True)
-            command = [sys.executable, __file__, f"-n={many}", f"--first={start}", f"--child={case}", "--readers", *now]
-            done = subprocess.run(command, env=os.environ | few, capture_output=True, text=True)
-            sys.stderr.write("" if done.returncode else done.stderr)
-            found |= dict(map(json.loads, problems.read_text().splitlines()))
-            if done.returncode and not case.exists():
-                raise RuntimeError(done.stderr)
-            if done.returncode:  # it died in this case
-                facts = json.loads(case.read_text())
-                name, number = facts["reader"], facts["number"]
-                FAILURES.mkdir(exist_ok=True)
-                kept = shutil.copy(case, FAILURES / f"{name}-{number}.json")
-                found[str(kept)] = f"ended the process ({done.returncode}):\n{done.stderr[-2000:]}"
-                later, left = now[now.index(name) + 1 :], start + many - number - 1
-                waiting += [(later, start, many)] if later else []
-                waiting += [([name], number + 1, left)] if left else []
-    return found
-
-
-def replayed(*paths: Path) -> list[str]:
-    """What saved cases do in a process of their own, a line each."""
-    done = subprocess.run([sys.executable, __file__, "--replay", *paths], capture_output=True, text=True)
-    return (done.stdout + done.stderr).splitlines()
+            arguments = name, seeds, range(first, count), case, said
+            process = multiprocessing.get_context("fork").Process(target=run_cases, args=arguments)
+            process.start()
+            process.join()
+            if process.exitcode == 0:
+                break
+            first, failed = json.loads(case.read_text())["number"] + 1, failed + 1
+            FAILURES.mkdir(exist_ok=True)
+            kept = shutil.copy(case, FAILURES / f"{name}-{first - 1}.json")
+            print(f"{kept}: ended with {process.exitcode}: {said.read_text()[-2000:]}", flush=True)
+    return failed
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-n", type=int, default=300, help="cases of each reader")
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--readers", nargs="*", help="only these")
     parser.add_argument("--replay", type=Path, nargs="+", help="cases that were written here before")
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    if given.child:
-        child(given.readers, given.first, given.n, given.child)
-        return 0
+    os.environ["OMP_NUM_THREADS"] = "1"  # threads take memory, and a forked process has none of them
+    ctypes.CDLL(None).mallopt(-8, 2)  # so many heaps at most: each new one takes 64 MB
     from readers import READERS
 
     if given.replay:
@@ -257,11 +231,7 @@ def main() -> int:
             problems.append(bounded(case["reader"], files))
             print(problems[-1] or "as it should be", flush=True)
         return any(problems)
-    found = fuzz(given.readers or list(READERS), given.n, given.first)
-    for path, problem in found.items():
-        print(f"{path}: {problem}\n", file=sys.stderr)
-    print(f"{len(found)} failures", file=sys.stderr)
-    return bool(found)
+    return sum(fuzz(name, given.n) for name in given.readers or READERS) > 0
 
 
 if __name__ == "__main__":

@@ -16,12 +16,15 @@ from typing import Any
 
 import numpy as np
 import portraits
+import test_ply
 import torch
 from clips import moving, write_clip
-from photos import calibration, camera_file, metres, picture, write_depth, write_photo
+from photos import calibration, metres, picture, write_depth, write_photo
 from PIL import Image
-from safetensors.torch import save_file
+from scenes import random_gaussians
+from test_camera_files import CAMERAS, PATH
 from test_eval_datasets import EYES, booster, eth3d, llff, middlebury_2014, tanks, wildrgbd
+from test_network_file import WHOLE, WRITERS
 
 from spackle.bases.depth_map import load_depth
 from spackle.bases.photo_depth.layouts import load_photo_depth
@@ -36,7 +39,6 @@ from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import read_cases
 from spackle.folders import digest_of
 from spackle.formats import PlyFile, load_cameras, load_path, save_ply
-from spackle.gaussians import Gaussians
 from spackle.image import load_photo, resize_photo
 from spackle.network_file import read_tensors
 from spackle.training.checkpoint import Checkpoint, Progress, load_checkpoint, save_checkpoint
@@ -111,31 +113,13 @@ def _npz(folder: Path) -> None:
 
 
 def _ply(folder: Path) -> None:
-    parts = torch.linspace(0.1, 0.9, 9 * 14).split([27, 36, 27, 9, 27])
-    scene = Gaussians(*(part.reshape(9, -1).squeeze(1) for part in parts))
-    save_ply(scene, folder / "a.ply", camera=Camera.from_focal(50, 64, 48), base_count=4, disparity=0.3)
-
-
-def _sharp_ply() -> str:
-    """ASCII, with SHARP's camera behind the Gaussians."""
-    rest = [f"{name}_{k}" for name, count in (("f_dc", 3), ("scale", 3), ("rot", 4)) for k in range(count)]
-    names = ["x", "y", "z", "opacity", *rest]
-    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {name}" for name in names)]
-    tables = {"intrinsic": [50, 0, 32, 0, 50, 24, 0, 0, 1], "image_size": [64, 48], "color_space": [1]}
-    for name, numbers in tables.items():
-        lines += [f"element {name} {len(numbers)}", f"property float {name}"]
-    rows = [" ".join(["0.5"] * len(names))] * 3 + [str(n) for numbers in tables.values() for n in numbers]
-    return "\n".join([*lines, "end_header", *rows, ""])
+    camera = Camera.from_focal(50, 64, 48)
+    save_ply(random_gaussians(9), folder / "a.ply", camera=camera, base_count=4, disparity=0.3)
 
 
 def _read_ply(folder: Path) -> None:
     for read in (PlyFile.camera, PlyFile.base_count, PlyFile.disparity, PlyFile.gaussians):
         read(PlyFile(_only(folder)))
-
-
-def _keyframes() -> str:
-    keys = [{"time": k, "eye": [k, 0, 0], "target": [0, 0, 3], "up": [0, -1, 0], "fov": 60} for k in range(3)]
-    return json.dumps({"keyframes": keys, "closed": False, "unit": "metres"})
 
 
 def _calib(folder: Path) -> None:
@@ -202,16 +186,13 @@ def _read_dataset(folder: Path) -> None:
             group.view(index, with_base=True)
 
 
-TENSORS = {"a": torch.zeros(3, 4), "b": torch.ones(2, dtype=torch.float16)}
-
-
 def _checkpoint(folder: Path) -> None:
     progress = Progress(3, 0.5, history=[{"loss": 1.0}])
-    save_checkpoint(Checkpoint(progress, TENSORS, TENSORS, {"state": {}}, {"run": {}}, "x"), folder)
+    save_checkpoint(Checkpoint(progress, WHOLE, WHOLE, {"state": {}}, {"run": {}}, "x"), folder)
 
 
-def _saved(folder: Path) -> None:
-    torch.save({"a": torch.zeros(3, 4), "b": torch.nn.Parameter(torch.ones(2))}, folder / "a.pt")
+def _weights(write: Callable[[dict[str, torch.Tensor], Path], None]) -> Maker:
+    return lambda folder: write(WHOLE, folder / "a")
 
 
 def _read_weights(folder: Path) -> None:
@@ -224,11 +205,6 @@ def _read_weights(folder: Path) -> None:
 
 def _clip(name: str, **options: Any) -> Maker:
     return lambda folder: write_clip(folder / name, moving(3, 16, 24), **options)
-
-
-def _animation(folder: Path) -> None:
-    first, *others = (Image.fromarray(frame) for frame in moving(3, 16, 24))
-    first.save(folder / "a.gif", save_all=True, append_images=others, duration=100)
 
 
 def _read_clip(folder: Path) -> None:
@@ -266,18 +242,20 @@ READERS: dict[str, Reader] = {
         ],
         lambda folder: load_photo_depth(_only(folder)),
     ),
-    "ply": Reader([_ply, _writes("a.ply", _sharp_ply())], _read_ply),
-    "cameras": Reader([lambda folder: camera_file(folder / "a.json", [0.0, 0.2])], lambda f: load_cameras(_only(f))),
-    "keyframes": Reader([_writes("a.json", _keyframes())], lambda folder: load_path(_only(folder))),
+    "ply": Reader([_ply, *(_writes("a.ply", content) for content in (test_ply.SHARP, test_ply.ASCII))], _read_ply),
+    "cameras": Reader([_writes("a.json", json.dumps(CAMERAS))], lambda folder: load_cameras(_only(folder))),
+    "keyframes": Reader([_writes("a.json", json.dumps(PATH))], lambda folder: load_path(_only(folder))),
     "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),
     "recipes": Reader([_writes("a.yaml", RECIPE)], lambda folder: load_recipe(Recipe, _only(folder))),
     "coco": Reader([_coco], lambda folder: find_photos(folder / "a.json", folder / "images", _say)),
     "datasets": Reader([_dataset], _read_dataset),
-    "weights": Reader(
-        [_checkpoint, lambda folder: save_file(TENSORS, folder / "a.safetensors"), _saved], _read_weights
-    ),
+    "weights": Reader([_checkpoint, *map(_weights, WRITERS)], _read_weights),
     "clips": Reader(
-        [_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4"), _animation], _read_clip
+        [
+            *(_clip("a.mp4"), _clip("a.mkv", sound="aac"), _clip("a.avi", codec="mpeg4")),
+            _clip("a.gif", codec="gif", pix_fmt="rgb8"),
+        ],
+        _read_clip,
     ),
     "middlebury": _tree("middlebury", lambda folder: middlebury_2014(folder / "a")),
     "booster": _tree("booster", lambda folder: booster(folder / "a")),

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import io
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import fuzz
 import numpy as np
-import pytest
 from PIL import Image
-from readers import READERS
 
 
-@pytest.fixture(scope="module")
-def failures() -> dict[str, str]:
-    """Of all readers: one child is enough for them."""
-    return fuzz.fuzz(list(READERS), 300)
+def run(*arguments: object) -> str:
+    """What the command prints."""
+    done = subprocess.run([sys.executable, fuzz.__file__, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}: python tests/fuzz/fuzz.py --replay shows one again"
+    return done.stdout
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_damaged_files_are_refused_in_time_and_in_memory(name: str, failures: dict[str, str]) -> None:
-    for path, problem in failures.items():
-        assert not Path(path).name.startswith(f"{name}-"), f"python tests/fuzz/fuzz.py --replay {path}: {problem}"
+def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
+    assert run("-n", 300) == ""
 
 
 def gif(side: int) -> bytes:
@@ -54,4 +53,4 @@ def test_small_files_that_announce_much_stay_below_the_bound(tmp_path: Path) -> 
     ]
     assert all(len(data) < 1_000_000 for _, _, data in cases)
     saved = [fuzz.save(case, 0, {name: data}, tmp_path / f"{k}") for k, (case, name, data) in enumerate(cases)]
-    assert fuzz.replayed(*saved) == ["as it should be"] * len(cases)
+    assert run("--replay", *saved).splitlines() == ["as it should be"] * len(cases)
