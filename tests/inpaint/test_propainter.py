@@ -209,21 +209,24 @@ def test_a_network_takes_its_own_from_a_published_file(tmp_path: Path) -> None:
 # The package --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("found", ["nothing", "a torchvision of another torch"])
-def test_without_its_packages_propainter_is_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: str) -> None:
+BROKEN = "operator torchvision::nms does not exist"  # what torchvision says beside another torch
+MISSING = {
+    "pytorchcv": "pip install 'spackle-nvs[propainter]'",
+    "torchvision": f"torchvision cannot be imported ({BROKEN}): install the one that was built for torch",
+}
+
+
+@pytest.mark.parametrize("package", MISSING)
+def test_without_its_packages_propainter_is_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
     for name in [name for name in sys.modules if name.startswith(OURS)]:
         monkeypatch.delitem(sys.modules, name)
-    said = "pip install 'spackle-nvs[propainter]'"
-    if found == "nothing":
-        monkeypatch.setitem(sys.modules, "pytorchcv", None)
+    if package == "pytorchcv":
+        monkeypatch.setitem(sys.modules, package, None)
     else:
         pytest.importorskip("pytorchcv")
-        problem = "operator torchvision::nms does not exist"  # what torchvision says
-        (tmp_path / "torchvision").mkdir()
-        (tmp_path / "torchvision" / "__init__.py").write_text(f"raise RuntimeError({problem!r})\n")
-        monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-        said = (
-            f"torchvision cannot be imported ({problem}): install the one that was built for torch {torch.__version__}"
-        )
-    with pytest.raises(InputError, match=re.escape(said)):
+        (tmp_path / "torchvision.py").write_text(f"raise RuntimeError({BROKEN!r})\n")
+        monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=re.escape(MISSING[package])):
         get_inpainter("propainter", InpainterOptions())
