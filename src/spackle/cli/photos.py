@@ -31,7 +31,7 @@ from spackle.image import PHOTO_SUFFIXES
 from spackle.patches import match_patches
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop
-from spackle.render import Renderer, get_renderer, place_of
+from spackle.render import Renderer, device_of, get_renderer
 from spackle.render.blend import blend_tiles
 from spackle.scene_fill import FillContext, OcclusionGuard, fill_scene
 from spackle.scene_fill.occlusion_guard import free_factors
@@ -252,7 +252,7 @@ def compiled_ahead(renderer: Renderer, log: Callable[[str], None]) -> Iterator[N
 
     Numba compiles one kernel at a time in a process, so a thread would not help.
     """
-    if place_of(renderer).type != "cpu" or is_compiled(blend_tiles):
+    if device_of(renderer).type != "cpu" or is_compiled(blend_tiles):
         yield
         return
     log("first use: kernels are compiled for this processor, which takes about half a minute, once")

@@ -13,7 +13,7 @@ from spackle.gaussians import Gaussians
 from spackle.render.cpu import CpuRenderer, touched_tiles
 from spackle.render.protocol import TILE, Renderer, Rendering
 
-__all__ = ["TILE", "CpuRenderer", "Renderer", "get_renderer", "place_of", "render_batch", "touched_tiles"]
+__all__ = ["TILE", "CpuRenderer", "Renderer", "device_of", "get_renderer", "render_batch", "touched_tiles"]
 
 LOG = logging.getLogger("spackle")
 
@@ -53,7 +53,7 @@ def render_batch(
     return [renderer.render(sets, camera, tiles=wanted, onto=under) for sets, camera, wanted, under in views]
 
 
-def place_of(renderer: Renderer) -> torch.device:
+def device_of(renderer: Renderer) -> torch.device:
     """Where a renderer computes: what lies there need not travel."""
     place: torch.device = getattr(renderer, "device", torch.device("cpu"))
     return place

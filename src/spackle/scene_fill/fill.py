@@ -20,7 +20,7 @@ from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.device import Precision
 from spackle.filters import far_fill, greatest_around, greatest_in_windows
 from spackle.gaussians import Gaussians
-from spackle.render import Renderer, place_of, touched_tiles
+from spackle.render import Renderer, device_of, touched_tiles
 from spackle.render.protocol import Rendering
 from spackle.residual.base_values import BEHIND, BLOB_CELLS, Seeds, make_seeds, placed_behind
 from spackle.residual.complete import compose
@@ -61,7 +61,7 @@ class FillContext:
     @functools.cached_property
     def placed(self) -> FillContext:
         """The same with base and network on the renderer's device."""
-        device = place_of(self.renderer)
+        device = device_of(self.renderer)
         if self.base.means.device.type == device.type:
             return self
         network = None if self.network is None else copy.deepcopy(self.network).to(device)
@@ -345,7 +345,7 @@ class _Stage:
     """The base and what was added to it, on the renderer's device, and how the last camera saw them."""
 
     def __init__(self, context: FillContext) -> None:
-        self._renderer, self._device, self._sets = context.renderer, place_of(context.renderer), [context.base]
+        self._renderer, self._device, self._sets = context.renderer, device_of(context.renderer), [context.base]
 
     def look(self, camera: Camera, rendering: Rendering | None = None) -> Rendering:
         """What a camera sees, on the processor; `rendering` where it has been drawn already."""

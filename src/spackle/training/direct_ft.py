@@ -31,7 +31,7 @@ from spackle.formats.png import sheet
 from spackle.gaussians import Gaussians
 from spackle.network_file import read_tensors
 from spackle.progress import Reporter
-from spackle.render import Renderer, place_of
+from spackle.render import Renderer, device_of
 from spackle.training.recipe import DataRecipe, Recipe
 from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask
 from spackle.training.samples import short_digest
@@ -99,7 +99,7 @@ def render_photo(decoder: nn.Module, base: TunableSharp, views: Sequence[Dataset
     photo_camera = views[0].photo_camera
     advice = ["try optim.precision=bf16"] if base.precision == torch.float32 else []
     with enough_memory(*advice):
-        gaussians = base.gaussians(decoder, base.encode(views[0].photo, photo_camera), place_of(renderer))
+        gaussians = base.gaussians(decoder, base.encode(views[0].photo, photo_camera), device_of(renderer))
         drawn = [renderer.render(gaussians, normalised_camera(view.camera, photo_camera)) for view in views]
     return ViewBatch.of(drawn, [v.rendering.rgb for v in views], [v.target for v in views], [v.mask for v in views])
 

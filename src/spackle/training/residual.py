@@ -22,7 +22,7 @@ from spackle.files import write_whole
 from spackle.folders import make_folder
 from spackle.formats.png import sheet
 from spackle.progress import Reporter
-from spackle.render import Renderer, get_renderer, place_of, render_batch
+from spackle.render import Renderer, device_of, get_renderer, render_batch
 from spackle.render.protocol import Rendering
 from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, load_residual, network_input
@@ -133,7 +133,7 @@ def complete_samples(
     The network, a `ResidualNet` by itself or wrapped, alone gets gradients; its convolutions compute in `precision`.
     What needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
     """
-    device = place_of(renderer)
+    device = device_of(renderer)
     cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
     fields: Sequence[Tensor | None] = [None] * len(samples)
