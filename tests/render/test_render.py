@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from spackle.errors import InputError
 from spackle.gaussians import Gaussians
 from spackle.render import TILE, CpuRenderer, get_renderer, touched_tiles
 from spackle.render.blend import decode_srgb, encode_srgb, exp2
+from spackle.render.project import BLOCK, natural_log
 from spackle.render.protocol import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP, Rendering
 from spackle.render.reference import ReferenceRenderer, falloff, front_to_back
 
@@ -117,11 +119,24 @@ def test_eps2d_widens_the_projected_covariance(renderer):
     assert alpha[16, 16:18].tolist() == pytest.approx([0.5, 0.5 * math.exp(-1)], abs=1e-6)
 
 
-@pytest.mark.parametrize("field", range(5))
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_needle_keeps_its_width():
+    """Ten million times as long as thick, across the image: its covariance has no digit to spare."""
+    turned = torch.tensor([[math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]])
+    needle = dataclasses.replace(ball(), quats=turned, scales=0.04 * torch.tensor([[1e7, 1, 1]]))
+    alpha = CPU.render(needle, CAMERA).alpha
+    for dx, dy in [(0, 0), (5, 5), (2, 0), (0, -3), (1, 4)]:
+        expected = 0.5 * math.exp(-((dx - dy) ** 2 / 2) / (2 * 2**2))
+        assert float(alpha[16 + dy, 16 + dx]) == pytest.approx(expected, abs=1e-5)
+
+
+# A rotation may be of any length.
+BAD = [*product(range(5), (math.nan, math.inf, -math.inf)), *product((0, 2, 3, 4), (1e38, -1e38))]
+
+
+@pytest.mark.parametrize(("field", "bad"), BAD)
 def test_bad_values_are_skipped_and_spoil_nothing(field, bad):
     camera = turned_camera(50, 40, 45.0)
-    scene = random_scene(1, 60, camera)
+    scene = random_scene(1, 300, camera)  # more than the projection takes at once
     spoiled = [t.clone() for t in scene.tensors]
     spoiled[field][::2] = bad
     assert same_bits(CPU.render(Gaussians(*spoiled), camera), CPU.render(scene.select(slice(1, None, 2)), camera))
@@ -157,19 +172,40 @@ def scenes(draw: st.DrawFn) -> tuple[Gaussians, Camera, float, float]:
     return random_scene(draw(SEEDS), draw(st.integers(1, 80)), camera, solidity), camera, eps2d, solidity
 
 
-@settings(max_examples=25, deadline=None)
-@given(scenes())
-def test_images_match_the_twin(scene):
-    gaussians, camera, eps2d, _ = scene
+def held_to_the_twin(gaussians: Gaussians, camera: Camera, eps2d: float) -> Rendering:
     fast = CPU.render(gaussians, camera, eps2d=eps2d)
-    parts = [gaussians.select(slice(0, 9)), Gaussians.empty(), gaussians.select(slice(9, None))]
-    assert same_bits(CPU.render(parts, camera, eps2d=eps2d), fast)
     slow = TWIN.render(gaussians.to(dtype=torch.float64), camera, eps2d=eps2d)
     sturdy = sturdy_pixels(gaussians, camera, eps2d)
     assert (~sturdy).sum() <= 2 + 0.02 * sturdy.numel()
     for name in FIELDS:
         found, expected = getattr(fast, name).double(), getattr(slow, name)
         torch.testing.assert_close(found[sturdy], expected[sturdy], rtol=1e-5, atol=1e-5, msg=lambda m, n=name: n + m)
+    return fast
+
+
+@settings(max_examples=25, deadline=None)
+@given(scenes())
+def test_images_match_the_twin(scene):
+    gaussians, camera, eps2d, _ = scene
+    fast = held_to_the_twin(gaussians, camera, eps2d)
+    parts = [gaussians.select(slice(0, 9)), Gaussians.empty(), gaussians.select(slice(9, None))]
+    assert same_bits(CPU.render(parts, camera, eps2d=eps2d), fast)
+
+
+@pytest.mark.parametrize("count", [0, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 50])
+def test_any_number_of_blocks_matches_the_twin(count):
+    camera = turned_camera(50, 40, 45.0)
+    scene = random_scene(count, count, camera, sizes=(1e-2, 4.0))
+    held_to_the_twin(dataclasses.replace(scene, opacities=0.05 * scene.opacities), camera, 0.0)
+
+
+@pytest.mark.parametrize("stretch", [(1e3, 1, 1), (1, 1e3, 1), (1, 1, 1e-9), (1e3, 1e3, 1e-6)])
+def test_needles_and_discs_seen_edge_on_match_the_twin(stretch):
+    """Their covariances have no digit to spare."""
+    camera = turned_camera(50, 40, 45.0)
+    scene = random_scene(5, 60, camera)
+    thin = dataclasses.replace(scene, scales=scene.scales * torch.tensor(stretch), opacities=0.2 * scene.opacities)
+    assert held_to_the_twin(thin, camera, 0.0).alpha.count_nonzero() > 100
 
 
 @settings(max_examples=15, deadline=None)
@@ -221,6 +257,10 @@ def test_approximations_hold_over_their_whole_range():
     powers = np.linspace(-30, 2, 4001, dtype=np.float32)
     found = np.array([exp2(x) for x in powers])
     np.testing.assert_allclose(found, np.exp2(powers.astype(np.float64)), rtol=5e-7)
+    near_one = 1 + np.random.default_rng(0).normal(size=200) * 1e-6
+    numbers = np.float32([*np.geomspace(1e-37, 1e30, 3001), *np.linspace(0.65, 1.5, 3001), 1, ALPHA_MIN, *near_one])
+    found = np.array([natural_log(x) for x in numbers])
+    np.testing.assert_allclose(found, np.log(numbers.astype(np.float64)), rtol=4e-16, atol=0)
     values = torch.cat([torch.linspace(-0.1, 1.1, 4001), torch.tensor([0.0, 0.0031308, 0.0031309, 1.0])])
     encoded = torch.tensor([encode_srgb(x) for x in values.numpy()])
     torch.testing.assert_close(encoded, linear_to_srgb(values), atol=1e-6, rtol=0)
