@@ -57,13 +57,11 @@ def grad(tensor: Tensor) -> Tensor:
 
 def test_color_is_the_mean_difference_in_each_images_hole() -> None:
     hole = torch.tensor([[[True, False]], [[True, True]], [[False, False]]])
-    each = [0.4 / 3, (0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6, 0]
-    rgb, target = RGB.expand(3, -1, -1, -1), TARGET.expand(3, -1, -1, -1)
-    assert [color_loss(RGB, TARGET, part[None]).item() for part in hole] == pytest.approx(each)
-    assert color_loss(rgb, target, hole).item() == pytest.approx(sum(each) / 3)
+    expected = (0.4 / 3 + (0.1 + 0.0 + 0.3 + 0.5 + 0.5 + 0.4) / 6 + 0) / 3
+    assert color_loss(RGB.expand(3, -1, -1, -1), TARGET.expand(3, -1, -1, -1), hole).item() == pytest.approx(expected)
 
 
-def test_a_blurred_color_loss_sees_low_frequencies_alone() -> None:
+def test_a_blurred_color_loss_averages_within_the_hole() -> None:
     rgb, target = pictures(2, 7, 9)
     hole, sigma = torch.rand(2, 7, 9, generator=torch.Generator().manual_seed(4)) < 0.5, 1.2
     each = []
@@ -73,12 +71,6 @@ def test_a_blurred_color_loss_sees_low_frequencies_alone() -> None:
         weights = torch.exp(-far.square().sum(-1) / (2 * sigma**2)) * (far.abs().amax(-1) <= math.ceil(3 * sigma))
         each.append(float((weights @ apart / weights.sum(1, keepdim=True)).abs().mean()))
     assert color_loss(rgb, target, hole, sigma).item() == pytest.approx(sum(each) / 2, rel=1e-5)
-    stripes = torch.tensor([-0.5, 0.5]).repeat(8)[None, None, :, None].expand(1, 8, 16, 3)
-    middle = torch.zeros(1, 8, 16, dtype=torch.bool)
-    middle[..., 2:14] = True
-    assert color_loss(stripes, 0 * stripes, middle).item() == pytest.approx(0.5)
-    assert color_loss(stripes, 0 * stripes, middle, 2.0).item() < 0.05
-    assert color_loss(stripes + 0.5, stripes, middle, 2.0).item() == pytest.approx(0.5)
 
 
 def test_alpha_is_clamped_cross_entropy_towards_one() -> None:
@@ -101,11 +93,8 @@ def test_preserve_is_the_mean_difference_outside_of_the_hole() -> None:
     assert preserve_loss(RGB, TARGET, ~NO_HOLE).item() == 0
 
 
-def perceptual_example() -> tuple[Tensor, Tensor]:
-    """Mean square of the target 3/6; left pixels (0, 0.5, 0) and (1, 0, 0)."""
-    return torch.tensor([[[[0.0, 0.5, 0], [9, 9, 9]]]]), torch.tensor([[[[1.0, 0, 0], [0, 1, 1]]]])
-
-
+# Mean square of the target 3/6; left pixels (0, 0.5, 0) and (1, 0, 0).
+FOUND, WANTED = torch.tensor([[[[0.0, 0.5, 0], [9, 9, 9]]]]), torch.tensor([[[[1.0, 0, 0], [0, 1, 1]]]])
 FEATURE_TERM = (1 + 0.5 + 0) / math.sqrt(0.5) / 3
 GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1) of the prediction, of nine
 
@@ -113,11 +102,8 @@ GRAM_TERM = (1 / 0.5 + 0.25 / 0.5) / 9  # entries (0, 0) of the target and (1, 1
 @pytest.mark.parametrize("gram", [1.0, 0.25, 0.0])
 @pytest.mark.parametrize("factors", [(1,), (1, 100, 0.01)])
 def test_perceptual_sums_feature_and_gram_terms_of_layers(factors: tuple[float, ...], gram: float) -> None:
-    rgb, target = perceptual_example()
     expected = len(factors) * (FEATURE_TERM + gram * GRAM_TERM)
-    loss = perceptual_loss(Pixels(*factors), rgb, target, LEFT, dilation=1, size=None, gram=gram)
-    assert loss.item() == pytest.approx(expected, rel=1e-5)
-    both = (tensor.repeat(2, 1, 1, 1) for tensor in (rgb, target))
+    both = (tensor.repeat(2, 1, 1, 1) for tensor in (FOUND, WANTED))
     loss = perceptual_loss(Pixels(*factors), *both, torch.cat([LEFT, NO_HOLE]), dilation=1, size=None, gram=gram)
     assert loss.item() == pytest.approx(expected / 2, rel=1e-5)
 
@@ -169,16 +155,15 @@ def test_without_a_hole_there_is_nothing_to_fill() -> None:
 
 @pytest.mark.parametrize("weights", [PAPER_WEIGHTS, {"color": 1, "alpha": 2, "perceptual": 3, "preserve": 4}])
 def test_the_total_is_the_weighted_sum_of_its_terms(weights: dict[str, float]) -> None:
-    rgb, target = perceptual_example()
-    alpha, base = torch.tensor([[[0.5, 0.0]]]), torch.full_like(rgb, 8.75)
-    loss, terms = total_loss(rgb, alpha, target, base, LEFT, features=Pixels(1), weights=weights, dilation=1, size=None)
+    images = FOUND, torch.tensor([[[0.5, 0.0]]]), WANTED, torch.full_like(FOUND, 8.75), LEFT
+    loss, terms = total_loss(*images, features=Pixels(1), weights=weights, dilation=1, size=None)
     values = {"color": 0.5, "alpha": 0.693147, "perceptual": FEATURE_TERM + GRAM_TERM, "preserve": 0.25}
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(values, rel=1e-5)
     assert loss.item() == pytest.approx(sum(weights[name] * value for name, value in values.items()), rel=1e-5)
-    assert set(total_loss(rgb, alpha, target, base, LEFT)[1]) == {"color", "alpha", "preserve"}
+    assert set(total_loss(*images)[1]) == {"color", "alpha", "preserve"}
 
 
-def test_distance_is_between_directions_of_feature_vectors() -> None:
+def test_distance_is_between_directions_and_psnr_of_the_hole() -> None:
     target = torch.tensor([[[1.0, 0, 0], [0, 0, 1]]])
 
     def distance(*pixel: float) -> float:
@@ -188,6 +173,8 @@ def test_distance_is_between_directions_of_feature_vectors() -> None:
     assert distance(1, 1, 0) == pytest.approx(2 * (2 - math.sqrt(2)))
     assert distance(0.5, 0, 0) == 0  # the same direction
     assert distance(0, 0, 0) == pytest.approx(2 * 1)  # no direction at all
+    assert hole_psnr(RGB[0], TARGET[0], LEFT[0]) == pytest.approx(-10 * math.log10((0.01 + 0.09) / 3))
+    assert hole_psnr(RGB[0], RGB[0], LEFT[0]) == math.inf
 
 
 def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
@@ -204,17 +191,7 @@ def test_distance_weighs_cells_by_their_share_of_the_hole() -> None:
     assert hole_distance(Halved(), rgb, target, hole) == pytest.approx(0.75 * (2 - math.sqrt(2)))
 
 
-def test_psnr_is_of_the_hole_alone() -> None:
-    assert hole_psnr(RGB[0], TARGET[0], LEFT[0]) == pytest.approx(-10 * math.log10((0.01 + 0.09) / 3))
-    assert hole_psnr(RGB[0], RGB[0], LEFT[0]) == math.inf
-
-
 # Feature networks ---------------------------------------------------------------------------------
-
-WITHOUT_HEAD = 25_557_032 - 2048 * 1000 - 1000  # parameters of torchvision's ResNet-50 less its classifier
-# Inputs, squeezed and expanded channels of fire2 to fire9, as the paper of SqueezeNet has them in its table 1.
-FIRES = [(96, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128), (256, 48, 192), (384, 48, 192), (384, 64, 256)]
-FIRES += [(512, 64, 256)]
 
 
 @pytest.fixture(scope="module")
@@ -230,9 +207,12 @@ def resnet() -> dict[str, Tensor]:
 
 @pytest.fixture
 def squeezed() -> dict[str, np.ndarray]:
+    """Random weights by Caffe's names."""
     rng = np.random.default_rng(0)
     shapes = {"conv1": (96, 3, 7, 7), "conv10": (1000, 512, 1, 1)}
-    for number, (inside, squeeze, expand) in enumerate(FIRES, 2):
+    # Inputs, squeezed and expanded channels of fire2 to fire9, as the paper of SqueezeNet has them in its table 1.
+    fires = [(96, 16, 64), (128, 16, 64), (128, 32, 128), (256, 32, 128), (256, 48, 192), (384, 48, 192)]
+    for number, (inside, squeeze, expand) in enumerate([*fires, (384, 64, 256), (512, 64, 256)], 2):
         shapes[f"fire{number}/conv1x1_1"] = (squeeze, inside, 1, 1)
         shapes |= {f"fire{number}/conv{k}x{k}_2": (expand, squeeze, k, k) for k in (1, 3)}
     arrays = {}
@@ -243,14 +223,6 @@ def squeezed() -> dict[str, np.ndarray]:
     return arrays
 
 
-@pytest.fixture
-def squeezenet(squeezed: dict[str, np.ndarray], tmp_path: Path) -> SqueezeNet:
-    np.savez(tmp_path / "squeeze.npz", **squeezed)
-    network = load_features("squeezenet", tmp_path / "squeeze.npz")
-    assert isinstance(network, SqueezeNet)
-    return network
-
-
 @pytest.mark.parametrize("older", [False, True])
 def test_resnet_has_torchvisions_names_shapes_and_input(resnet: dict[str, Tensor], tmp_path: Path, older: bool) -> None:
     """Older files have no counters."""
@@ -259,8 +231,9 @@ def test_resnet_has_torchvisions_names_shapes_and_input(resnet: dict[str, Tensor
     network = load_features("resnet50", path)
     assert isinstance(network, ResNet50)
     assert all(torch.equal(value, resnet[name]) for name, value in network.state_dict().items())
-    assert sum(parameter.numel() for parameter in network.parameters()) == WITHOUT_HEAD
-    assert len(network.state_dict()) == 320 - 2  # torchvision's, less its classifier
+    # Torchvision's, less its classifier.
+    assert sum(parameter.numel() for parameter in network.parameters()) == 25_557_032 - 2048 * 1000 - 1000
+    assert len(network.state_dict()) == 320 - 2
     assert resnet["layer1.0.downsample.0.weight"].shape == (256, 64, 1, 1)
     assert resnet["layer3.5.bn3.running_var"].shape == (1024,)
     seen: list[Tensor] = []
@@ -272,7 +245,10 @@ def test_resnet_has_torchvisions_names_shapes_and_input(resnet: dict[str, Tensor
     assert all(m.min() >= 0 for m in maps)
 
 
-def test_squeezenet_has_caffes_sizes_and_input(squeezenet: SqueezeNet, squeezed: dict[str, np.ndarray]) -> None:
+def test_squeezenet_has_caffes_sizes_and_input(squeezed: dict[str, np.ndarray], tmp_path: Path) -> None:
+    np.savez(tmp_path / "squeeze.npz", **squeezed)
+    squeezenet = load_features("squeezenet", tmp_path / "squeeze.npz")
+    assert isinstance(squeezenet, SqueezeNet)
     shapes = [tuple(m.shape[1:]) for m in squeezenet(torch.rand(1, 3, 227, 227))]
     assert shapes == [(96, 111, 111), (256, 55, 55), (512, 27, 27), (512, 13, 13)]  # table 1, 227 for its 224
     images = torch.rand(2, 3, 35, 35, requires_grad=True)
@@ -304,13 +280,10 @@ def test_what_is_not_a_networks_weights_is_refused(
     refused("resnet50", path, "nothing in it was run")
     torch.save({name: value for name, value in resnet.items() if name != "bn1.bias"}, path)
     refused("resnet50", path, "1 missing (bn1.bias)")
-    torch.save([1, 2], path)
-    refused("resnet50", path, "it holds no named tensors")
     first = squeezed["conv1.w"]
     for change, said in (
         ({"conv1.w": first[:, :, :3, :3]}, "1 of another shape (conv1.weight"),
         ({"conv1.w": np.full_like(first, np.nan)}, "numbers that are not finite (conv1.weight)"),
-        ({"fire10/conv1x1_1.w": first}, "1 unknown (fire10.conv1x1_1.weight)"),
         ({"conv1.w": np.array([{}])}, "not a file of weights"),  # an object: would have to be unpickled
     ):
         np.savez(tmp_path / "other.npz", **(squeezed | change))

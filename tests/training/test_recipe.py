@@ -18,12 +18,6 @@ pytest.importorskip("yaml")
 PLAIN = "loss: {features: none}"
 
 
-def written(folder: Path, text: str = PLAIN) -> Path:
-    path = folder / "recipe.yaml"
-    path.write_text(text)
-    return path
-
-
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
 def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
     recipe = load_recipe(Recipe, name, ["loss.features_path=weights"])
@@ -32,9 +26,8 @@ def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
     assert recipe.data.photos is not None or recipe.data.pseudo is not None
     assert recipe.loss.dilation == 21
     if name == "paper":
-        optim, run = recipe.optim, recipe.run
-        assert (optim.lr, optim.min_lr, optim.warmup) == (1.6e-4, 1.6e-5, 10_000)
-        assert (run.patience, run.min_delta) == (10, 1e-4)
+        assert (recipe.optim.lr, recipe.optim.min_lr, recipe.optim.warmup) == (1.6e-4, 1.6e-5, 10_000)
+        assert (recipe.run.patience, recipe.run.min_delta) == (10, 1e-4)
         assert (recipe.loss.features, recipe.loss.feature_size, recipe.data.views) == ("resnet50", 512, 20_000)
 
 
@@ -59,15 +52,13 @@ def test_a_command_overrides_the_recipes_file(tmp_path: Path) -> None:
         init: weights.safetensors
     """
     overrides = ["optim.steps=1e3", "data.rgbd.0.focal_px=600", "optim.lr=2e-4", "init=null", "run.log_every=7"]
-    recipe = load_recipe(Recipe, written(tmp_path, text), overrides)
+    (tmp_path / "recipe.yaml").write_text(text)
+    recipe = load_recipe(Recipe, tmp_path / "recipe.yaml", overrides)
     assert recipe.data.photos == Path("some/photos")
     assert recipe.data.rgbd == (RgbdFolder(folder=Path("kitchen"), focal_px=600.0, unit_m=0.001),)
-    assert recipe.data.disparity == (0.0, 0.1)
-    assert recipe.loss.feature_size is None
-    assert (recipe.optim.steps, recipe.optim.lr, recipe.optim.batch) == (1000, 2e-4, OptimRecipe().batch)
+    assert (recipe.data.disparity, recipe.loss.feature_size, recipe.init) == ((0.0, 0.1), None, None)
+    assert (recipe.optim.steps, recipe.optim.lr, recipe.run.log_every) == (1000, 2e-4, 7)
     assert isinstance(recipe.optim.steps, int)
-    assert recipe.init is None
-    assert recipe.run.log_every == 7
 
 
 @pytest.mark.parametrize(
@@ -76,17 +67,12 @@ def test_a_command_overrides_the_recipes_file(tmp_path: Path) -> None:
         ("optim: {stepps: 3}", "", "recipe.yaml: optim.stepps: there is no such key; there are lr, min_lr"),
         ("optim: {steps: many}", "", "recipe.yaml: optim.steps: input should be a valid integer"),
         ("optim: {lr: .nan}", "", "optim.lr: input should be a finite number, not nan"),
-        ("data: {disparity: [0.1]}", "", "data.disparity.1: field required"),
-        ("data: {rgbd: [{folder: a}]}", "", "data.rgbd.0.focal_px: field required"),
         ("data: {rgbd: [{folder: a, focal_px: 1, focal: 1}]}", "", "data.rgbd.0.focal: there is no such key; there"),
-        ("data: {rgbd: kitchen}", "", "data.rgbd: input should be a valid tuple, not 'kitchen'"),
         ("[1, 2]", "", "recipe.yaml: input should be a valid dictionary or instance of Recipe, not [1, 2]"),
-        ("a: [", "", "recipe.yaml: not YAML"),
         ("optim: {steps: " + "[" * 60_000, "", "recipe.yaml: not YAML"),
         (f"{'x' * 1000}: 1", "", f"recipe.yaml: {'x' * 60}: there is no such key"),
         ("#" * 100_000, "", "too long for a recipe"),
         (PLAIN, "quick", "'quick': neither an option nor key=value"),
-        (PLAIN, "optim.steps=1.5", "optim.steps: input should be a valid integer"),
         ("data: {rgbd: []}", "data.rgbd.0.folder=a", "data.rgbd.0.folder=a: no place for it"),
         ("{data: {disparity: [0.5, 0.1]}, loss: {features: none}}", "", "data.disparity: runs from 0.5 down to 0.1"),
         (PLAIN, "optim.min_lr=0.5", "optim: min_lr 0.5 is above lr"),
@@ -99,8 +85,9 @@ def test_what_cannot_be_is_named_with_its_file_or_option(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, override: str, named: str
 ) -> None:
     monkeypatch.setenv("SPACKLE_WEIGHTS", str(tmp_path))
+    (tmp_path / "recipe.yaml").write_text(text)
     with pytest.raises(InputError) as error:
-        load_recipe(Recipe, written(tmp_path, text), [override] if override else [])
+        load_recipe(Recipe, tmp_path / "recipe.yaml", [override] if override else [])
     assert named in str(error.value)
     assert str(tmp_path / "recipe.yaml") in str(error.value) or (override and override in str(error.value))
     assert "\n" not in str(error.value)
@@ -109,7 +96,8 @@ def test_what_cannot_be_is_named_with_its_file_or_option(
 
 
 def test_runs_differ_by_what_is_learned_not_by_length(tmp_path: Path) -> None:
-    path = written(tmp_path)
+    path = tmp_path / "recipe.yaml"
+    path.write_text(PLAIN)
     one = load_recipe(Recipe, path).model_dump(mode="json")
     same = ["optim.steps=9", "run.validate_every=2", "run.save_every=2", "data.cache=elsewhere", "data.photos=moved"]
     assert differences(one, load_recipe(Recipe, path, same)) == []

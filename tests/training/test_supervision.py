@@ -35,19 +35,15 @@ CPU = CpuRenderer()
 RIM_PX = 2  # blobs are no pixels: what stands in front hides so much more or less than a line says
 
 
-# Geometry, once more ------------------------------------------------------------------------------
-
-
 def grow(mask: Tensor, pixels: int = 1) -> Tensor:
     side = 2 * pixels + 1
     return max_pool2d(mask.float()[None, None], side, stride=1, padding=pixels)[0, 0] > 0
 
 
 def outline(scene: Scene) -> Tensor:
-    """[H, W] bool: the pixels within the rim of the photo's depth edges, where blobs of both sides mix."""
-    depth = scene.depth[None, None]
-    far, near = (max_pool2d(sign * depth, 3, stride=1, padding=1)[0, 0] for sign in (1, -1))
-    return grow(far + near > 0.5, RIM_PX - 2)
+    """[H, W] bool: the pixels at the photo's depth edges, where blobs of both sides mix."""
+    far, near = (max_pool2d(sign * scene.depth[None], 3, stride=1, padding=1)[0] for sign in (1, -1))
+    return far + near > 0.5
 
 
 def looking(camera: Camera, *eye: float) -> Camera:
@@ -95,7 +91,7 @@ def hidden(scene: Scene, viewer: Camera) -> Tensor:
 
 
 def reverse(scene: Scene, viewer: Camera) -> Sample:
-    return sources.reverse_view(scene.lift(levels=0), scene.rgb, viewer, CPU)
+    return sources.reverse_view(scene.lift(), scene.rgb, viewer, CPU)
 
 
 @pytest.mark.parametrize("eye", [(0.35, 0.0, 0.0), (-0.35, 0.0, 0.0), (0.25, -0.2, 0.15), (-0.2, 0.2, -0.3)])
@@ -107,21 +103,19 @@ def test_holes_are_what_a_line_to_the_eye_says(seed: int | None, eye: tuple[floa
     hole = reverse(scene, viewer).hole
     expected = behind | beside
     assert int(behind.sum()) > 100
-    assert not (hole & ~grow(expected, RIM_PX) & ~outline(scene)).any()  # what the virtual camera sees is no hole
-    assert not (~hole & ~grow(~expected, RIM_PX)).any()  # what it does not see is one, but for a rim of what hides it
+    assert not (hole & ~grow(expected, RIM_PX) & ~outline(scene)).any()
+    assert not (~hole & ~grow(~expected, RIM_PX)).any()
     assert not (~hole & outside(scene, viewer, margin=1)).any()
 
 
 def test_the_photos_camera_sees_no_hole_one_turned_away_no_base() -> None:
-    scene, box = wall(), box_before_wall()
-    views = [reverse(scene, scene.camera), reverse(scene, away(scene.camera))]
-    assert not views[0].hole.any()
-    assert views[1].hole.all()
-    assert torch.equal(views[0].target, scene.rgb)
-    assert not any(crops_of(view, np.random.default_rng(0), 3, 16) for view in views)
+    scene, box, small = wall(), box_before_wall(), box_before_wall(width=31, height=64)
+    closed, empty = reverse(scene, scene.camera), reverse(scene, away(scene.camera))
+    assert not closed.hole.any()
+    assert empty.hole.all()
     assert not (reverse(box, box.camera).hole & ~outline(box)).any()
-    scene = box_before_wall(width=31, height=64)  # too small for a crop
-    assert not crops_of(reverse(scene, shifted(scene.camera, 0.35)), np.random.default_rng(0), 3, 16)
+    for view in (closed, empty, reverse(small, shifted(small.camera, 0.35))):
+        assert not crops_of(view, np.random.default_rng(0), 3, 16)
 
 
 @pytest.mark.parametrize(("near", "far", "axis"), [(3.0, 3.001, 1), (2.0, 6.0, 1), (1.5, 5.0, 0)])
@@ -140,29 +134,24 @@ def test_a_plane_seen_from_the_side_stays_closed(
 
 # Crops --------------------------------------------------------------------------------------------
 
-CROP = 24  # cells
-VIEW = (144, 112)  # width, height
-
 
 @pytest.fixture(scope="module", params=["box from aside", "ground in reverse"])
 def whole(request: pytest.FixtureRequest) -> Sample:
-    width, height = VIEW
     if request.param == "box from aside":
-        scene = box_before_wall(width=width, height=height, focal=120)
+        scene = box_before_wall(width=144, height=112, focal=120)
         view, base = shifted(scene.camera, 0.4), scene.base()
         return Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb)
-    ground = slanted_plane(1.5, 4.5, 0, width, height, 120)
-    stone = torch.zeros(height, width, dtype=torch.bool)
-    stone[40:80, 50:90] = True
-    scene = dataclasses.replace(ground, depth=torch.where(stone, 1.2, ground.depth))
+    scene = slanted_plane(1.5, 4.5, 0, 144, 112, 120)
+    scene.depth[40:80, 50:90] = 1.2  # a stone
     return reverse(scene, looking(scene.camera, -0.4, 0.1, 0.1))
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (32, 48), (13, 27), (7, 20)])  # corners, and off the tiles' grid
 def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: int, column: int) -> None:
-    crop = whole.crop(row, column, CROP, CROP)
-    part = slice(CELL * row, CELL * (row + CROP)), slice(CELL * column, CELL * (column + CROP))
-    cells = slice(row, row + CROP), slice(column, column + CROP)
+    side = 24  # cells
+    crop = whole.crop(row, column, side, side)
+    part = slice(CELL * row, CELL * (row + side)), slice(CELL * column, CELL * (column + side))
+    cells = slice(row, row + side), slice(column, column + side)
     for name in ("cues", "rim"):
         for mine, yours in zip(tensors_of(getattr(crop, name)), tensors_of(getattr(whole, name)), strict=True):
             assert torch.equal(mine, yours[cells])
@@ -171,7 +160,7 @@ def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: in
     assert torch.equal(crop.seeds.uv, cell_centers(crop.camera))
     # It needs fewer Gaussians for the same picture, and completed, it is the crop of the completed view.
     assert len(crop.base) < 0.7 * len(whole.base)
-    inside = tile_mask(crop.tiles, CELL * CROP, CELL * CROP)
+    inside = tile_mask(crop.tiles, CELL * side, CELL * side)
     drawn = CPU.render(crop.base, crop.camera, tiles=crop.tiles)
     for name, tolerance in (("rgb", 1e-5), ("depth", 1e-4), ("alpha", 1e-5)):
         assert (getattr(drawn, name) - getattr(whole.rendering, name)[part]).abs()[inside].max() < tolerance
@@ -222,22 +211,19 @@ def test_enough_cells_and_masked_ones_first(size: tuple[int, int], share: float)
 
 # Composites ---------------------------------------------------------------------------------------
 
-PALETTE = torch.tensor(
-    [[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9, 0.9, 0.1], [0.1, 0.9, 0.9], [0.8, 0.2, 0.9]]
-)
-
-
-def plain_composite(seed: int, objects: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Tensor, Tensor]:
-    """A composite of so many cut-outs; with one more, those before it stay the same."""
-    monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
-    colors = itertools.cycle(PALETTE)  # photos of one colour each, every one another
-    return sources.composite(np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160)
+PALETTE = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9, 0.9, 0.1], [0.1, 0.9, 0.9]])
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_cut_out_stands_before_what_it_covers(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = [plain_composite(seed, count, monkeypatch) for count in range(5)]
-    assert all(map(torch.equal, steps[-1], plain_composite(seed, 4, monkeypatch)))
+    def composite(objects: int) -> tuple[Tensor, Tensor]:
+        """Of photos of one colour each; with one more, those before it stay the same."""
+        monkeypatch.setattr(sources, "OBJECTS", (objects, objects))
+        colors = iter(PALETTE)
+        return sources.composite(np.random.default_rng(seed), lambda rng: next(colors).expand(150, 200, 3), 120, 160)
+
+    steps = [composite(count) for count in range(5)]
+    assert all(map(torch.equal, steps[-1], composite(4)))
     for count, ((rgb, inverse), (next_rgb, next_inverse)) in enumerate(itertools.pairwise(steps)):
         assert 0 <= next_rgb.min() <= next_rgb.max() <= 1
         assert 0.5 / 8.0 * 0.99 < next_inverse.min() < next_inverse.max() < 1.2 / 0.7
@@ -322,8 +308,7 @@ def test_a_killed_fill_goes_on_to_the_same_files(tmp_path: Path) -> None:
 
 
 def pixels(photo: Path) -> Tensor:
-    with Image.open(photo) as image:
-        return torch.from_numpy(np.array(image)).float() / 255
+    return torch.from_numpy(np.array(Image.open(photo))).float() / 255
 
 
 @pytest.mark.parametrize("unit_m", [0.001, 0.0002])
@@ -362,8 +347,7 @@ def write_stereo(folder: Path, width: int = 96, height: int = 72, **changes: Any
     for side, name in enumerate(("left", "right")):
         wall, box = (side * (d - int(DOFFS)) for d in (WALL_PX, BOX_PX))
         image = texture(height, width + 16, (0.2, 0.4, 0.7))[:, wall : wall + width].clone()
-        place = slice(24, 48), slice(40 - box, 64 - box)
-        image[place] = texture(height, width + 16, (0.8, 0.3, 0.2))[:, box : box + width][place]
+        image[24:48, 40 - box : 64 - box] = texture(height, width + 16, (0.8, 0.3, 0.2))[24:48, 40:64]
         Image.fromarray((255 * image).round().byte().numpy()).save(folder / f"{name}.png")
     disparity = np.full((height, width), WALL_PX - DOFFS, np.float32)
     disparity[24:48, 40:64] = BOX_PX - DOFFS
@@ -398,10 +382,6 @@ def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) ->
     sample = sources.random_reverse_view(np.random.default_rng(0), left, (0.3, 0.6), CPU)
     assert torch.equal(sample.target, pixels(folder / "left.png"))
     assert torch.equal(sample.camera.world_to_camera, torch.eye(4))
-    covered = ~grow(sample.hole)
-    covered[21:51, 37:67] = False  # the box's outline is where a base is not sharp
-    assert psnr(sample.rendering.rgb[covered], sample.target[covered]) > 30
-    assert sample.hole.any()
 
 
 @pytest.mark.parametrize(
@@ -411,15 +391,10 @@ def test_a_pair_gives_the_right_photo_and_in_reverse_the_left(tmp_path: Path) ->
         ({"focal_px": 10**400}, "scene.json"),
         ({"right": "small.png"}, "the two photos differ in size"),
         ({"disparity": "narrow.npy"}, "narrow.npy is 20×72 but photo"),
-        (b'{"left": ', "no stereo pair"),
-        (b"[" * 100_000, "no stereo pair"),
-        (b"\xff\xfe\x00", "no stereo pair"),
     ],
 )
-def test_a_pair_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any] | bytes, said: str) -> None:
-    folder = write_stereo(tmp_path, **(changes if isinstance(changes, dict) else {}))
-    if isinstance(changes, bytes):
-        (folder / "scene.json").write_bytes(changes)
+def test_a_pair_that_cannot_be_used_is_named(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    folder = write_stereo(tmp_path, **changes)
     write_photo(folder / "small.png", 32, 24)
     np.save(folder / "narrow.npy", np.full((72, 20), 4, np.float32))
     with pytest.raises(InputError, match=said) as caught:
