@@ -71,11 +71,9 @@ class Photo:
     @property
     def camera(self) -> Camera:
         """The photo's own camera, at the world's origin; a frame that was cut off has moved the principal point."""
+        left, top, right, bottom = self.frame.widths if self.frame else (0, 0, 0, 0)
         camera = Camera.from_focal(self.focal_px, self.width, self.height)
-        if self.frame is not None:
-            left, top, right, bottom = self.frame.widths
-            camera.K[:2, 2] += camera.K.new_tensor([right - left, bottom - top]) / 2
-        return camera
+        return camera.cropped((left - right) / 2, (top - bottom) / 2, self.width, self.height)
 
 
 def load_photo(

@@ -84,6 +84,11 @@ class Options:
     path: PathOptions = dataclasses.field(default_factory=PathOptions)
     fill: FillOptions = dataclasses.field(default_factory=FillOptions)
 
+    @property
+    def give_geometry(self) -> bool:
+        """Whether a depth map or cameras are given: they are of the whole photo, so nothing of it may be cut off."""
+        return self.base.depth is not None or self.path.cameras is not None
+
 
 @dataclasses.dataclass(frozen=True)
 class CompletedPhoto:
@@ -264,16 +269,15 @@ def predict(
         raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
     if isinstance(base, str):
         raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
+    source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
+    options = Options(BaseSettings(depth=source), PathOptions(kind, disparity), FillOptions(fill=fill))
     if isinstance(photo, Photo):
         if (focal_px, focal_mm, fov) != (None, None, None):
             raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
         loaded = photo
     else:
-        loaded = load_photo(
-            photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame or depth is not None
-        )
-    source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
-    options = Options(BaseSettings(depth=source), PathOptions(kind, disparity), FillOptions(fill=fill))
+        keep_frame = keep_frame or options.give_geometry
+        loaded = load_photo(photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame)
     opened = open_base(options.base) if base is None else open_loaded(base)
     chosen = shipped_network() if network == "shipped" else network
     pipeline = Pipeline(options, opened, chosen, renderer or get_renderer())

@@ -124,7 +124,6 @@ def predict(
     settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    keep_frame = keep_frame or depth is not None or path.cameras is not None  # geometry is of the whole photo
     options = PredictOptions(scene, lens, render, keep_frame, overwrite, workers, threads, ray)
     if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
@@ -209,7 +208,7 @@ def view(
 
     reporter = Reporter(verbose, as_json=as_json)
     settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
-    uploads = Uploads(settings, disparity, keep_frame or depth is not None, reporter)
+    uploads = Uploads(settings, disparity, keep_frame, reporter)
     if view_page(target, uploads, {"focal_px": focal_px, "fov": fov}, host, port, token, browser):
         raise typer.Exit(INTERRUPTED)
     # A step of a network cannot be interrupted, and Python would wait for it, or fall over it, on its way out.

@@ -67,7 +67,7 @@ def predict_photo(
     """
     reporter = reporter.restarted()
     with reporter.stage("load"):
-        photo = load_photo(path, keep_frame=options.keep_frame, **options.lens)
+        photo = load_photo(path, keep_frame=options.keep_frame or pipeline.options.give_geometry, **options.lens)
     video_file = f"video{options.scene.path.video.suffix}"
     with contextlib.ExitStack() as folders:
         files = ["base.ply", "scene.ply", REPORT, *([video_file] if options.render else [])]

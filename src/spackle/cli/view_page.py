@@ -61,7 +61,7 @@ def view_page(
     else:
         pipeline = uploads.open(base)
         with reporter.stage("load"):
-            photo = load_photo(target, keep_frame=uploads.keep_frame, **lens)
+            photo = load_photo(target, keep_frame=uploads.keep_frame or pipeline.options.give_geometry, **lens)
             if base.depth is not None:
                 pipeline.base.load(photo)  # what is wrong with a depth map is known before a page opens
 
@@ -166,7 +166,7 @@ class Uploads:
             chosen.check()
             pipeline = dataclasses.replace(pipeline, options=dataclasses.replace(pipeline.options, path=chosen))
         with teller.stage("load"):
-            photo = load_photo(path, keep_frame=self.keep_frame)
+            photo = load_photo(path, keep_frame=self.keep_frame or pipeline.options.give_geometry)
         return complete_for_page(photo, name, pipeline, teller)
 
 

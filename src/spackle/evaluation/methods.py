@@ -83,10 +83,17 @@ def make_method(
 def _paper(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
     """Aux Gaussians for each view, as eqs. 2 to 9 say."""
     placed = context.placed
-    given = (placed.photo_camera, placed.renderer, placed.network)
     for camera, rendering in zip(cameras, before, strict=True):
         aux = complete_view(
-            placed.base, camera, *given, threshold=placed.threshold, least=LEAST_AUX, precision=placed.precision
+            placed.base,
+            camera,
+            placed.photo_camera,
+            placed.renderer,
+            placed.network,
+            threshold=placed.threshold,
+            least=LEAST_AUX,
+            rendering=rendering,
+            precision=placed.precision,
         )
         yield _drawn(placed, aux, camera, rendering)
 

@@ -17,6 +17,7 @@ from spackle.color import srgb_to_linear
 from spackle.device import Precision
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer
+from spackle.render.protocol import Rendering
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.network import DELTAS, ResidualNet, color_logit, find_rim, predict_deltas
 from spackle.residual.view_features import CELL, MASK_THRESHOLD, ViewFeatures, hole_mask
@@ -41,6 +42,7 @@ def complete_view(
     *,
     threshold: float = MASK_THRESHOLD,
     least: int = 0,
+    rendering: Rendering | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
     """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell, on top of the base, which is only read.
@@ -57,9 +59,10 @@ def complete_view(
         threshold: τ_α.
         least: so many Gaussians come in any case, where few cells are masked those of the least opaque cells; 64 in
             the paper (training details), 0 where a view without holes shall stay as it is.
+        rendering: ℛ(𝒢_base, v), where that is at hand.
         precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
     """
-    view = renderer.render(base, camera)  # eqs. 2 and 3
+    view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3
     features = ViewFeatures.of(view, threshold)
     mask = hole_mask(view.alpha, threshold)[::CELL, ::CELL].cpu()  # eq. 4
     if int(mask.count_nonzero()) < least:
