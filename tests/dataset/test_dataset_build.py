@@ -30,8 +30,8 @@ from spackle.errors import InputError
 from spackle.folders import hold
 from spackle.render import get_renderer
 from spackle.training.recipe import DataRecipe
-from spackle.training.samples import digest_of_samples
-from spackle.training.sources import find_sources, open_pseudo, pseudo_view, views_with_holes
+from spackle.training.samples import Source, digest_of_samples
+from spackle.training.sources import find_sources
 from spackle.workers import results_of
 
 
@@ -236,32 +236,22 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -
     assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
 
 
-def test_training_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
-    pytest.importorskip("yaml")
-    (tmp_path / "recipe.yaml").write_text("optim: {precision: fp32}\nloss: {features: none}")
-    data = ["data.views=4", "data.validation_views=2", "data.crops=2", "data.cells=16", f"data.pseudo={whole}"]
-    options = ["optim.steps=2", "optim.batch=2", "run.validate_every=2"]
-    done = run("train", "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out", *data, *options)
-    assert done.code == 0, done.err
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["samples"]["train"] > 0
+def test_training_draws_the_views_of_a_dataset(whole: Path, place: Path, tmp_path: Path) -> None:
+    def sources(folder: Path) -> tuple[DataRecipe, list[Source]]:
+        recipe = DataRecipe(pseudo=folder)
+        return recipe, find_sources(recipe, get_renderer())
 
-
-def test_a_sample_of_a_dataset_is_one_of_its_views(whole: Path) -> None:
-    files = open_pseudo(whole)
-    sample, again = (pseudo_view(np.random.default_rng(3), files, views_with_holes(files)) for _ in range(2))
+    (source,) = sources(whole)[1]
+    sample, again = (source.view(np.random.default_rng(3)) for _ in range(2))
     assert torch.equal(sample.target, again.target)
     assert bool(sample.hole.any())
     (view,) = [view for view in ViewDataset(whole) if torch.equal(view.target, sample.target)]
     assert torch.equal(view.mask, sample.hole)
-
-
-def test_datasets_are_told_apart_and_open_holes_refused(whole: Path, place: Path, tmp_path: Path) -> None:
     options = ("--sample", 1, "--views", 2)
     assert build(place, tmp_path / "none", *options, "--inpainter", "none").code == 0
     with pytest.raises(InputError, match="--inpainter none"):
-        open_pseudo(tmp_path / "none")
+        sources(tmp_path / "none")
     assert build(place, tmp_path / "other", *options).code == 0
     places = whole, shutil.copytree(whole, tmp_path / "copy"), tmp_path / "other"
-    recipes = [DataRecipe(pseudo=at) for at in places]
-    one, same, other = (digest_of_samples(recipe, find_sources(recipe, get_renderer())) for recipe in recipes)
+    one, same, other = (digest_of_samples(*sources(at)) for at in places)
     assert one == same != other

@@ -9,7 +9,7 @@ from typing import Any
 import evaluation_data
 import pytest
 import torch
-from command import Run, names_in, refuses, run
+from command import names_in, refuses, run
 from evaluation_data import write_boxes
 from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
@@ -20,7 +20,7 @@ from spackle.bases.sharp.encoder import TINY
 from spackle.errors import InputError
 from spackle.evaluation import bench
 from spackle.evaluation.case import Points
-from spackle.evaluation.folder import KINDS, load_run, open_folder
+from spackle.evaluation.folder import load_run
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import PAPER, STAGES, Row
 from spackle.evaluation.rows import Run as Results
@@ -39,10 +39,10 @@ def cost(added: int = 20, factor: float = 1.0) -> dict[str, float]:
     return {name: value for name, value in bench.view_figures(1000, added, runs) if not name.endswith("_run_ms")}
 
 
-def results(disparities: tuple[float, ...] = (0.3, 0.4, 0.5)) -> Results:
+def results() -> Results:
     """Three images of Middlebury, the second twice as slow and the third four times, and one that failed."""
     config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": ["spackle"], "title": "Middlebury"}
-    config |= {"disparities": list(disparities), "runs": 3, "base_runs": 1}
+    config |= {"disparities": [0.3, 0.4, 0.5], "runs": 3, "base_runs": 1}
     config["base"] = {"title": "SHARP", "says": "a network", "device": "cpu"}
     config["residual"] = {"weights": "shipped", "sha256": "0123456789abcdef", "precision": "bfloat16"}
     config["hardware"] = {"cpu": "A Processor", "cores": 2, "threads": 2}
@@ -52,14 +52,11 @@ def results(disparities: tuple[float, ...] = (0.3, 0.4, 0.5)) -> Results:
         image = Row("Middlebury", f"image {k}", "", "", "", "", None)
         facts = {"load": 1.5, "warm": 1, "note.precision": "bf16"}
         rows += [image._replace(metric=metric, value=value) for metric, value in facts.items()]
-        for disparity in disparities:
+        for disparity in config["disparities"]:
             view = image._replace(setting=f"{disparity:g}", view="right", method="spackle")
             rows += [view._replace(metric=name, value=value) for name, value in cost(10 * k, 2.0**k).items()]
     rows.append(Row("Middlebury", "broken", "", "", "", "problem", "no such file"))
     return Results(config, rows, {"parameters": bench.count_parameters()})
-
-
-# --- the paper's numbers, figures, tables
 
 
 def test_the_networks_have_the_papers_parameters() -> None:
@@ -80,11 +77,11 @@ def test_times_are_medians_of_runs_that_add_up() -> None:
 
 
 def test_the_layouts_are_the_papers() -> None:
-    overhead, expanded, stages = make_tables([results()])
-    assert list(dict.fromkeys(group for group, _ in overhead.heads)) == [
-        "",
-        *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)),
-    ]
+    evaluation = evaluation_data.results("Middlebury", False, lambda image: {"spackle": {"aux": 30}})
+    *others, overhead, expanded, stages = make_tables([evaluation, results()])
+    assert len({table.label for table in (*others, overhead, expanded, stages)}) == 6
+    groups = [f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)]
+    assert list(dict.fromkeys(group for group, _ in overhead.heads)) == ["", *groups]
     lines = [cells for rows in overhead.bodies for cells in rows]
     datasets = {cells[0] or None: k for k, cells in enumerate(lines)}
     ours = lines[datasets["Middlebury"]]
@@ -105,15 +102,6 @@ def test_the_layouts_are_the_papers() -> None:
         assert any("1 of 4 images" in note and "broken" in note for note in table.notes)
 
 
-def test_each_table_has_a_label_of_its_own() -> None:
-    evaluation = evaluation_data.results("Middlebury", False, lambda image: {"spackle": {"aux": 30}})
-    labels = [table.label for table in make_tables([evaluation, results()])]
-    assert len(set(labels)) == len(labels) == 6
-
-
-# --- timing
-
-
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
@@ -128,9 +116,6 @@ def test_a_view_costs_what_a_completion_adds() -> None:
     assert (whole["aux"], whole["rerender_run_ms"]) == (0, 0.0)  # a view without holes: no second render
 
 
-# --- one image and the command
-
-
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two small scenes in Middlebury's folders."""
@@ -140,15 +125,6 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def bench_of(root: Path, output: Path, *more: object) -> Run:
-    return run("bench", root, "--dataset", "middlebury", "--base", "rgbd", "-o", output, *more)
-
-
-def facts_of(rows: list[Row]) -> dict[str, Any]:
-    """What is known of an image alone."""
-    return {row.metric: row.value for row in rows if not row.setting}
-
-
 def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings: dict[str, Any] = {"methods": ("spackle",), "disparities": (0.3,), "metrics": (), "residual": "seeds"}
     tools = open_evaluation(EvaluateOptions("middlebury", scenes, base=BaseSettings("rgbd"), **settings))
@@ -156,10 +132,9 @@ def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, mo
     config = {"title": "Middlebury", "base_runs": 1, "runs": 1, "base": {"device": "cpu"}}
     assert case.depth is not None
     known = case.depth()
-    rows, columns = torch.nonzero(known.valid, as_tuple=True)
-    points = Points(torch.stack([columns, rows], dim=-1) + 0.5, known.depth[rows, columns])
+    points = Points(known.valid.nonzero().flip(-1) + 0.5, known.depth[known.valid])
     found = bench.time_case(dataclasses.replace(case, depth=None, points=lambda: points), tools, config, True)
-    assert facts_of(found)["base_gaussians"] > 0
+    assert next(row.value for row in found if row.metric == "base_gaussians")
     with pytest.raises(InputError, match="no depth map and no points"):
         bench.time_case(dataclasses.replace(case, depth=None), tools, config, True)
     monkeypatch.setattr(RgbdBase, "predict", lambda *words: predictions.append(words) or predict(*words))
@@ -167,12 +142,12 @@ def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, mo
         predictions.clear()
         found = bench.time_case(case, tools, config, warm)
         assert (len(predictions), sum(row.metric == "base_run_ms" for row in found)) == (calls, 1)
-        assert facts_of(found)["warm"]
 
 
 def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
-    output, words = tmp_path / "out", ("--runs", 2, "--disparity", "0.3,0.5")
-    done = bench_of(scenes, output, *words, "-v")
+    output = tmp_path / "out"
+    words = ("bench", scenes, "--dataset", "middlebury", "--base", "rgbd", "-o", output, "--disparity", "0.3,0.5")
+    done = run(*words, "--runs", 2, "-v")
     assert done.code == 0, done.err
     assert names_in(output) == {"rows.jsonl", "bench.md", "bench.tex", "config.json", "images"}
     found = load_run(output)
@@ -183,33 +158,20 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
         assert {len(found.numbers(f"{stage}_run_ms", setting)) for stage in STAGES} == {2 * 2}
         counts = zip(found.numbers("base_gaussians"), found.numbers("aux", setting), strict=True)
         assert found.numbers("merged", setting) == [base + aux for base, aux in counts]
-    refuses(bench_of(scenes, output, "--runs", 3, *words[2:]), "runs: 2 -> 3")
+    refuses(run(*words, "--runs", 3), "holds a benchmark of another kind (base_runs: 2 -> 3; runs: 2 -> 3)")
+    refuses(run("evaluate", *words[1:], "--metrics", "none"), "config.json: not of `spackle evaluate`")
 
 
 def test_sharp_is_timed_once(scenes: Path, tmp_path: Path) -> None:
     sharp = ("--base", "sharp", "-c", write_tiny(tmp_path / "sharp.safetensors"), "--precision", "fp32")
-    words = ("--runs", 1, "--disparity", "0.3", "--residual", "seeds", "--limit", 1)
-    done = bench_of(scenes, tmp_path / "out", *words, *sharp)
+    words = ("-o", tmp_path / "out", "--runs", 1, "--disparity", "0.3", "--residual", "seeds", "--limit", 1)
+    done = run("bench", scenes, "--dataset", "middlebury", *words, *sharp)
     assert done.code == 0, done.err
     found = load_run(tmp_path / "out")
     assert found.numbers("base_gaussians") == [gaussians_of(TINY)]
     assert len(found.numbers("base_run_ms", "0.3")) == len(found.numbers("overhead", "0.3")) == 1
     assert found.numbers("warm") == [0]  # the first prediction, which counts
     assert "network in fp32 on" in (tmp_path / "out" / "bench.md").read_text()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, kind: str) -> None:
-    (other,) = KINDS.keys() - {kind}
-    for _ in range(2):  # the second one goes on
-        open_folder(tmp_path, {"kind": kind, "runs": 1}, {})
-    assert names_in(tmp_path) == {"config.json", "images"}
-    for asked, message in (
-        ({"kind": kind, "runs": 2}, rf"holds {KINDS[kind]} of another kind \(runs: 1 -> 2\)"),
-        ({"kind": other, "runs": 1}, rf"config\.json: not of `spackle {other}`"),
-    ):
-        with pytest.raises(InputError, match=message):
-            open_folder(tmp_path, asked, {})
 
 
 @pytest.mark.parametrize(
@@ -224,4 +186,3 @@ def test_a_folder_belongs_to_one_configuration_of_one_command(tmp_path: Path, ki
 )
 def test_bad_options_are_one_line(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
     refuses(run("bench", *words, "-o", tmp_path / "out"), message)
-    assert not (tmp_path / "out").exists()

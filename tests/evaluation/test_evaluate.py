@@ -25,7 +25,6 @@ from spackle.bases import BasePrediction
 from spackle.bases.lift import RgbdBase
 from spackle.bases.open import BaseError
 from spackle.bases.settings import BaseSettings
-from spackle.camera import Camera
 from spackle.camera_path import DepthRange, max_offset
 from spackle.device import MemoryShort
 from spackle.errors import InputError
@@ -41,16 +40,12 @@ from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.table import Table, mark_best, write_table
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
-from spackle.render.protocol import Rendering
 from spackle.residual import hole_mask
 from spackle.scene_fill import FillContext
 
 TABLES = ("tables.md", "tables.tex")
 FLAT = "inpaint2d," if importlib.util.find_spec("cv2") else ""  # an optional package
 OUTPUTS = {"rows.jsonl", "config.json", "worst.png", "best.png", "images", *TABLES}
-
-
-# --- metrics
 
 
 def test_psnr_and_ssim_are_scikit_images() -> None:
@@ -63,7 +58,6 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
     found = ssim_map(image, truth)
     mask, nothing = torch.zeros(2, *image.shape[:2], dtype=torch.bool)
     mask[:20, -30:] = True  # up to the border, where half of a hole may be
-    assert np.abs(found.numpy() - full).max() < 1e-6
     assert ssim_average(found) == pytest.approx(whole, abs=1e-6)
     assert ssim_average(found, mask) == pytest.approx(full[:20, -30:].mean(), abs=1e-6)
     for ours, part in ((psnr(image, truth), np.s_[:]), (psnr(image, truth, mask), np.s_[:20, -30:])):
@@ -73,9 +67,6 @@ def test_psnr_and_ssim_are_scikit_images() -> None:
     assert math.isnan(ssim_average(found, nothing))
     assert (psnr(image, image), reduction(0.2, 0.05)) == (math.inf, pytest.approx(0.75))
     assert math.isnan(reduction(0.0, 0.0))
-
-
-# --- pyiqa, by a stand-in
 
 
 @pytest.mark.parametrize("why", [NOT_INSTALLED, "pyiqa cannot be imported: operator torchvision"])
@@ -113,7 +104,7 @@ def test_variants_are_pinned_and_images_come_as_pyiqa_wants_them(monkeypatch: py
     assert metrics["niqe"](truth, None) == pytest.approx(0.25)
     first, second = seen[0]
     assert first.shape == second.shape == (1, 3, 5, 7)
-    assert (float(first[0, 2, 0, 1]), float(first.max()), len(seen[1])) == (0, 1, 1)
+    assert (float(first[0, 2, 0, 1]), float(first.max())) == (0, 1)
 
 
 def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,9 +122,6 @@ def test_weights_are_not_downloaded_without_leave(monkeypatch: pytest.MonkeyPatc
     assert states["niqe"].startswith("not run: weights: not on this machine")
     assert "'koniq'" in states["musiq"]
     assert math.isnan(metrics["clipiqa"](torch.zeros(4, 4, 3), None))
-
-
-# --- rows and tables
 
 
 LARGE: Figures = {
@@ -205,50 +193,35 @@ def test_a_table_as_markdown_and_latex() -> None:
     assert mark_best([1.0, 1.1, 1.1001], ["1.0", "1.1", "1.1"], lower=False) == ["1.0", "**1.1**", "**1.1**"]
 
 
-# --- methods and views
-
-
-def compared(*sides: float) -> tuple[FillContext, list[Camera], list[Rendering]]:
-    """A box before a wall, and its base from elsewhere."""
-    prediction, renderer = box_before_wall().lift(), get_renderer()
-    cameras: list[Camera] = [shifted(box_before_wall().camera, side) for side in sides]
-    before = [renderer.render(prediction.gaussians, camera) for camera in cameras]
-    return FillContext(prediction.gaussians, prediction.camera, renderer), cameras, before
-
-
 def test_each_method_starts_from_the_same_base() -> None:
-    context, cameras, renderings = compared(0.4, -0.4)
+    prediction, renderer = box_before_wall().lift(), get_renderer()
+    context = FillContext(prediction.gaussians, prediction.camera, renderer)
+    cameras = [shifted(prediction.camera, side) for side in (0.4, -0.4)]
+    renderings = [renderer.render(context.base, camera) for camera in cameras]
     names = ("base", "seeds", "spackle-scene", "dense", "paper", "spackle")
     alone, per_view, scene, dense, paper, spackle = (
         list(make_method(name, context)(cameras, renderings)) for name in names
     )
     for index, before in enumerate(renderings):
         covered = ~hole_mask(before.alpha)
+        holes = float((~covered).float().mean())
         assert torch.equal(alone[index].rgb, before.rgb)
         assert alone[index].aux == 0
-        for view in (per_view[index], scene[index], dense[index]):
+        for view in (per_view[index], scene[index], dense[index], paper[index]):
             assert view.alpha is not None
-            assert float(hole_mask(view.alpha).float().mean()) < 0.1 * float((~covered).float().mean())
+            assert float(hole_mask(view.alpha).float().mean()) < 0.1 * holes
             assert float((view.rgb - before.rgb).abs()[covered].mean()) < 0.01
         whole = before.alpha.numel() / 4
         assert 0.97 * whole <= (dense[index].aux or 0) <= whole
         assert (per_view[index].aux or 0) < 0.5 * whole
-        holes = float((~covered).float().mean())
         assert (paper[index].aux or 0) == pytest.approx(holes * whole, rel=0.05)  # the paper's HAR × grid
         assert (paper[index].aux or 0) < (spackle[index].aux or 0) <= 6 * (paper[index].aux or 0)  # in pixels
-        assert paper[index].alpha is not None
-        assert float(hole_mask(paper[index].alpha).float().mean()) < 0.1 * holes
     assert scene[0].aux == scene[1].aux  # one set for both
-
-
-def test_direct_ft_looks_from_the_same_place_in_its_own_unit() -> None:
-    context, cameras, before = compared(0.4)
-    g = context.base
-    double = dataclasses.replace(g, means=2 * g.means, scales=2 * g.scales)
-    for other, unit, most in ((g, 1.0, 0.0), (double, 2.0, 1e-3)):
-        method = make_method("direct-ft", context, direct_ft=lambda other=other, unit=unit: (other, unit))
-        (view,) = method(cameras, before)
-        assert float((view.rgb - before[0].rgb).abs().max()) <= most
+    double = dataclasses.replace(context.base, means=2 * context.base.means, scales=2 * context.base.scales)
+    for view, before in zip(
+        make_method("direct-ft", context, direct_ft=lambda: (double, 2.0))(cameras, renderings), renderings, strict=True
+    ):
+        assert float((view.rgb - before.rgb).abs().max()) <= 1e-3  # from the same place, in its own unit
 
 
 def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
@@ -274,9 +247,6 @@ def test_large_views_end_a_swipe_and_a_failed_metric_is_a_remark() -> None:
     assert pictures["base"].shape == (72, 96, 3)  # both sides even
 
 
-# --- the command
-
-
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three small scenes in Middlebury's folders."""
@@ -294,11 +264,6 @@ def mean_of(run: Results, setting: str, method: str, metric: str) -> float:
     value = mean([row.value for row in run.rows if row[2:3] + row[4:6] == (setting, method, metric)]).value
     assert value is not None
     return value
-
-
-def same_files(one: Path, other: Path, names: tuple[str, ...]) -> None:
-    for name in names:
-        assert (one / name).read_bytes() == (other / name).read_bytes(), name
 
 
 def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,32 +305,15 @@ def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None
     assert abs(outside["spackle"] - outside["base"]) < 0.5
 
 
-def test_a_run_goes_on_and_gives_the_same_bytes(scenes: Path, tmp_path: Path) -> None:
-    choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.4")
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert evaluate(scenes, whole, *choices).code == 0
-    shutil.copytree(whole, stopped)
-    for name in ("rows.jsonl", "images/00002-Door.json"):
-        (stopped / name).unlink()
-    again = evaluate(scenes, stopped, *choices)
-    assert "going on, 2 of 3" in again.err
-    before = {path.name: path.stat().st_mtime_ns for path in (stopped / "images").iterdir()}
-    assert evaluate(scenes, stopped, *choices).code == 0
-    assert before == {path.name: path.stat().st_mtime_ns for path in (stopped / "images").iterdir()}
-    same_files(whole, stopped, ("rows.jsonl", "worst.png", "best.png", *TABLES))
-    refuses(evaluate(scenes, stopped, *choices[:-1], "0.5"), "disparities: [0.4] -> [0.5]")
-
-
 def test_a_broken_image_is_named_and_the_others_go_on(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, output = tmp_path / "data", tmp_path / "out"
     shutil.copytree(scenes, root)
     photo = root / "Chair" / "left.png"
-    whole = photo.read_bytes()
     choices = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
     near = (*choices[:4], "--protocol", "near-view")
-    for content, where, more in ((whole[: len(whole) // 2], output, choices), (b"", tmp_path / "near", near)):
+    for content, where, more in ((photo.read_bytes()[:900], output, choices), (b"", tmp_path / "near", near)):
         photo.write_bytes(content)  # the second has not even a header
         done = evaluate(root, where, *more)
         assert done.code == 0, done.err
@@ -374,14 +322,9 @@ def test_a_broken_image_is_named_and_the_others_go_on(
         assert list(load_run(where).problems) == ["Chair"]
         assert str(tmp_path) not in (where / "rows.jsonl").read_text()
     assert "1 of 3 images gave no figures: Chair." in (output / "tables.md").read_text()
-    photo.write_bytes(whole)
-    assert evaluate(root, output, *choices).code == 0
-    assert load_run(output).problems == {}
     for scene in root.iterdir():
         (scene / "left.png").write_bytes(b"")
-    done = evaluate(root, tmp_path / "none", *choices)
-    assert (done.code, len(done.lines), "none of 3 images gave figures" in done.err) == (2, 4, True)
-
+    assert "none of 3 images gave figures" in evaluate(root, tmp_path / "none", *choices).lines[-1]
     load, lack = load_case, f"{scenes}/Chair/third.png: not\nan image"
     monkeypatch.setattr(
         "spackle.evaluation.evaluate.load_case", lambda case, side: dataclasses.replace(load(case, side), lacks=(lack,))
@@ -397,8 +340,8 @@ def test_infinite_gaussians_fail_an_image_no_memory_the_run(scenes: Path, monkey
 
     def too_large(*arguments: Any) -> BasePrediction:
         found = predict(*arguments)
-        endless = dataclasses.replace(found.gaussians, means=found.gaussians.means / 0)
-        return dataclasses.replace(found, gaussians=endless)
+        found.gaussians.means[:] = math.inf
+        return found
 
     def too_little(*arguments: Any) -> BasePrediction:
         raise MemoryShort("not enough memory for the network")
@@ -412,18 +355,24 @@ def test_infinite_gaussians_fail_an_image_no_memory_the_run(scenes: Path, monkey
         assert type(caught.value) is kind
 
 
-def test_several_evaluations_share_their_tables(scenes: Path, tmp_path: Path) -> None:
-    choices = ("--methods", "base,seeds", "--metrics", "none", "--limit", "1", "--disparity", "0.3 0.5")
+def test_a_run_goes_on_to_the_same_bytes_and_runs_share_their_tables(scenes: Path, tmp_path: Path) -> None:
+    choices = ("--methods", "base,seeds", "--metrics", "none", "--disparity", "0.3 0.5")
     one, two, both = tmp_path / "one", tmp_path / "two", tmp_path / "both"
     assert evaluate(scenes, one, *choices).code == 0
-    assert evaluate(scenes, two, *choices[:-2], "--protocol", "near-view").code == 0
-    assert len(load_run(one).images) == 1
+    stopped = shutil.copytree(one, tmp_path / "stopped")
+    for name in ("rows.jsonl", "images/00002-Door.json"):
+        (stopped / name).unlink()
+    assert "going on, 2 of 3" in evaluate(scenes, stopped, *choices).err
+    for name in ("rows.jsonl", "worst.png", "best.png", *TABLES):
+        assert (one / name).read_bytes() == (stopped / name).read_bytes(), name
+    refuses(evaluate(scenes, stopped, *choices[:-1], "0.4"), "disparities: [0.3, 0.5] -> [0.4]")
+    assert evaluate(scenes, two, *choices[:-2], "--protocol", "near-view", "--limit", "1").code == 0
+    assert len(load_run(two).images) == 1
     done = run("tables", one, two, "-o", both)
     assert done.code == 0, done.err
-    text = (both / "tables.md").read_text()
-    assert "tab:controlled_disocclusion" in text
+    assert "tab:controlled_disocclusion" in (both / "tables.md").read_text()
     assert run("tables", one, "-o", tmp_path / "again").code == 0
-    same_files(one, tmp_path / "again", TABLES)
+    assert all((one / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in TABLES)
     refuses(run("tables", one, one, "-o", both), "two results")
     refuses(run("tables", scenes, "-o", both), "rows.jsonl is missing")
     for file, content in (("rows.jsonl", "[1]\n"), ("config.json", "{}"), ("config.json", "x")):

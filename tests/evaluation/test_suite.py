@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 import suite
@@ -34,16 +33,14 @@ def rows_of(section: suite.Section) -> dict[str, suite.Timed]:
 def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     section = suite.renderer_section(2, SIDE, PEAKS)
     found, facts = rows_of(section), section[1]
-    whole, naive = "whole call: RGB, depth, alpha", "naive: whole call"
-    names = [*suite.RENDER_STAGES, *(f"naive: {stage}" for stage in suite.RENDER_STAGES), whole, naive]
-    assert all(len(found[name].values) == 2 and min(found[name].values) > 0 for name in names)
-    assert found["naive over ours"].values == pytest.approx(found[naive].values / found[whole].values)
+    whole, naive = found["whole call: RGB, depth, alpha"], found["naive: whole call"]
+    assert found["naive over ours"].values == pytest.approx(naive.values / whole.values)
     scene, camera = photo_scene(SIDE)
     difference = (CpuRenderer().render(scene, camera).rgb - naive_render(scene, camera)).abs()
     assert float(difference.mean()) < 1e-5
     assert float(difference.amax()) < 0.02
     assert facts["gaussians"] == (count := len(scene)) == SIDE * SIDE // 2
-    assert found[whole].limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
+    assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
 
 
 def test_a_view_is_found_by_its_share_of_holes_and_completed() -> None:
@@ -56,9 +53,8 @@ def test_a_view_is_found_by_its_share_of_holes_and_completed() -> None:
     assert hole_area_ratio(CpuRenderer().render(base, view).alpha) == pytest.approx(0.05, rel=0.05)
     with pytest.raises(InputError, match="no view"):
         find_view(base, camera, CpuRenderer(), 0.999)
-    section = suite.completion_section(2, base, camera, CpuRenderer(), network)
-    found, facts = rows_of(section), section[1]
-    assert all(len(row.values) == 2 and min(row.values) > 0 for row in found.values())
+    rows, facts = suite.completion_section(2, base, camera, CpuRenderer(), network)
+    assert all(len(row.values) == 2 and min(row.values) > 0 for row in rows)
     assert (facts["disparity"], facts["holes"]) == (disparity, pytest.approx(0.05, rel=0.05))
     context = FillContext(base, camera, CpuRenderer(), network)
     whole = fill_view(context, view).aux
@@ -66,28 +62,18 @@ def test_a_view_is_found_by_its_share_of_holes_and_completed() -> None:
     assert facts["added"] == len(whole) > 0
 
 
-def test_a_video_in_one_scene_and_frame_by_frame() -> None:
+def test_a_video_frame_by_frame_and_sharp_in_its_stages() -> None:
     section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
-    found = {name: float(row.values[0]) for name, row in rows_of(section).items()}
-    assert all(value > 0 for value in found.values())
-    assert found["the same, the photo's occlusion guard made once"] < found["frame by frame over one scene"]
+    found = rows_of(section)
+    once, each = "the same, the photo's occlusion guard made once", "frame by frame over one scene"
+    assert found[once].values[0] < found[each].values[0]
     assert section[1]["added"] > 0
-
-
-def test_sharp_in_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     photo = Photo(torch.rand(MICRO.side, MICRO.side, 3), 1.2 * MICRO.side, "", Path("photo.png"))
     section = suite.sharp_section(1, SharpBase(micro_network(), weights="micro"), photo, PEAKS)
     found, facts = rows_of(section), section[1]
     assert facts["gaussians"] == gaussians_of(MICRO)
     assert (found[suite.FORWARD].limit_ms or 0) > 1e3  # 1e9 operations at 1e6 a millisecond
     assert found["photo to scene"].values[0] >= found[suite.FORWARD].values[0]
-
-    def no_compiler(*arguments: object) -> Any:
-        raise RuntimeError("no compiler\nanywhere")
-
-    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
-    _, facts = suite.sharp_section(1, SharpBase(micro_network(), compiled=True, windows=9), photo, PEAKS)
-    assert (facts["windows"], facts["compile_problem"]) == (9, "no compiler anywhere")
 
 
 def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:
@@ -97,7 +83,5 @@ def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> N
     found = json.loads((tmp_path / "out" / "suite.json").read_text())["sections"]
     assert set(found) == {"limits", "renderer", "sharp"}
     assert "no weights" in found["sharp"]["facts"]["not run"]
-    text = (tmp_path / "out" / "suite.md").read_text()
-    assert all(f"**{name}.**" in text for name in found)
     with pytest.raises(SystemExit):
         suite.main([*words, "--only", "rendrer"])

@@ -261,7 +261,7 @@ READERS: dict[str, Reader] = {
     "booster": _tree("booster", lambda folder: booster(folder / "a")),
     "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a", EYES[:2])),
     "llff": _tree("llff", lambda folder: llff(folder / "fern", EYES[:2])),
-    "colmap": _tree("tanks", lambda folder: tanks(folder / "Truck", EYES[:2]), _text_model),
+    "colmap": _tree("tanks", lambda folder: tanks(folder / "Truck"), _text_model),
 }
 
 
