@@ -140,8 +140,8 @@ def apple_jpeg(map_: NDArray[np.uint8], packet: bytes | None = None, orientation
     """A portrait with a gain map and a matte before its depth map, as iPhones have them."""
     other = jpeg(np.flipud(map_))
     gain_map = with_segments(other, xmp_segment(xmp("><apdi:StoredFormat>1278226488</apdi:StoredFormat>", APPLE)))
-    kind = "<apdi:AuxiliaryImageType>depth</apdi:AuxiliaryImageType>"
-    matte = with_segments(other, xmp_segment(apple_xmp("L008", more=kind)))
+    said = apple_xmp("L008", more="<apdi:AuxiliaryImageType>depth</apdi:AuxiliaryImageType>")
+    matte = with_segments(other, xmp_segment(said))
     depth = with_segments(jpeg(map_), xmp_segment(apple_xmp() if packet is None else packet))
     return multi_picture(jpeg(picture(), orientation), gain_map, matte, depth, order=order)
 
@@ -190,13 +190,14 @@ def dynamic_jpeg(
     """The map behind the photo, after another item, where a directory in the (extended) XMP has it."""
     other, uri = jpeg(codes()[::-1]), "android/depthmap"
     depth = {"DepthMap:ItemSemantic": "Depth", **said.properties("DepthMap"), "DepthMap:DepthURI": uri}
-    rows = (
-        ("image/jpeg", primary, "primary_image", padding),
-        ("image/jpeg", len(other), "android/gainmap", 0),
-        ("image/png", len(image) if length is None else length, uri, 0),
-    )
-    names = ("Item:Mime", "Item:Length", "Item:DataURI", "Item:Padding")
-    entries: list[dict[str, object]] = [dict(zip(names, row, strict=True)) for row in rows]
+    entries: list[dict[str, object]] = [
+        {"Item:Mime": mime, "Item:Length": size, "Item:DataURI": name, "Item:Padding": gap}
+        for mime, size, name, gap in (
+            ("image/jpeg", primary, "primary_image", padding),
+            ("image/jpeg", len(other), "android/gainmap", 0),
+            ("image/png", len(image) if length is None else length, uri, 0),
+        )
+    ]
     resource = 'rdf:parseType="Resource"'
     if extended:  # as Pixels have it
         inner = (f"<rdf:value {resource}>{elements(entry)}</rdf:value>" for entry in entries)
@@ -205,7 +206,8 @@ def dynamic_jpeg(
     else:
         items = "".join(f"<rdf:li><Container:Item{attributes(entry)}/></rdf:li>" for entry in entries)
         of_map = f"<Camera:DepthMap{attributes(depth)}/>"
-    lens = "" if model is None else f"<Camera:ImagingModel><rdf:Description{attributes(model)}/></Camera:ImagingModel>"
+    said_of_lens = attributes({f"ImagingModel:{name}": value for name, value in (model or {}).items()})
+    lens = f"<Camera:ImagingModel><rdf:Description{said_of_lens}/></Camera:ImagingModel>" if model else ""
     directory = f"<Container:Directory><rdf:Seq>{items}</rdf:Seq></Container:Directory>"
     body = f"><Device:Cameras><rdf:Seq><rdf:li>{of_map}{lens}</rdf:li></rdf:Seq></Device:Cameras>"
     packet = xmp(f"{body}<Device:Container>{directory}</Device:Container>", DYNAMIC)
@@ -243,15 +245,9 @@ def heic(
     information: str = "",
     own_turn: bool = False,
 ) -> bytes:
-    """A photo with an auxiliary image, encoded by libheif and put together here.
+    """A photo, an auxiliary image of some kind, and its XMP, encoded by libheif and put together here.
 
-    Args:
-        map_: the auxiliary image; None for none.
-        packet: its XMP.
-        orientation: of the photo, written as HEIF's rotation and mirroring.
-        kind: what the auxiliary image is.
-        information: one of `INFORMATION`.
-        own_turn: the auxiliary image gets the photo's rotation and mirroring too.
+    The orientation is written as HEIF's rotation and mirroring of the photo, with `own_turn` of the map too.
     """
     turns = [box(name, bytes([value])) for name, value in TURNS.get(orientation, [])]
     data, properties = _encoded_heif(picture())
@@ -277,20 +273,19 @@ def _encoded_heif(values: Codes) -> tuple[bytes, list[bytes]]:
 def _file(items: list[tuple[bytes, bytes, list[bytes]]]) -> bytes:
     """A HEIC of these items: the photo, and its auxiliary image and that one's XMP where they are given."""
     entries = associations = references = b""
-    count = 0
+    stored: list[bytes] = []
     for number, (kind, _, properties) in enumerate(items, 1):
         mime = b"application/rdf+xml\0" if kind == b"mime" else b""
         entries += full(b"infe", struct.pack(">HH4s", number, 0, kind) + b"\0" + mime, version=2)
-        indices = bytes(range(count + 1, count + 1 + len(properties)))
+        indices = bytes(range(len(stored) + 1, len(stored) + 1 + len(properties)))
         associations += struct.pack(">HB", number, len(indices)) + indices
-        count += len(properties)
+        stored += properties
         if number > 1:
             references += box((b"auxl", b"cdsc")[number - 2], struct.pack(">HHH", number, 1, number - 1))
-    stored = b"".join(b"".join(properties) for _, _, properties in items)
     meta = full(b"hdlr", b"\0\0\0\0pict" + bytes(13)) + full(b"pitm", struct.pack(">H", 1))
     meta += full(b"iinf", struct.pack(">H", len(items)) + entries)
     meta += full(b"iref", references) if references else b""
-    meta += box(b"iprp", box(b"ipco", stored) + full(b"ipma", struct.pack(">I", len(items)) + associations))
+    meta += box(b"iprp", box(b"ipco", b"".join(stored)) + full(b"ipma", struct.pack(">I", len(items)) + associations))
     head = box(b"ftyp", b"heic\0\0\0\0mif1heic")
     at = len(head) + 12 + len(meta) + 16 + 14 * len(items) + 8  # behind the heads of meta, iloc and mdat
     places = b""
