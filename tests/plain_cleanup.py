@@ -1,9 +1,8 @@
-"""Oracles of the kernels of depth maps: Dijkstra's algorithm, least squares, growth by rings, plain Python."""
+"""Oracles of the kernels of depth maps: SciPy's cheapest paths, least squares, growth by rings, plain Python."""
 
 from __future__ import annotations
 
 import contextlib
-import heapq
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -37,28 +36,16 @@ def around(shape: tuple[int, ...], pixel: Pixel, reach: int = 1) -> list[Pixel]:
 
 
 def cheapest(sources: Bools, targets: Bools, cost: Callable[[Pixel, Pixel], float]) -> dict[Pixel, Pixel]:
-    """The source that each target is cheapest to reach from, by Dijkstra's algorithm.
-
-    `cost` is that of a step between neighbours. AssertionError where two ways are as good as equal.
-    """
-    starts = [(int(y), int(x)) for y, x in np.argwhere(sources)]
-    total, origin, ties = dict.fromkeys(starts, 0.0), {p: p for p in starts}, set()
-    queue = [(0.0, p) for p in starts]
-    while queue:
-        so_far, p = heapq.heappop(queue)
-        if so_far > total[p]:
-            continue
+    """The source that each target is cheapest to reach from, by SciPy; `cost` is that of a step between neighbours."""
+    csgraph = pytest.importorskip("scipy.sparse.csgraph")
+    pixels = list(np.ndindex(*targets.shape))
+    number, steps = {pixel: k for k, pixel in enumerate(pixels)}, np.zeros((len(pixels), len(pixels)))
+    for p in pixels:
         for q in around(targets.shape, p):
-            if not targets[q]:
-                continue
-            new, old = so_far + math.dist(p, q) + cost(p, q), total.get(q, math.inf)
-            if abs(new - old) < 1e-3 and origin[q] != origin[p]:
-                ties.add(q)
-            if new < old:
-                total[q], origin[q] = new, origin[p]
-                heapq.heappush(queue, (new, q))
-    assert not ties
-    return origin
+            if targets[q] and p != q:
+                steps[number[p], number[q]] = math.dist(p, q) + cost(p, q)
+    *_, found = csgraph.dijkstra(steps, indices=np.flatnonzero(sources), return_predecessors=True, min_only=True)
+    return {pixel: pixels[start] for pixel, start in zip(pixels, found.tolist(), strict=True) if start >= 0}
 
 
 def plain_planes(inverse: Floats, known: Bools, tolerance: float) -> Floats:

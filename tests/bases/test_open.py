@@ -48,16 +48,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """SHARP and models of the hub in no time, from files that are not read; holds what was asked for."""
     asked: list[dict[str, Any]] = []
 
-    def load_sharp(path: Path, **options: Any) -> StandIn:
+    def load(path: Path | str, **options: Any) -> StandIn:
         asked.append({"path": path, **options})
-        return StandIn("sharp")
+        return StandIn("sharp" if isinstance(path, Path) else f"hf:{path}")
 
-    def load_model(name: str, **options: Any) -> StandIn:
-        asked.append({"path": name, **options})
-        return StandIn(f"hf:{name}")
-
-    monkeypatch.setattr(SharpBase, "load", load_sharp)
-    monkeypatch.setattr(HfBase, "load", load_model)
+    monkeypatch.setattr(SharpBase, "load", load)
+    monkeypatch.setattr(HfBase, "load", load)
     return asked
 
 
@@ -69,10 +65,8 @@ def photo(tmp_path: Path) -> Path:
 @pytest.fixture
 def portrait(tmp_path: Path) -> Path:
     """A photo with depth in it, and a lens of that."""
-    matrix = (70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0)
-    return portraits.write(
-        tmp_path / "portrait.jpg", portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp(matrix=matrix))
-    )
+    said = portraits.apple_xmp(matrix=(70.0, 0.0, 0.0, 0.0, 70.0, 0.0, 32.0, 24.0, 1.0))
+    return portraits.write(tmp_path / "portrait.jpg", portraits.apple_jpeg(portraits.codes(), said))
 
 
 def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[BasePrediction, ResolvedBase]:
@@ -81,20 +75,16 @@ def pick(path: Path, log: list[str] | None = None, /, **settings: Any) -> tuple[
     return open_base(BaseSettings(**settings)).predict(load_photo(path), log=log.append)
 
 
-# The order of auto, and why.
-
-
 def test_auto_takes_the_photos_depth_then_sharp_then_lite(
-    tmp_path: Path, photo: Path, portrait: Path, made: dict[str, Path]
+    tmp_path: Path, photo: Path, portrait: Path, sharp: Path
 ) -> None:
-    choice = pick(photo)[1]
-    assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get depth` (99.2 MB, Apache-2.0)" in choice.note
-    (tmp_path / "weights").mkdir()
-    shutil.copy(made["sharp"], tmp_path / "weights")
     prediction, choice = pick(photo)
     assert (choice.base, choice.why, len(prediction.gaussians)) == ("sharp", NO_DEPTH, gaussians_of(TINY))
     assert prediction.notes["weights"] == SHARP_FILE
+    sharp.unlink()
+    choice = pick(photo)[1]
+    assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
+    assert "--depth FILE, `spackle weights get depth` (99.2 MB, Apache-2.0)" in choice.note
     prediction, choice = pick(portrait)
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
@@ -142,8 +132,7 @@ def test_a_base_is_loaded_once_and_when_a_photo_needs_it(
     base.predict(load_photo(portrait))
     assert not quick
     news = [base.predict(load_photo(photo))[1].note for _ in range(2)]
-    assert [bool(line) for line in news] == [True, False]
-    assert len(quick) == 1
+    assert ([bool(line) for line in news], len(quick)) == ([True, False], 1)
     model = open_base(BaseSettings("hf:me/small", precision="fp32", device="cpu"))
     assert [model.predict(load_photo(photo))[1].base for _ in range(2)] == ["hf:me/small"] * 2
     assert quick[1:] == [{"path": "me/small", "precision": "fp32", "device": "cpu"}]
@@ -163,9 +152,6 @@ def test_other_weights_of_lite_and_one_choice_for_a_clip(
     assert kept.notes == prediction.notes
 
 
-# Whose lens counts.
-
-
 def test_focal_length_of_person_then_map_then_photo(tmp_path: Path, photo: Path) -> None:
     disparity, ours_px = tmp_path / "disp0.npy", load_photo(photo, focal_px=60)
     np.save(disparity, (80 * 0.2 / metres() - 1.5).astype(np.float32))
@@ -178,7 +164,7 @@ def test_focal_length_of_person_then_map_then_photo(tmp_path: Path, photo: Path)
         assert (ours.camera.focal[0], ours.lens_source) == (60, "")
         # depth = baseline · focal / (disparity + doffs)
         torch.testing.assert_close(ours.gaussians.means[front, 2], 0.75 * prediction.gaussians.means[front, 2])
-        scene = spackle.predict(ours_px, depth=depth, network=None)
+        scene = spackle.predict(ours_px, depth=depth, network=None, fill="none")
         assert scene.camera.focal[0] == 60
         assert same_bits(scene.base, ours.gaussians)
     of_the_file = dataclasses.replace(ours_px, focal_source="EXIF")
@@ -193,9 +179,6 @@ def test_focal_length_of_person_then_depth_in_the_photo(portrait: Path) -> None:
             assert (prediction.camera.focal[0], prediction.lens_source) == (focal, source)
             middles.append(float(prediction.gaussians.means[: WIDTH * HEIGHT, 2].median()))
     assert middles == pytest.approx(middles[:1] * 4, rel=1e-3)  # its metres depend on no lens
-
-
-# Auto falls back where a base cannot be used.
 
 
 def test_broken_depth_in_the_photo_fails(
@@ -222,8 +205,7 @@ def test_broken_depth_in_the_photo_fails(
 
 
 def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = sharp.read_bytes()
-    publish(monkeypatch, "sharp", content)
+    publish(monkeypatch, "sharp", content := sharp.read_bytes())
     sharp.write_bytes(content[::-1])
     said, log, base = "SHA-256 is not the published one", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
@@ -257,9 +239,6 @@ def test_what_fails_for_one_photo_is_tried_for_the_next(
         with pytest.raises(InputError, match=path.name) as caught:
             pick(path, name="sharp")
         assert not isinstance(caught.value, BaseError)
-
-
-# What is named never gives way to another.
 
 
 def test_depth_that_is_given_or_named_has_no_fallback(tmp_path: Path, photo: Path, portrait: Path) -> None:
@@ -301,9 +280,6 @@ def test_what_a_base_has_no_use_for_is_refused(settings: dict[str, Any], option:
         open_base(BaseSettings(**settings))
 
 
-# What results say of a base.
-
-
 def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
     folder = write_model(tmp_path / "one" / "small")
     settings = BaseSettings(f"hf:{folder}")
@@ -328,10 +304,10 @@ def test_weights_are_apples_by_name_and_size(tmp_path: Path, monkeypatch: pytest
 
 def test_python_takes_depth_or_a_base_and_photos_without_file(tmp_path: Path, photo: Path) -> None:
     loaded = load_photo(photo)
-    scene = spackle.predict(loaded, network=None)
+    scene = spackle.predict(loaded, network=None, fill="none")
     drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
-    assert same_bits(spackle.predict(drawn, network=None).base, scene.base)
-    assert same_bits(spackle.predict(photo, base=LiteBase.load(), network=None).base, scene.base)
+    assert same_bits(spackle.predict(drawn, network=None, fill="none").base, scene.base)
+    assert same_bits(spackle.predict(photo, base=LiteBase.load(), network=None, fill="none").base, scene.base)
     with pytest.raises(ValueError, match="not both"):
         spackle.predict(photo, write_depth(tmp_path / "d.npy"), base=LiteBase.load())
     with pytest.raises(ValueError, match=r"base='lite': give a base that is loaded"):

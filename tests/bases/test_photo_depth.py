@@ -198,6 +198,7 @@ def test_dynamic_depth_finds_its_item_however_the_lengths_are_meant(tmp_path: Pa
         portraits.dynamic_jpeg(png(codes()), padding=37).replace(b'Item:Padding="37"', b'Item:Padding="0" '),
         portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99).replace(b'Item:Padding="0"', b'Item:Padding="9"'),
         portraits.dynamic_jpeg(png(codes()), trailer=b"x" * 99, primary=5000),
+        portraits.dynamic_jpeg(png(codes())).replace(b"\xff\xd9", b"\xff\0"),  # a photo without an end
     ):
         assert torch.equal(found(tmp_path, data).depth, expected)
 
@@ -274,6 +275,7 @@ def test_photos_without_depth(tmp_path: Path) -> None:
         "other.txt": b"neither a photo nor anything else",
         "odd.jpg": portraits.multi_picture(odd, odd),
         "other.heic": of_another_picture.replace(link, link[:-1] + b"\3"),
+        "broken.heic": portraits.heic(codes()).replace(b"mif1heic\0", b"mif1heic\xff"),  # a box beyond the file
     }
     for name, data in files.items():
         assert load_photo_depth(portraits.write(tmp_path / name, data)) is None, name

@@ -76,9 +76,6 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
             inside = np.s_[row * part.height : (row + 1) * part.height, column * part.width : (column + 1) * part.width]
             covered[inside] += 1
             assert free[inside].all()
-        assert part.means(inverse) == pytest.approx(
-            [float(inverse[int(y) : int(y) + 1, int(x) : int(x) + 1].mean()) for x, y in part.centers()], abs=0.02
-        )
     assert (covered == 1).all()
 
     def best(level: int, row: int, column: int) -> float:
@@ -107,9 +104,8 @@ def test_a_cut_covers_every_pixel_once_and_no_other_costs_less(worth: float) -> 
 def test_means_of_tiles_are_those_of_their_pixels() -> None:
     image = torch.rand(9, 11, 2)
     tiles = Tiles(2, 4, torch.tensor([0, 3]), torch.tensor([1, 0]))
-    torch.testing.assert_close(
-        tiles.means(image), torch.stack([image[:2, 4:8].mean((0, 1)), image[6:8, :4].mean((0, 1))])
-    )
+    expected = torch.stack([image[:2, 4:8].mean((0, 1)), image[6:8, :4].mean((0, 1))])
+    torch.testing.assert_close(tiles.means(image), expected)
     assert tiles.centers().tolist() == [[6.0, 1.0], [2.0, 7.0]]
 
 

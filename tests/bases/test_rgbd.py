@@ -28,10 +28,6 @@ from spackle.residual import hole_area_ratio, hole_mask
 CPU = CpuRenderer()
 
 
-def photo_of(scene: Scene) -> Photo:
-    return Photo(scene.rgb, scene.camera.focal[0], "--focal-px", Path("photo.png"))
-
-
 def eroded(mask: Tensor, pixels: int) -> Tensor:
     """A mask without its outermost pixels; the image's border counts as outside."""
     outside = torch.nn.functional.pad((~mask).float()[None, None], [pixels] * 4, value=1.0)
@@ -82,16 +78,14 @@ def test_from_the_photos_eye_the_photo_is_whole(scene: Scene) -> None:
     view = CPU.render(scene.lift(LEVELS).gaussians, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     assert psnr(view.rgb, scene.rgb) > 29
-    error = (view.depth / scene.depth - 1).abs()
-    assert float(error.median()) < 0.01
+    assert float((view.depth / scene.depth - 1).abs().median()) < 0.01
 
 
 @pytest.mark.parametrize("size", [(63, 47), (5, 3), (3, 2), (2, 2), (64, 1), (1, 64), (1, 1)])
 def test_odd_and_tiny_photos_are_lifted(size: tuple[int, int]) -> None:
     scene = wall(4.0, *size)
     assert len(scene.lift(levels=0).gaussians) == size[0] * size[1] + (size[0] // 2) * (size[1] // 2)
-    base = scene.lift(LEVELS).gaussians
-    view = CPU.render(base, scene.camera)
+    view = CPU.render(scene.lift(LEVELS).gaussians, scene.camera)
     assert hole_area_ratio(view.alpha) == 0
     if min(size) > 1:  # else there is no backing
         torch.testing.assert_close(view.depth, scene.depth, rtol=0.01, atol=0)
@@ -139,7 +133,7 @@ def test_filling_of_missing_depth_matches_dijkstra(seed: int) -> None:
 
 def test_the_lens_is_the_calibrations_else_the_photos() -> None:
     scene = wall()
-    photo = photo_of(scene)
+    photo = Photo(scene.rgb, scene.camera.focal[0], "--focal-px", Path("photo.png"))
     assert torch.equal(RgbdBase(scene.depth_map).predict(photo).camera.K, photo.camera.K)
     K = torch.tensor([[70.0, 0.0, 15.0], [0.0, 70.0, 12.5], [0.0, 0.0, 1.0]])
     half = DepthMap(scene.depth[::2, ::2], scene.depth[::2, ::2] > 0, K, None, "disparity", Path("disp.pfm"))
@@ -173,10 +167,9 @@ def test_what_a_box_uncovers_is_a_hole_and_nothing_else(disparity: float, side: 
         x, y = uv.long().unbind(-1)
         return in_frame(scene.camera, points) & box[y.clamp(0, 71), x.clamp(0, 95)]
 
-    at_box, at_wall = cast(camera, near), cast(camera, far)
-    hits_box = looked_up(at_box)
-    uncovered = ~hits_box & looked_up(at_wall)
-    seen = hits_box | (in_frame(scene.camera, at_wall) & ~looked_up(at_wall))
+    at_wall = cast(camera, far)
+    hits_box, hidden = looked_up(cast(camera, near)), looked_up(at_wall)
+    uncovered, seen = ~hits_box & hidden, hits_box | (in_frame(scene.camera, at_wall) & ~hidden)
     alpha = CPU.render(base, camera).alpha
     assert int(eroded(uncovered, 1).sum()) > 20
     assert float(alpha[eroded(uncovered, 1)].quantile(0.98)) < 0.5  # the photo's outline is found to half a pixel
@@ -218,9 +211,7 @@ def test_the_motorcycle_is_reproduced_and_its_occlusions_stay() -> None:
     assert found.notes["depth_filled"] == pytest.approx(0.0735, abs=1e-3)
     assert hole_area_ratio(view.alpha) < 1e-4
     assert psnr(view.rgb, scene.rgb) > 30.5
-    known = scene.depth > 0
-    error = (view.depth / scene.depth - 1).abs()[known]
-    assert float(error.median()) < 0.01
+    assert float((view.depth / scene.depth - 1).abs()[scene.depth > 0].median()) < 0.01
     view = CPU.render(found.gaussians, pair.right)
     hole = hole_mask(view.alpha)
     assert 0.08 < float(hole.float().mean()) < 0.15

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,6 @@ def same(one: SharpOutput, other: SharpOutput) -> bool:
     return torch.equal(one.deltas, other.deltas) and all(torch.equal(a, b) for a, b in pairs)
 
 
-# --- windows at once
-
-
 @pytest.mark.parametrize(("options", "calls"), [({}, 7), ({"windows": 9}, 4), ({"windows": 1}, WINDOWS)])
 def test_so_many_windows_go_at_once_and_change_nothing(options: dict[str, Any], calls: int) -> None:
     seen: list[int] = []
@@ -44,10 +40,7 @@ def test_so_many_windows_go_at_once_and_change_nothing(options: dict[str, Any], 
     torch.testing.assert_close(found.deltas, expected.deltas, rtol=1e-4, atol=1e-4)
 
 
-# --- torch.compile
-
-
-def test_a_compiled_forward_shares_the_weights_of_a_network_that_stays_as_it_is() -> None:
+def test_a_compiled_forward_shares_the_weights_of_its_network() -> None:
     network = micro_network()
     twin = compile_forward(network, backend="eager")
     assert isinstance(twin, SharpNetwork)
@@ -73,33 +66,27 @@ def test_a_translated_forward_says_the_same(backend: str) -> None:
     assert counters["stats"]["unique_graphs"] - before <= 5  # the blocks, of five windows and of one; and three more
 
 
-def test_without_a_compiler_one_line_says_so_and_the_photo_is_done_all_the_same(
+def test_without_a_compiler_a_line_says_so_and_all_goes_on(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def no_compiler(*arguments: object, **options: object) -> Any:
-        raise RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx: (None, 'g++')")
+    error: Exception = RuntimeError("No working C++ compiler found in\n  torch._inductor.config.cpp.cxx")
 
+    def fail(*arguments: object) -> Any:
+        raise error
+
+    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: fail)
     plain, base = SharpBase(micro_network()), SharpBase(micro_network(), compiled=True)
-    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: no_compiler)
     with caplog.at_level(logging.WARNING, "spackle"):
         found = [base.infer(PHOTO), base.infer(PHOTO)]
-    assert len(caplog.records) == 1
-    assert not base.compiled
+    assert (len(caplog.records), base.compiled) == (1, False)
     assert "C++" in base.compile_problem
     expected = plain.infer(PHOTO)
     assert all(same(output, expected) for output in found)
-
-    def short(*arguments: object) -> Any:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
-
+    error = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
     base = SharpBase(micro_network(), compiled=True)  # too little memory is no missing compiler
-    monkeypatch.setattr("spackle.bases.sharp.base.compile_forward", lambda network: short)
     with pytest.raises(spackle.InputError, match="not enough memory for the network: try --sharp windows=1"):
         base.predict(PHOTO)
     assert base.compiled
-
-
-# --- one CUDA graph, on a stand-in for CUDA
 
 
 class RecordingGraph(TorchDispatchMode):
@@ -126,28 +113,21 @@ class NoStream:
     def wait_stream(self, other: object) -> None: ...
 
 
-@pytest.fixture
-def _stand_in_for_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    replacements: dict[str, Callable[..., Any]] = {
-        "CUDAGraph": RecordingGraph,
-        "graph": lambda graph, stream: graph,
-        "Stream": NoStream,
-        "current_stream": NoStream,
-        "stream": contextlib.nullcontext,
-        "device": contextlib.nullcontext,
-    }
-    for name, replacement in replacements.items():
-        monkeypatch.setattr(torch.cuda, name, replacement)
-
-
-@pytest.mark.usefixtures("_stand_in_for_cuda")
-def test_one_graph_says_of_every_photo_what_the_network_says() -> None:
+def test_one_graph_says_of_every_photo_what_the_network_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, stand_in in (
+        ("CUDAGraph", RecordingGraph),
+        ("graph", lambda graph, stream: graph),
+        ("Stream", NoStream),
+        ("current_stream", NoStream),
+        ("stream", contextlib.nullcontext),
+        ("device", contextlib.nullcontext),
+    ):
+        monkeypatch.setattr(torch.cuda, name, stand_in)
     network = micro_network()
     calls: list[int] = []
     network.register_forward_hook(lambda *_: calls.append(1))
-    graphed, seen = GraphedForward(network), []
+    graphed, seen, found = GraphedForward(network), [], []
     pictures = [(waves(MICRO.side), 0.8), (waves(MICRO.side).flip(-1), 1.3)]
-    found = []
     for one, mode in zip(pictures, (torch.inference_mode(), torch.no_grad()), strict=True):
         with mode:
             found.append(graphed(*one, 35, lambda done, total: seen.append((done, total))))

@@ -58,9 +58,6 @@ def gaussians_from(weights: Path) -> Gaussians:
     return SharpBase.load(weights, precision="fp32", device="cpu").predict(photo()).gaussians
 
 
-# The way from the decoder's weights to a picture --------------------------------------------------
-
-
 def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSharp) -> None:
     with torch.no_grad():
         before = base.gaussians(base.network.gaussian_decoder(), base.encode(photo().rgb, CAMERA))
@@ -75,7 +72,7 @@ def test_gaussians_before_metres_are_drawn_as_they_are_in_metres(base: TunableSh
 
 
 @pytest.mark.parametrize("name", ["prediction_head.", "feature_model.texture_head.", "feature_model.decoder."])
-def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
+def test_gradients_to_weights_are_those_of_finite_differences(base: TunableSharp, name: str) -> None:
     """Along the gradient itself, without rendering: its cut-offs are steps, which no gradient sees."""
     decoder = copy.deepcopy(base.network.gaussian_decoder()).let_learn()
     encoded = base.encode(photo().rgb, CAMERA)
@@ -86,8 +83,7 @@ def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(bas
         return torch.stack([(t.double() * torch.randn(t.shape, generator=random)).mean() for t in tensors]).sum()
 
     loss().backward()
-    named = [(key, weight) for key, weight in decoder.named_parameters() if key.startswith(name)]
-    weights = [weight for _, weight in named if weight.requires_grad]
+    weights = [w for key, w in decoder.named_parameters() if key.startswith(name) and w.requires_grad]
     assert all(weight.grad is not None for weight in weights)
     length = float(torch.stack([weight.grad.norm() for weight in weights]).norm())
     found = []
@@ -97,9 +93,6 @@ def test_gradients_from_gaussians_to_weights_are_those_of_finite_differences(bas
                 weight.add_(weight.grad, alpha=step / length)
             found.append(float(loss()))
     assert (found[0] - found[1]) / (2 * NUDGE) == pytest.approx(length, rel=0.005)
-
-
-# A decoder's own file -----------------------------------------------------------------------------
 
 
 def test_a_decoders_file_finds_its_checkpoint(owner: Owner, base: TunableSharp, tmp_path: Path) -> None:

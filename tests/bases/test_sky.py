@@ -15,16 +15,9 @@ from spackle.bases.lift import _flood, push_sky
 from spackle.camera import Camera
 
 
-@dataclasses.dataclass(frozen=True)
-class Outdoors:
-    """A field, a house, a flagpole and a sky, as a network sees them."""
-
-    scene: Scene
-    sky: Tensor  # [H, W] bool
-    pole: Tensor  # [H, W] bool
-
-
-def outdoors(sky_depth: Tensor | float = 80.0, height: int = 96, width: int = 128) -> Outdoors:
+def outdoors(sky_depth: Tensor | float = 80.0) -> tuple[Scene, Tensor, Tensor]:
+    """A field, a house, a flagpole and a sky, as a network sees them; [H, W] where the sky is, and the pole."""
+    height, width = 96, 128
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     inverse = torch.where(y > height // 2, 0.01 * (y - height // 2), 1 / torch.as_tensor(sky_depth))
     blue = torch.tensor([0.35, 0.55, 0.9]) + 0.02 * texture(height, width)
@@ -33,39 +26,39 @@ def outdoors(sky_depth: Tensor | float = 80.0, height: int = 96, width: int = 12
     for thing, inverse_depth, color in ((house, 0.1, (0.5, 0.3, 0.25)), (pole, 0.2, (0.2, 0.2, 0.2))):
         inverse = torch.where(thing, inverse_depth, inverse)
         rgb = torch.where(thing[..., None], torch.tensor(color), rgb)
-    sky_mask = (y <= height // 2) & ~house & ~pole
-    return Outdoors(Scene(rgb.float(), 1 / inverse, Camera.from_focal(100, width, height)), sky_mask, pole)
+    sky = (y <= height // 2) & ~house & ~pole
+    return Scene(rgb.float(), 1 / inverse, Camera.from_focal(100, width, height)), sky, pole
 
 
 def test_the_sky_is_one_plane_behind_everything() -> None:
     """However its predicted depth varies."""
     waves = 80 + 40 * texture(96, 128)[..., 0].sub(0.5).mul(10)
-    found = outdoors(waves)
-    base = found.scene.lift()
+    scene, sky, pole = outdoors(waves)
+    base = scene.lift()
     z = base.gaussians.means[: 96 * 128, 2].reshape(96, 128)
-    assert base.notes["sky"] == pytest.approx(float(found.sky.float().mean()), abs=0.01)
-    assert float(z[found.sky].max() / z[found.sky].min()) < 1 + 1e-5
-    assert float(z[~found.sky].max()) < float(z[found.sky].min())
-    torch.testing.assert_close(z[:61][found.pole[:61]], torch.full((2 * 50,), 5.0))
-    torch.testing.assert_close(z[found.pole], torch.full((2 * 69,), 5.0), rtol=0.02, atol=0)  # by the field as near
+    assert base.notes["sky"] == pytest.approx(float(sky.float().mean()), abs=0.01)
+    assert float(z[sky].max() / z[sky].min()) < 1 + 1e-5
+    assert float(z[~sky].max()) < float(z[sky].min())
+    torch.testing.assert_close(z[:61][pole[:61]], torch.full((2 * 50,), 5.0))
+    torch.testing.assert_close(z[pole], torch.full((2 * 69,), 5.0), rtol=0.02, atol=0)  # by the field as near
 
 
 def test_a_sky_without_depth_is_far_and_not_as_near_as_the_roofs() -> None:
-    found = outdoors()
-    unknown = dataclasses.replace(found.scene, depth=torch.where(found.sky, 0.0, found.scene.depth)).lift()
+    scene, sky, _ = outdoors()
+    unknown = dataclasses.replace(scene, depth=torch.where(sky, 0.0, scene.depth)).lift()
     z = unknown.gaussians.means[: 96 * 128, 2].reshape(96, 128)
-    assert float(z[found.sky].min()) > 100
+    assert float(z[sky].min()) > 100
     assert unknown.notes["depth_filled"] == 0
-    near = dataclasses.replace(found.scene, depth=torch.where(found.sky, 0.0, 0.1 * found.scene.depth))
+    near = dataclasses.replace(scene, depth=torch.where(sky, 0.0, 0.1 * scene.depth))
     assert "sky" not in near.lift().notes  # a model on a table, or a room: what is unknown there is filled
 
 
 def test_a_sky_that_melts_into_the_sea_is_left_alone() -> None:
     """Pushed with the far part of the sea it would tear the sea apart."""
-    found = outdoors()
-    sea = torch.where((torch.arange(96)[:, None] > 48)[..., None], found.scene.rgb[0, 0], found.scene.rgb)
-    assert "sky" in found.scene.lift().notes
-    assert "sky" not in dataclasses.replace(found.scene, rgb=sea).lift().notes
+    scene, _, _ = outdoors()
+    sea = torch.where((torch.arange(96)[:, None] > 48)[..., None], scene.rgb[0, 0], scene.rgb)
+    assert "sky" in scene.lift().notes
+    assert "sky" not in dataclasses.replace(scene, rgb=sea).lift().notes
 
 
 def test_a_floor_that_runs_to_the_horizon_is_no_sky() -> None:
@@ -78,11 +71,11 @@ def test_a_floor_that_runs_to_the_horizon_is_no_sky() -> None:
 
 
 def test_specks_in_the_sky_belong_to_it_and_a_lake_does_not() -> None:
-    found = outdoors()
-    rgb = found.scene.rgb.clone()
+    scene, _, _ = outdoors()
+    rgb = scene.rgb.clone()
     rgb[20, 60:62] = 0.1  # birds, which the depth does not know
     rgb[70:90, 60:80] = torch.tensor([0.35, 0.55, 0.9])
-    inverse, _, _ = push_sky(1 / found.scene.depth, rgb, torch.ones(96, 128, dtype=torch.bool))
+    inverse, _, _ = push_sky(1 / scene.depth, rgb, torch.ones(96, 128, dtype=torch.bool))
     far = inverse == inverse.min()
     assert bool(far[20, 60:62].all())
     assert not bool(far[49:].any())

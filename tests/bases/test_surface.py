@@ -104,21 +104,17 @@ def test_a_flying_pixel_joins_the_nearer_side(hanging: float, side: float, turne
     assert torch.equal(found, clean.T if turned else clean)
 
 
-def test_clean_edges_thin_things_borders_and_flat_walls_do_not_fly() -> None:
+def test_clean_edges_thin_things_borders_and_planes_do_not_fly() -> None:
     """A pixel at the border has no neighbour on one side, so it cannot lie between two."""
+    for axis in (0, 1):  # near the horizon each row of a floor is much farther than the one below it
+        inverse = 1 / slanted_plane(1.5, 1000, axis, width=40, height=30).depth
+        torch.testing.assert_close(attach_flying_pixels(inverse), inverse, rtol=1e-5, atol=0)
     rows = [[1.0, 1.0, 0.2, 0.2], [0.2, 0.2, 1.0, 0.2, 0.2], [1.0, 1.0, 0.2, 1.0, 1.0], [0.5] * 4, [0.5]]
     rows += [[1.0, 0.2, 0.2, 0.2], [0.2, 1.0, 1.0, 1.0]]
     for row in [*rows, *(row[::-1] for row in rows)]:
         image = torch.tensor(row).expand(4, len(row))
         assert torch.equal(attach_flying_pixels(image), image)
         assert torch.equal(attach_flying_pixels(image.T), image.T)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_no_pixel_of_a_plane_flies_however_slanted(axis: int) -> None:
-    """Near the horizon each row of a floor is much farther than the one below it, and yet one surface."""
-    inverse = 1 / slanted_plane(1.5, 1000, axis, width=40, height=30).depth
-    torch.testing.assert_close(attach_flying_pixels(inverse), inverse, rtol=1e-5, atol=0)
 
 
 @PROPERTY

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from command import Run, refuses, report_of, run
 from evaluation_data import write_boxes
 from photos import write_depth, write_photo
@@ -47,11 +48,10 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return asked
 
 
-@pytest.fixture(scope="module")
-def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("middlebury")
-    write_boxes(root / "Ball", 0)
-    return root
+@pytest.fixture
+def stereo(tmp_path: Path) -> Path:
+    write_boxes(tmp_path / "middlebury" / "Ball", 0)
+    return tmp_path / "middlebury"
 
 
 def build(tmp_path: Path, *words: object) -> Run:
@@ -59,6 +59,10 @@ def build(tmp_path: Path, *words: object) -> Run:
     write_photo(tmp_path / "photos" / "a.png")
     options = ("--views", 2, "--inpainter", "none", "--threads", 1, "-o", tmp_path / "out")
     return run("dataset", "build", "--photos", tmp_path / "photos", *options, *words)
+
+
+def succeeds(result: Run) -> None:
+    assert result.code == 0, result.err
 
 
 def sha256(path: Path) -> str:
@@ -69,36 +73,31 @@ def test_a_dataset_of_lite_and_of_a_model(tmp_path: Path, shipped: Path, hub: li
     model = write_model(tmp_path / "models" / "small")
     digests = {name: sha256(model / name) for name in ("config.json", "model.safetensors")}
     for base, name, weights in (("lite", "lite", sha256(shipped)), (f"hf:{model}", "hf:small", digests)):
-        result = build(tmp_path / name, "--base", base)
-        assert result.code == 0, result.err
+        succeeds(build(tmp_path / name, "--base", base))
         manifest = load_manifest(tmp_path / name / "out")
-        assert manifest.complete
-        assert len(manifest.samples) == 1
+        assert (manifest.complete, len(manifest.samples)) == (True, 1)
         said = manifest.config["base"]
         assert (said["name"], said["weights"]) == (name, weights)
         assert str(tmp_path) not in (tmp_path / name / "out" / "manifest.json").read_text()
     assert [asked["model"] for asked in hub] == [str(model)]
 
 
-def test_a_dataset_skips_bad_photos_and_stops_without_memory(
-    tmp_path: Path, hub: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    work = StandIn.predict
+@pytest.mark.usefixtures("hub")
+def test_a_dataset_skips_bad_photos_and_stops_without_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    work, short = StandIn.predict, True
 
     def picky(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
+        if short:
+            raise MemoryShort("not enough memory")
         if photo.path.name == "b.png":
             raise InputError(f"{photo.path}: the model predicts 0 for every pixel")
         return work(self, photo, progress)
 
-    def hungry(self: StandIn, photo: Photo, progress: Progress | None = None) -> BasePrediction:
-        raise MemoryShort("not enough memory")
-
     write_photo(tmp_path / "photos" / "b.png", 80, 60)
-    monkeypatch.setattr(StandIn, "predict", hungry)
-    refuses(build(tmp_path, "--base", "hf:me/small"), "not enough memory")
     monkeypatch.setattr(StandIn, "predict", picky)
-    result = build(tmp_path, "--base", "hf:me/small")
-    assert result.code == 0, result.err
+    refuses(build(tmp_path, "--base", "hf:me/small"), "not enough memory")
+    short = False
+    succeeds(result := build(tmp_path, "--base", "hf:me/small"))
     assert "b.png: the model predicts 0 for every pixel" in result.err
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["a.png"]
 
@@ -106,16 +105,15 @@ def test_a_dataset_skips_bad_photos_and_stops_without_memory(
 def test_an_evaluation_of_lite_and_of_a_model(
     tmp_path: Path, stereo: Path, shipped: Path, hub: list[dict[str, Any]]
 ) -> None:
-    for base, title, weights in (("lite", "lite", sha256(shipped)), ("hf:me/small", "hf:me/small", None)):
-        folder = tmp_path / title
-        words = ("--methods", "base", "--metrics", "none", "--disparity", "0.3", "-o", folder / "out")
-        root = ("--dataset", "middlebury", "--root", stereo)
-        result = run("evaluate", *root, *words, "--base", base, "--precision", "fp32")
-        assert result.code == 0, result.err
-        said = json.loads((folder / "out" / "config.json").read_text())["base"]
-        assert (said["name"], said["title"], said["weights"]) == (title, title, weights)
+    for base, weights in (("lite", sha256(shipped)), ("hf:me/small", None)):
+        out = tmp_path / base
+        root = ("--dataset", "middlebury", "--root", stereo, "-o", out, "--precision", "fp32")
+        words = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
+        succeeds(run("evaluate", *root, *words, "--base", base))
+        said = json.loads((out / "config.json").read_text())["base"]
+        assert (said["name"], said["title"], said["weights"]) == (base, base, weights)
         assert "not SHARP, so not the paper's base" in said["says"]
-        assert f"| {title} alone |" in (folder / "out" / "tables.md").read_text()
+        assert f"| {base} alone |" in (out / "tables.md").read_text()
     assert hub == [{"model": "me/small", "precision": "fp32", "device": None}]
 
 
@@ -134,7 +132,6 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: P
 
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
-    """A folder with a photo and another."""
     for name in ("a.png", "b.png"):
         write_photo(tmp_path / "photos" / name)
     return tmp_path / "photos"
@@ -154,8 +151,7 @@ def test_a_folder_is_done_again_when_weights_come_or_go(
 
     def again(*options: object) -> tuple[str, list[str]]:
         """The base of what is made now, and the warnings that it is rougher."""
-        result = predict(tmp_path, "-i", photos, *options)
-        assert result.code == 0, result.err
+        succeeds(result := predict(tmp_path, "-i", photos, *options))
         name: str = report_of(tmp_path / "out" / "a")["base"]["name"]
         warned = [line for line in result.lines if "was made by sharp" in line]
         return "done already" if "done already" in result.err else name, warned
@@ -200,14 +196,12 @@ def test_disparity_of_the_person_then_of_the_base(tmp_path: Path) -> None:
         assert PlyFile(tmp_path / "out" / "photo" / "scene.ply").disparity() == far
         assert [row["view"] for row in report["hole_area_ratio"]] == [f"-{far:g}", f"+{far:g}"]
     scene = spackle.predict(photo, network=None, fill="none")
-    assert (scene.disparity, scene.path()[20].position.tolist()) == (
-        0.15,
-        scene.path(disparity=0.15)[20].position.tolist(),
-    )
+    assert scene.disparity == 0.15
+    assert torch.equal(scene.path()[20].position, scene.path(disparity=0.15)[20].position)
+    succeeds(predict(tmp_path, "-i", photo))
     files = [tmp_path / f"{name}.mp4" for name in ("as it is", "said")]
-    assert predict(tmp_path, "-i", photo).code == 0
     for file, options in zip(files, ((), ("--disparity", 0.15)), strict=True):
-        assert run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options).code == 0
+        succeeds(run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options))
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
