@@ -57,7 +57,6 @@ def shows_plane(scene: Scene, camera: Camera) -> Tensor:
 def test_pixels_come_first_then_mixed_ones_then_the_backing() -> None:
     scene = box_before_wall(width=94, height=70)  # the box's border runs through the cells
     base, pixels = scene.lift(levels=0).gaussians, scene.depth.numel()
-    assert pixels * 6 // 5 < len(base) <= pixels * 3 // 2
     front, others = base.select(slice(0, pixels)), base.select(slice(pixels, None))
     uv, z = scene.camera.project(front.means)
     torch.testing.assert_close(uv, scene.camera.pixel_centers().reshape(-1, 2), rtol=0, atol=1e-3)
@@ -69,8 +68,7 @@ def test_pixels_come_first_then_mixed_ones_then_the_backing() -> None:
     farthest = max_pool2d(scene.depth[None, None], 2, stride=1)[0, 0][y - 1, x - 1]  # of the four pixels around
     assert bool((z[backing] / farthest < 1.01).all())
     assert bool((z[backing] > farthest).all())
-    bluish = others.colors[:, 2] > others.colors[:, 0]
-    assert torch.equal(bluish, z > 4)
+    assert torch.equal(others.colors[:, 2] > others.colors[:, 0], z > 4)  # the wall is bluish
 
 
 @pytest.mark.parametrize("scene", [wall(), box_before_wall(), slanted_plane(1.5, 6, 0), slanted_plane(1.5, 6, 1)])
