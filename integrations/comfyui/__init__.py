@@ -38,7 +38,7 @@ class LoadBase:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`checkpoint` is a file of SHARP's or lite's weights; empty takes what `spackle weights get` brought."""
+        """`checkpoint` is a file of the base's weights; empty takes what `spackle weights get` brought."""
         names = [AUTO, *AUTO_NETWORKS]
         return {"required": {"name": (names,)}, "optional": {"checkpoint": ("STRING", {"default": ""})}}
 

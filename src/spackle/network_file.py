@@ -13,7 +13,8 @@ import pickle
 import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import torch
@@ -132,12 +133,30 @@ def read_tensors(path: str | os.PathLike[str], advice: str) -> dict[str, Tensor]
     Raises:
         InputError: a missing or broken file, or one of another kind.
     """
-    check_file(path, "weight file")
-    with reading(path, f"not a file of weights, or damaged ({{reason}}): {advice}"), enough_memory():
+    with _reading_weights(path, advice):
         tensors = _read(path)
         if not tensors:
             raise ValueError("it holds no named tensors")
     return tensors
+
+
+def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tuple[object, dict[str, Tensor]]:
+    """A value in the dict that `torch.save` wrote, such as a network's settings, and all its tensors by their path.
+
+    The value is a stranger's: plain numbers, words, lists and dicts, or inert stand-ins. InputError as `read_tensors`.
+    """
+    with _reading_weights(path, advice):
+        root = _read_archive(path)
+        if not isinstance(root, dict) or name not in root:
+            raise ValueError(f"it holds no {name}")
+        return root[name], _tensors(root)
+
+
+@contextmanager
+def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None]:
+    check_file(path, "weight file")
+    with reading(path, f"not a file of weights, or damaged ({{reason}}): {advice}"), enough_memory():
+        yield
 
 
 def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
@@ -145,7 +164,7 @@ def _read(path: str | os.PathLike[str]) -> dict[str, Tensor]:
     with open(path, "rb") as file:
         head = file.read(9)
     if head.startswith(b"PK\x03\x04"):
-        return _read_archive(path)
+        return _tensors(_read_archive(path))
     if head[8:] == b"{":
         with safe_open(path, framework="pt") as opened:
             return {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118  # it is no dict
@@ -168,7 +187,8 @@ def _is_plain(value: object) -> bool:
     return not value.is_nested and value.layout == torch.strided and value.device.type == "cpu"
 
 
-def _read_archive(path: str | os.PathLike[str]) -> dict[str, Tensor]:
+def _read_archive(path: str | os.PathLike[str]) -> object:
+    """What was saved."""
     with zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if name.count("/") == 1 and name.endswith("/data.pkl")]
         if len(names) != 1:
@@ -181,7 +201,7 @@ def _read_archive(path: str | os.PathLike[str]) -> dict[str, Tensor]:
         summed = any(record.CRC for record in archive.infolist())  # torch.save can be told to leave the sums out
         if summed and (damaged := archive.testzip()) is not None:
             raise ValueError(f"damaged at {damaged}")
-        return _tensors(_Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load())
+        return _Unpickler(archive.read(names[0]), archive, path, f"{root}data/").load()
 
 
 class _StandIn:

@@ -23,6 +23,7 @@ from spackle.bases import BasePrediction, Progress
 from spackle.bases.depth_map import DepthMap, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lite import LiteBase
+from spackle.bases.moge.base import MogeBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import KINDS, BaseSettings
@@ -31,9 +32,10 @@ from spackle.bases.sharp.encoder import TINY
 from spackle.errors import InputError
 from spackle.image import Photo, load_photo
 from spackle.pipeline import FillOptions
+from spackle.weights import PUBLISHED
 
 pytestmark = pytest.mark.usefixtures("shipped")
-NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no Depth Anything here"
+NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe here, no Depth Anything here"
 
 
 @pytest.fixture
@@ -84,7 +86,7 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
     sharp.unlink()
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get depth` (99.2 MB, Apache-2.0)" in choice.note
+    assert "--depth FILE, `spackle weights get moge` (140.6 MB, MIT)" in choice.note
     prediction, choice = pick(portrait)
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
@@ -94,6 +96,16 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
     given, choice = pick(portrait, depth=write_depth(tmp_path / "depth.npy"))
     assert (choice.base, choice.why, choice.note) == ("rgbd", "--depth", "")
     assert float(given.gaussians.means[0, 2]) == pytest.approx(metres()[0, 0], rel=1e-5)
+
+
+def test_auto_takes_moge_before_depth_anything(tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, base in (("depth", HfBase), ("moge", MogeBase)):
+        monkeypatch.setattr(base, "load", lambda path, name=name, **options: StandIn(name))
+        file = tmp_path / "weights" / PUBLISHED[name].file
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"weights")
+        assert pick(photo)[1].base == name
+    assert pick(photo)[1].why == f"{NO_DEPTH}, no SHARP weights here"
 
 
 def test_weights_and_options_that_a_person_gave_reach_sharp(
@@ -209,7 +221,9 @@ def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path, monk
     sharp.write_bytes(content[::-1])
     said, log, base = "SHA-256 is not the published one", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no Depth Anything here"] * 2
+    assert [choice.why for choice in choices] == [
+        f"{NO_DEPTH}, SHARP cannot be used, no MoGe here, no Depth Anything here"
+    ] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):

@@ -26,7 +26,7 @@ from spackle.errors import InputError
 from spackle.formats import PlyFile
 from spackle.image import Photo
 
-NO_DEPTH, NO_MODEL = "no depth in the photo", "no Depth Anything here"
+NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe here, no Depth Anything here"
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +126,9 @@ def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: P
         run("bench", *root),
     ):
         refuses(result, "--base auto: results must say what they are of")
-    refuses(build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, depth, lite, hf:NAME_OR_FOLDER need none")
+    refuses(
+        build(tmp_path, "--base", "rgbd"), "give --depth FOLDER; sharp, moge, depth, lite, hf:NAME_OR_FOLDER need none"
+    )
     assert not (tmp_path / "out").exists()
 
 

@@ -1,8 +1,8 @@
 """The one path from a base's settings to a photo's Gaussians.
 
-`auto` tries the depth in the photo's file, then SHARP and Depth Anything if their weights are installed, then lite. It
-falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from the depth
-map's calibration, else from the photo's file, else it is the default.
+`auto` tries the depth in the photo's file, then SHARP, MoGe and Depth Anything if their weights are installed, then
+lite. It falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from
+the depth map's calibration, else from the photo's file, else from a network that sees the lens, else it is the default.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from spackle.bases.depth_map import DepthMap, find_depth, load_depth
 from spackle.bases.hf import HfBase
 from spackle.bases.lift import RgbdBase
 from spackle.bases.lite import LiteBase
+from spackle.bases.moge.base import MogeBase
 from spackle.bases.photo_depth.layouts import load_photo_depth
 from spackle.bases.settings import AUTO, HF, NETWORKS, RGBD, ROUGH, BaseSettings, Depth
 from spackle.bases.sharp.base import SharpBase
@@ -34,6 +35,7 @@ Stage = Callable[[str], AbstractContextManager[Progress]]
 ORDER = {  # of `auto`: what a candidate is called in reports and the log, and the reason to go on where there is none
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
+    "moge": ("MoGe", "no MoGe here"),
     "depth": ("Depth Anything", "no Depth Anything here"),
     "lite": ("lite", ""),
 }
@@ -76,6 +78,8 @@ def _load_network(name: str, settings: BaseSettings) -> Base | None:
     if (file := settings.files.get(name)) is None:
         return None
     check_undamaged(file)
+    if name == "moge":
+        return MogeBase.load(file, device=device, precision=precision)
     if name == "depth":
         return HfBase.load(str(file.parent), device=device, precision=precision, name=name)
     windows, compiled = settings.windows, settings.compiled

@@ -17,12 +17,13 @@ from spackle.weights import PUBLISHED, installed, published_as
 
 AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # a folder, or owner/name of the hub, follows
-AUTO_NETWORKS = ("sharp", "depth", "lite")  # in the order that `auto` tries them
+AUTO_NETWORKS = ("sharp", "moge", "depth", "lite")  # in the order that `auto` tries them
 NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
 NOT_SHARP = "lifted; not SHARP, so not the paper's base"
 KINDS = {  # the description below tables, and the options that only some bases take
     RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib")),
     "sharp": ("Apple's network, from the photo alone", ("-c", "--precision", "--sharp")),
+    "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
     "depth": (f"Depth-Anything-V2-Small, from the photo alone, {NOT_SHARP}", ("--precision",)),
     "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
     "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
@@ -37,9 +38,10 @@ def _download(name: str) -> str:
     return f"`spackle weights get {name}` ({decimal(PUBLISHED[name].bytes)}, {PUBLISHED[name].licence})"
 
 
-ROUGH = f"rough geometry; for better: --depth FILE, {_download('depth')}, or {_download('sharp')}"
+ROUGH = f"rough geometry; for better: --depth FILE, {_download('moge')}, or {_download('sharp')}"
 MISSING = {  # what to do without the weights of a base
     "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
+    "moge": f"no weights of MoGe on this machine: {_download('moge')} downloads them, -c FILE takes a local copy",
     "depth": f"not on this machine: {_download('depth')} downloads it",
 }
 
@@ -59,7 +61,7 @@ class BaseSettings:
     name: str = AUTO  # or one of `KINDS`, or `hf:…`
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
-    checkpoint: Path | None = None  # weights of SHARP or of lite
+    checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
     windows: int | None = None  # that SHARP computes at once; 1 takes the least memory
     compiled: bool = False

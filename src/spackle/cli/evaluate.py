@@ -34,7 +34,7 @@ Folder = Annotated[
     Path | None, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.", show_default=False)
 ]
 Root = Annotated[Path | None, typer.Option("--root", hidden=True)]  # as the folder was given once
-BaseName = Annotated[str, typer.Option(help="sharp, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
+BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
     str | None,

@@ -32,7 +32,7 @@ JsonOption = Annotated[
 ]
 VerboseOption = Annotated[bool, typer.Option("-v", "--verbose", help="Say how long each stage takes.")]
 CheckpointOption = Annotated[
-    Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), or of lite.")
+    Path | None, typer.Option("-c", "--checkpoint", metavar="FILE", help="Weights of sharp (or auto), moge or lite.")
 ]
 SharpOption = Annotated[
     list[str] | None,

@@ -24,7 +24,7 @@ weights = typer.Typer(help="Weights that others publish: fetch them, list them."
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[str, typer.Argument(help="Which weights: sharp, depth, lama or features.")],
+    name: Annotated[str, typer.Argument(help="Which weights: sharp, moge, depth, lama or features.")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),

@@ -1,0 +1,294 @@
+"""MoGe-2 (Wang et al. 2025, arXiv 2507.02546): a DINOv2 backbone, a pyramid of features, and a pyramid for each output.
+
+Modules are named as in the checkpoint, whose `model_config` gives the sizes. What no published checkpoint uses (other
+norms, activations and resamplers, registers, ViT-g) is refused.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import os
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import torch
+from pydantic import BaseModel, Field, ValidationError, model_validator
+from torch import Tensor, nn
+from torch.nn.functional import gelu, interpolate, scaled_dot_product_attention
+
+from spackle.errors import InputError, one_line, shown
+from spackle.network_file import channels_last, load_strict, read_checkpoint
+
+ADVICE = "give MoGe-2's model.pt as it was downloaded"
+BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
+PATCH = 14  # pixels of a token's side
+GRID = 37  # tokens of a side that the positions were learned on
+NORM_EPS = 1e-6
+LEVELS = 5  # of a pyramid, each twice as fine as the one before
+FINEST = 2 ** (LEVELS - 1)  # pixels of an output for each token's side
+conv3 = functools.partial(nn.Conv2d, kernel_size=3, padding=1, padding_mode="replicate")
+
+Count = Annotated[int, Field(ge=0, le=64)]
+Width = Annotated[int, Field(ge=1, le=8192)]
+PerLevel = Field(min_length=LEVELS, max_length=LEVELS)
+ScaleDims = Annotated[list[Width], Field(min_length=4, max_length=4)]
+
+
+class EncoderConfig(BaseModel, strict=True):
+    backbone: Literal["dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14"]
+    intermediate_layers: Annotated[list[Count], Field(min_length=1, max_length=40)]  # blocks whose tokens are used
+    dim_out: Width
+
+
+class PyramidConfig(BaseModel, strict=True, extra="forbid"):
+    """The neck or a head: channels and numbers of each level, coarse to fine."""
+
+    dim_in: Annotated[list[Width], PerLevel]
+    dim_out: Annotated[list[Width | None], PerLevel] | None  # None: a level gives its features as they are
+    dim_res_blocks: Annotated[list[Width], PerLevel]
+    num_res_blocks: Annotated[list[Count], PerLevel]
+    dim_times_res_block_hidden: Literal[1] = 1
+    res_block_in_norm: Literal["none"]
+    res_block_hidden_norm: Literal["none"]
+    activation: Literal["relu"] = "relu"
+    resamplers: Annotated[list[Literal["conv_transpose", "bilinear"]], Field(min_length=4, max_length=4)]
+
+    @property
+    def outputs(self) -> list[int]:
+        """Channels that come out of each level."""
+        return [out or width for out, width in zip(self.dim_out or [None] * LEVELS, self.dim_res_blocks, strict=True)]
+
+
+class MogeConfig(BaseModel, strict=True):
+    """The checkpoint's `model_config`; other keys do not count."""
+
+    encoder: EncoderConfig
+    neck: PyramidConfig
+    points_head: PyramidConfig
+    mask_head: PyramidConfig
+    normal_head: PyramidConfig | None = None
+    scale_head: Annotated[dict[Literal["dims"], ScaleDims], Field(min_length=1)]
+    remap_output: Literal["exp", "sinh_exp"]
+    num_tokens_range: Annotated[list[Width], Field(min_length=2, max_length=2)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> MogeConfig:
+        width, depth, _ = BACKBONES[self.encoder.backbone]
+        heads = [(self.points_head, 3), (self.mask_head, 1)] + ([(self.normal_head, 3)] if self.normal_head else [])
+        fits = max(self.encoder.intermediate_layers) < depth
+        fits &= self.neck.dim_in == [self.encoder.dim_out + 2] + [2] * (LEVELS - 1)
+        fits &= all(head.dim_in == self.neck.outputs and head.outputs[-1] == channels for head, channels in heads)
+        if not fits or (self.scale_head["dims"][0], self.scale_head["dims"][-1]) != (width, 1):
+            raise ValueError("one part gives other channels than the next takes")
+        return self
+
+
+@dataclasses.dataclass(frozen=True)
+class MogeOutput:
+    """What the network says of a photo, on a grid [h, w] over it; float32."""
+
+    points: Tensor  # [h, w, 3] x right, y down, z forward, up to the metric scale and a shift along z
+    mask_logits: Tensor  # [h, w] above 0: there is a surface, and not the sky
+    metric_scale: Tensor  # [] metres for each unit of the points
+
+
+class DinoBlock(nn.Module):
+    """Self-attention, then a perceptron, scaled by channel and added to the tokens [B, T, C] in float32."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1, self.norm2 = (nn.LayerNorm(width, eps=NORM_EPS) for _ in range(2))
+        self.attn = nn.ModuleDict({"qkv": nn.Linear(width, 3 * width), "proj": nn.Linear(width, width)})
+        self.mlp = nn.ModuleDict({"fc1": nn.Linear(width, 4 * width), "fc2": nn.Linear(4 * width, width)})
+        self.ls1, self.ls2 = (nn.ParameterDict({"gamma": torch.ones(width)}) for _ in range(2))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        dtype = self.attn["proj"].weight.dtype
+        qkv = self.attn["qkv"](self.norm1(tokens).to(dtype))
+        query, key, value = qkv.unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        attended = scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
+        tokens = tokens + self.attn["proj"](attended) * self.ls1["gamma"]
+        out: Tensor = tokens + self.mlp["fc2"](gelu(self.mlp["fc1"](self.norm2(tokens).to(dtype)))) * self.ls2["gamma"]
+        return out
+
+
+class DinoBackbone(nn.Module):
+    """DINOv2 (Oquab et al. 2023) without registers."""
+
+    def __init__(self, width: int, depth: int, heads: int) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + GRID**2, width))
+        self.mask_token = nn.Parameter(torch.zeros(1, width))  # of training alone
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, width, PATCH, stride=PATCH)})
+        self.blocks = nn.ModuleList(DinoBlock(width, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(width, eps=NORM_EPS)
+
+    def forward(self, image: Tensor, layers: Sequence[int]) -> list[Tensor]:
+        """Normalised tokens [1, 1 + T, C] after some blocks, the class token first, of an image [1, 3, 14·h, 14·w]."""
+        patches, positions = self.patch_embed["proj"](image), self.pos_embed
+        rows, columns = patches.shape[2:]
+        if (rows, columns) != (GRID, GRID):
+            # DINOv2 resizes by a factor of (n + 0.1) / 37, by which positions are a little off the grid's.
+            factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
+            grid = positions[:, 1:].reshape(1, GRID, GRID, -1).permute(0, 3, 1, 2)
+            grid = interpolate(grid, scale_factor=factors, mode="bicubic", align_corners=False)
+            positions = torch.cat([positions[:, :1], grid.flatten(2).transpose(1, 2)], dim=1)  # type: ignore[assignment]
+        tokens = torch.cat([self.cls_token, patches.flatten(2).transpose(1, 2)], dim=1) + positions
+        after = []
+        for block in self.blocks:
+            tokens = block(tokens)
+            after.append(tokens)
+        return [self.norm(after[layer]) for layer in layers]
+
+
+class DinoEncoder(nn.Module):
+    """An image to features [1, C, h, w] and the class token [1, C']."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        width, depth, heads = BACKBONES[config.backbone]
+        self.layers = config.intermediate_layers
+        self.register_buffer("image_mean", torch.zeros(1, 3, 1, 1))
+        self.register_buffer("image_std", torch.ones(1, 3, 1, 1))
+        self.backbone = DinoBackbone(width, depth, heads)
+        self.output_projections = nn.ModuleList(nn.Conv2d(width, config.dim_out, 1) for _ in self.layers)
+
+    def forward(self, image: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+        size = (PATCH * rows, PATCH * columns)
+        seen = interpolate(image, size=size, mode="bilinear", align_corners=False, antialias=True)
+        tokens = self.backbone((seen - self.get_buffer("image_mean")) / self.get_buffer("image_std"), self.layers)
+        maps = [each[:, 1:].transpose(1, 2).unflatten(2, (rows, columns)) for each in tokens]
+        features = [project(each) for project, each in zip(self.output_projections, maps, strict=True)]
+        return torch.stack(features).sum(0), tokens[-1][:, 0]
+
+
+class ConvBlock(nn.Module):
+    """Two convolutions, added to what comes in [1, C, h, w] in float32."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        first, second = conv3(width, width), conv3(width, width)
+        self.layers = nn.Sequential(nn.Identity(), nn.ReLU(), first, nn.Identity(), nn.ReLU(), second)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = x + self.layers(x.to(next(self.parameters()).dtype))
+        return out
+
+
+def resampler(kind: str, inputs: int, outputs: int) -> nn.Sequential:
+    """Doubles the size."""
+    if kind == "conv_transpose":
+        return nn.Sequential(nn.ConvTranspose2d(inputs, outputs, 2, stride=2), conv3(outputs, outputs))
+    return nn.Sequential(nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False), conv3(inputs, outputs))
+
+
+class Pyramid(nn.Module):
+    """Features from coarse to fine: each level adds its input to what the level before hands on."""
+
+    def __init__(self, config: PyramidConfig) -> None:
+        super().__init__()
+        widths, outs = config.dim_res_blocks, config.dim_out or [None] * LEVELS
+        self.input_blocks = nn.ModuleList(map(functools.partial(nn.Conv2d, kernel_size=1), config.dim_in, widths))
+        self.res_blocks = nn.ModuleList(
+            nn.Sequential(*(ConvBlock(width) for _ in range(count)))
+            for width, count in zip(widths, config.num_res_blocks, strict=True)
+        )
+        self.output_blocks = nn.ModuleList(
+            nn.Identity() if out is None else nn.Conv2d(width, out, 1) for width, out in zip(widths, outs, strict=True)
+        )
+        self.resamplers = nn.ModuleList(map(resampler, config.resamplers, widths[:-1], widths[1:]))
+
+    def forward(self, inputs: Sequence[Tensor]) -> list[Tensor]:
+        """The outputs of all levels [1, C, 2^l·h, 2^l·w] from an input of the same size for each."""
+        outputs: list[Tensor] = []
+        carried: Tensor | None = None
+        for level, x in enumerate(inputs):
+            x = self.input_blocks[level](x)
+            carried = self.res_blocks[level](x if carried is None else x + self.resamplers[level - 1](carried))
+            outputs.append(self.output_blocks[level](carried))
+        return outputs
+
+
+class MogeNetwork(nn.Module):
+    """A photo to points, mask and metric scale."""
+
+    def __init__(self, config: MogeConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = DinoEncoder(config.encoder)
+        self.neck = Pyramid(config.neck)
+        self.points_head, self.mask_head = Pyramid(config.points_head), Pyramid(config.mask_head)
+        self.normal_head = config.normal_head and Pyramid(config.normal_head)  # not run: a lifted photo needs none
+        first, second, third = map(nn.Linear, config.scale_head["dims"][:-1], config.scale_head["dims"][1:])
+        self.scale_head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), third)
+
+    def forward(self, image: Tensor, tokens: int, size: tuple[int, int]) -> MogeOutput:
+        """Maps of the given size from an image [1, 3, H, W], sRGB in 0..1, that is seen as about so many tokens."""
+        levels, scale = self.features(image, tokens)
+        x, y, z = self.decode(self.points_head, levels, size).unbind(-1)
+        z = z.exp()
+        x, y = (x * z, y * z) if self.config.remap_output == "exp" else (x.sinh(), y.sinh())
+        mask_logits = self.decode(self.mask_head, levels, size)[..., 0]
+        return MogeOutput(torch.stack([x, y, z], dim=-1), mask_logits, scale)
+
+    def features(self, image: Tensor, tokens: int) -> tuple[list[Tensor], Tensor]:
+        """The neck's features [1, C, 2^l·h, 2^l·w] of all levels, and the metric scale []."""
+        height, width = image.shape[2:]
+        rows, columns = token_grid(height, width, tokens)
+        features, class_token = self.encoder(image, rows, columns)
+        planes = [view_plane(rows << level, columns << level, width / height).to(image) for level in range(LEVELS)]
+        inputs = [torch.cat([features, planes[0]], dim=1), *planes[1:]]
+        return self.neck(inputs), self.scale_head(class_token)[0, 0].exp()
+
+    @staticmethod
+    def decode(head: Pyramid, levels: Sequence[Tensor], size: tuple[int, int]) -> Tensor:
+        """[h, w, C] of the size (h, w): a head's finest output, resized."""
+        return interpolate(head(levels)[-1], size=size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0)
+
+
+def token_grid(height: int, width: int, tokens: int) -> tuple[int, int]:
+    """(rows, columns) of about so many tokens over a photo."""
+    return max(1, round(math.sqrt(tokens / (width / height)))), max(1, round(math.sqrt(tokens * (width / height))))
+
+
+def view_plane(rows: int, columns: int, aspect: float) -> Tensor:
+    """[1, 2, rows, columns]: x and y of each cell's centre from the photo's, in halves of its diagonal."""
+    x, y = (((2 * torch.arange(n, dtype=torch.float64) + 1) / n - 1) for n in (columns, rows))
+    diagonal = math.hypot(1, aspect)
+    grid = torch.meshgrid(x * (aspect / diagonal), y / diagonal, indexing="xy")
+    return torch.stack(grid)[None].float()
+
+
+def load_network(path: str | os.PathLike[str], dtype: torch.dtype) -> MogeNetwork:
+    """A frozen network from MoGe-2's model.pt, on the processor.
+
+    What residual blocks add is computed in `dtype`, float32 or bfloat16; the features that they add to are float32, for
+    eight bits would turn slanted surfaces into stairs.
+    InputError for a missing, broken or foreign file, or too little memory; nothing in the file is executed.
+    """
+    content, tensors = read_checkpoint(path, "model_config", ADVICE)
+    try:
+        config = MogeConfig.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = one_line(".".join(["model_config", *(str(name)[:60] for name in first["loc"])]))
+        said = f"no published kind of MoGe-2: {key}: {first['msg']}, not {shown(first['input'])}"
+        raise InputError(f"{path}: {said}: {ADVICE}") from error
+    with torch.device("meta"):
+        network = MogeNetwork(config)
+    weights = {name.removeprefix("model."): tensor for name, tensor in tensors.items() if name.startswith("model.")}
+    return load_strict(network, weights, path, ADVICE, prepare=functools.partial(set_precision, dtype=dtype))
+
+
+def set_precision(network: nn.Module, dtype: torch.dtype) -> None:
+    """Convert what is added to the features to `dtype`, in place, and kernels to channels-last."""
+    for block in network.modules():
+        if isinstance(block, (DinoBlock, ConvBlock)):
+            for layer in block.modules():
+                if isinstance(layer, (nn.Linear, nn.Conv2d)):
+                    layer.to(dtype)
+    channels_last(network)
