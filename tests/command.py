@@ -35,7 +35,8 @@ class Run:
 
     @property
     def lines(self) -> list[str]:
-        return self.err.splitlines()
+        """What it said, but for the notice of a first use, which depends on what this machine has compiled before."""
+        return [line for line in self.err.splitlines() if not line.startswith("first use: ")]
 
 
 def run(*arguments: object) -> Run:

@@ -208,9 +208,6 @@ def test_spz_is_an_eighth_of_the_ply() -> None:
     assert float(error) < 0.01 / 16
 
 
-# The command.
-
-
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     save_ply(BOX.base(), tmp_path / "scene.ply", camera=BOX.camera, base_count=1000)
@@ -292,9 +289,6 @@ def test_too_large_a_scene_is_told_and_an_older_file_stays(
     with pytest.raises(InputError, match=rf"{output.name}: [0-9,]+ Gaussians are too many"):
         export(scene, output.name)
     assert output.read_bytes() == b"older"
-
-
-# Readers that others wrote.
 
 
 def agree(found: Gaussians, expected: Gaussians, turn: float) -> None:

@@ -51,9 +51,6 @@ def file(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# The network --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "size", "height", "width", "step"),
     [("tiny", (16, 3), 64, 96, 4), pytest.param("full", (), 192, 256, 8, marks=pytest.mark.slow)],
@@ -70,9 +67,6 @@ def test_the_published_size() -> None:
     shapes = expected_shapes()
     assert len(shapes) == 989 - 152  # without counts of batches
     assert sum(np.prod(shape) for name, shape in shapes.items() if "running" not in name) == 50_975_875
-
-
-# Its files ----------------------------------------------------------------------------------------
 
 
 def named(prefix: str, weights: Weights) -> Weights:
@@ -109,9 +103,6 @@ def test_other_networks_are_a_line(
     save_file(named("generator.", tensors), tmp_path / "big-lama.pt")
     with pytest.raises(InputError, match=f"big-lama.pt: .*{said}.*: `spackle weights get lama` downloads"):
         load_network(tmp_path / "big-lama.pt")
-
-
-# What it paints -----------------------------------------------------------------------------------
 
 
 def views(height: int, width: int, *holes: tuple[int, int, int, int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -35,17 +35,11 @@ class DeformConv2d(nn.Conv2d):
 OURS = ("torchvision", "pytorchcv.models.propainter")  # modules that hold the convolution
 
 
-# Parts that need no package -----------------------------------------------------------------------
-
-
 def test_holes_grow_by_steps() -> None:
     hole = torch.zeros(1, 1, 20, 20)
     hole[0, 0, 10, 8] = 1
     y, x = torch.meshgrid(torch.arange(20), torch.arange(20), indexing="ij")
     assert torch.equal(dilated(hole)[0, 0] > 0, (y - 10).abs() + (x - 8).abs() <= DILATION)
-
-
-# With the package ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -140,14 +134,14 @@ def test_what_the_networks_are_given(video: type[Video], inpainter: PropainterIn
     assert torch.equal(frames[:, :, 112:113].expand(-1, -1, 16, -1), frames[:, :, 112:])
     assert torch.equal(painted[~hole], rgb[~hole])
     torch.testing.assert_close(painted[hole], torch.full((int(hole.sum()), 3), 0.75))
-    torch.testing.assert_close(inpainter.paint(rgb[1:2], hole[1:2], unknown[1:2]), painted[1:2])
+    torch.testing.assert_close(inpainter.paint(*(x[1:2] for x in (rgb, hole, unknown))), painted[1:2])
     assert video.given[1][0].shape == (2, 3, 128, 152)  # a video has two frames
     assert torch.equal(inpainter.paint(rgb, torch.zeros_like(hole), unknown), rgb)
 
 
 def test_large_views_are_worked_on_in_small_and_no_hole_is_lost(video: type[Video], weights: Path) -> None:
     rgb, hole, unknown = views_of(2, 200, 300)
-    hole = torch.zeros_like(hole)
+    hole[:] = False
     hole[1, 50, :] = True  # one pixel high
     small = PropainterInpainter(InpainterOptions(weights, 150, "cpu"))
     painted = small.paint(rgb, hole, unknown)
@@ -171,9 +165,6 @@ def test_colours_that_are_none_are_refused(
     monkeypatch.setattr(Video, "__iter__", short)
     with pytest.raises(InputError, match="lower --inpainter-side"):
         inpainter.paint(*views)
-
-
-# Weights ------------------------------------------------------------------------------------------
 
 
 def test_weights_that_are_not_there_are_told(tmp_path: Path) -> None:
@@ -204,9 +195,6 @@ def test_a_network_takes_its_own_from_a_published_file(tmp_path: Path) -> None:
     torch.save(values, tmp_path / "small-0000-0badf00d.pth")
     with pytest.raises(InputError, match="SHA-1 is not the one in its name"):
         give_weights(network, "small", tmp_path / "small-0000-0badf00d.pth")
-
-
-# The package --------------------------------------------------------------------------------------
 
 
 BROKEN = "operator torchvision::nms does not exist"  # what torchvision says beside another torch

@@ -83,9 +83,6 @@ def test_views_of_one_storage_and_empty_tensors_are_read(tmp_path: Path) -> None
     assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items())
 
 
-# Files that mean harm or are damaged --------------------------------------------------------------
-
-
 class Bomb:
     """Unpickling this makes a folder."""
 
@@ -192,8 +189,6 @@ def test_files_of_other_kinds_are_a_line(tmp_path: Path) -> None:
     archive(tmp_path / "a.zip", {"hello.txt": b"hello"})
     assert "without the pickle of a network" in refused(tmp_path / "a.zip")
 
-
-# Into a network -----------------------------------------------------------------------------------
 
 hiding = torch.zeros(2)
 hiding.float = "x"  # type: ignore[method-assign,assignment]

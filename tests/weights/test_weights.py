@@ -78,9 +78,6 @@ def ranges(site: Site) -> list[str | None]:
     return [asked.get("Range") for asked in site.requests]
 
 
-# Whole files, and going on
-
-
 def test_an_older_file_or_a_link_stays_until_the_new_one_is_whole(site: Site, tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     link, real = tmp_path / "link.pt", tmp_path / "real" / "weights.pt"
@@ -124,9 +121,6 @@ def test_the_beginning_of_another_file_is_dropped(site: Site, target: Path, size
     target.with_name("weights.pt.part").write_bytes(random.Random(6).randbytes(size))
     fetches(site.url, target)
     assert ranges(site)[-1] is None
-
-
-# What goes wrong for good
 
 
 @pytest.mark.parametrize(
@@ -189,9 +183,6 @@ def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: py
     fetches(site.url, target)
 
 
-# What is published
-
-
 def test_the_entries_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
         for digest in (entry.sha256, *(sha256 for _, sha256 in entry.beside.values())):
@@ -230,9 +221,6 @@ def test_the_folder_of_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     ):
         monkeypatch.setenv(variable, value)
         assert weights_folder() == tmp_path / folder
-
-
-# The commands
 
 
 @pytest.fixture
