@@ -1,11 +1,11 @@
-// Bundles the page's scripts into src/spackle/viewer/page: viewer.js and the licences. index.html and viewer.css lie there.
+// Bundles the page's scripts into src/spackle/web/page: viewer.js and the licences. index.html and viewer.css lie there.
 import { createHash } from "node:crypto";
 import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 
-const OUT = "../src/spackle/viewer/page";
+const OUT = "../src/spackle/web/page";
 const SOURCES = ["build.mjs", "package-lock.json", "package.json", ...readdirSync("src").map((name) => `src/${name}`)];
 
 // A test works out the same digest, to notice a bundle that is older than its sources.

@@ -21,8 +21,8 @@ from spackle.gaussians import Gaussians
 from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
-from spackle.viewer import PageScene, page_scene, single_html
 from spackle.views import PATH_FRAMES, scene_path
+from spackle.web import PageScene, page_scene, single_html
 
 DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
 

@@ -39,7 +39,7 @@ def test_help_does_not_wait_for_torch(words: str, shown: str) -> None:
     assert (result.returncode, shown in result.stdout) == (0, True), result.stderr
 
 
-@pytest.mark.parametrize("at", ["pipeline.fill_views", "cli.photo.save_views", "cli.photo.write_json"])
+@pytest.mark.parametrize("at", ["pipeline.fill_views", "photo_results.save_views", "photo_results.write_json"])
 def test_ctrl_c_is_one_line_and_leaves_an_old_set_whole(
     tmp_path: Path, pair: tuple[Path, Path], plain: tuple[Path, Run], monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:

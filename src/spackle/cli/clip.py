@@ -9,7 +9,7 @@ from typing import Any
 
 from spackle.bases import BasePrediction
 from spackle.bases.open import ResolvedBase
-from spackle.cli.photo import PredictOptions, shared_report
+from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
 from spackle.clips.files import ClipWriter, clip_frames, read_clip
 from spackle.errors import InputError
@@ -17,6 +17,7 @@ from spackle.files import write_json
 from spackle.folders import file_records, results_folder, whole_set
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.plain import OpenCV
+from spackle.photo_results import shared_report
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, timed
 from spackle.residual import hole_area_ratio

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from spackle.bases import BasePrediction
 from spackle.bases.settings import BaseSettings
-from spackle.cli.photo import save_views
 from spackle.cli.photos import compiled_ahead
 from spackle.evaluation.datasets.stereo import StereoPair, load_motorcycle
 from spackle.evaluation.metrics import sharpness
@@ -22,6 +21,7 @@ from spackle.files import write_json
 from spackle.folders import results_folder
 from spackle.formats import save_ply, save_png
 from spackle.image import Photo
+from spackle.photo_results import save_views
 from spackle.pipeline import Options, Pipeline, complete
 from spackle.progress import Reporter
 from spackle.render import Renderer

@@ -21,7 +21,7 @@ from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
 from spackle.camera import Camera
 from spackle.cli.clip import clip_options, predict_clip
-from spackle.cli.photo import REPORT, PredictOptions, earlier_report, predict_photo
+from spackle.cli.photo import PredictOptions
 from spackle.clips.files import is_clip
 from spackle.device import thread_count
 from spackle.errors import InputError
@@ -29,6 +29,7 @@ from spackle.files import check_file, files_in, fingerprint
 from spackle.folders import as_recorded, check_mark, digest_of, mark, results_folder
 from spackle.image import PHOTO_SUFFIXES
 from spackle.patches import match_patches
+from spackle.photo_results import REPORT, earlier_report, predict_photo
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Notes, Reporter, asked_to_stop
 from spackle.render import Renderer, device_of, get_renderer
@@ -215,7 +216,17 @@ class Predictor:
         """Whether a photo's results could be made; logs why not. InputError if that holds for all photos."""
         folder = self.output / photo.name
         try:
-            predict_photo(photo.path, folder, self.options, self.pipeline, reporter, self.request(photo))
+            options = self.options
+            predict_photo(
+                photo.path,
+                folder,
+                self.pipeline,
+                reporter,
+                lens=options.lens,
+                keep_frame=options.keep_frame,
+                render=options.render,
+                request=self.request(photo),
+            )
         except InputError as error:
             if self.single or isinstance(error, BaseError):  # no other photo can be worked on
                 raise

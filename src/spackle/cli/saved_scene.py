@@ -30,8 +30,8 @@ from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.scene import DEFAULT_SIZE, Scene
-from spackle.viewer import PageScene, single_html
 from spackle.views import FrameMaker, PathOptions, cover, video_problem
+from spackle.web import PageScene, single_html
 
 TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
 PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}

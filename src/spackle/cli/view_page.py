@@ -25,10 +25,10 @@ from spackle.image import Photo, load_photo
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, Step, asked_to_stop
 from spackle.scene import Scene
-from spackle.viewer import PageScene, page_files
-from spackle.viewer.handler import Tell
-from spackle.viewer.server import ViewerServer
 from spackle.views import PathOptions
+from spackle.web import PageScene, page_files
+from spackle.web.handler import Tell
+from spackle.web.server import ViewerServer
 from spackle.weights import installed
 
 DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows

@@ -32,10 +32,10 @@ from spackle.gaussians import quat_to_matrix as matrices
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
-from spackle.viewer import PageScene, page_files, page_scene, single_html
-from spackle.viewer.page import BYTES, encode_layer
-from spackle.viewer.server import ViewerServer
 from spackle.views import scene_path
+from spackle.web import PageScene, page_files, page_scene, single_html
+from spackle.web.page import BYTES, encode_layer
+from spackle.web.server import ViewerServer
 
 WEB = Path(__file__).parents[2] / "web"
 EVIL = "</script><b>&\"'\ud800"

@@ -19,7 +19,7 @@ from command import Run, refuses, report_of, run
 from photos import write_pair, write_photo
 from portraits import apple_jpeg, codes
 from scenes import box_before_wall
-from viewer_client import ask, events, send
+from web_client import ask, events, send
 
 import spackle
 from spackle.bases.settings import ROUGH

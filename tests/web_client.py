@@ -18,10 +18,10 @@ from urllib.parse import urlsplit
 from photos import picture
 from PIL import Image
 
-from spackle.viewer.guard import Limits
-from spackle.viewer.handler import Tell
-from spackle.viewer.page import PageScene
-from spackle.viewer.server import Complete, ViewerServer
+from spackle.web.guard import Limits
+from spackle.web.handler import Tell
+from spackle.web.page import PageScene
+from spackle.web.server import Complete, ViewerServer
 
 Where = ViewerServer | str  # the latter: the page's address
 PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}

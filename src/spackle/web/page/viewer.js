@@ -1,4 +1,4 @@
-/* built from web/ by "make viewer", sources e5adf92e1242f40df325990f1e8d9c25e68c4a4193e0181d6497a9ac0959f1ed
+/* built from web/ by "make viewer", sources d240e8867c61c9043300af3fb69da0d021e21eeb6a9724c39fdd8005c184b939
 
 viewer.js holds the page of Spackle (Apache-2.0, see LICENSE of the project) and these packages:
 

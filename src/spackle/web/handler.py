@@ -14,8 +14,8 @@ from io import BufferedIOBase
 from typing import Any, Protocol, cast
 
 from spackle.errors import InputError, reason_in_a_line
-from spackle.viewer.guard import HEADERS, PIECE, Declared, Limits, RefusedError, declared, refusal
-from spackle.viewer.page import as_json
+from spackle.web.guard import HEADERS, PIECE, Declared, Limits, RefusedError, declared, refusal
+from spackle.web.page import as_json
 
 JSON = "application/json; charset=utf-8"
 EVENTS = re.compile(r"/jobs/([1-9][0-9]{0,8})/events")

@@ -16,7 +16,7 @@ from typing import Any
 
 import pillow_heif
 import pytest
-from viewer_client import (
+from web_client import (
     PHOTO,
     QUICK,
     a_scene,
@@ -37,10 +37,10 @@ from viewer_client import (
 )
 
 from spackle.errors import InputError
-from spackle.viewer.guard import shown_name
-from spackle.viewer.handler import Tell
-from spackle.viewer.page import PageScene
-from spackle.viewer.server import ViewerServer
+from spackle.web.guard import shown_name
+from spackle.web.handler import Tell
+from spackle.web.page import PageScene
+from spackle.web.server import ViewerServer
 
 
 @pytest.fixture(scope="module")

@@ -23,9 +23,9 @@ from typing import Any
 
 from spackle.errors import InputError
 from spackle.image import PHOTO_SUFFIXES
-from spackle.viewer.guard import DEFAULT, Declared, Limits, check_photo, is_loopback, own_names, receive, split_depth
-from spackle.viewer.handler import JSON, Handler, Tell, Worker
-from spackle.viewer.page import PageScene, as_json
+from spackle.web.guard import DEFAULT, Declared, Limits, check_photo, is_loopback, own_names, receive, split_depth
+from spackle.web.handler import JSON, Handler, Tell, Worker
+from spackle.web.page import PageScene, as_json
 
 Body = tuple[str, bytes]  # content type, bytes
 Content = bytes | Callable[[], bytes]  # or what makes them

@@ -171,4 +171,4 @@ def _digest(text: str) -> str:
 
 
 def _read(name: str) -> bytes:
-    return resources.files("spackle.viewer").joinpath("page", name).read_bytes()
+    return resources.files("spackle.web").joinpath("page", name).read_bytes()

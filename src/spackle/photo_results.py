@@ -1,0 +1,187 @@
+"""One photo to a folder: a scene, a video and a report. The command line and the server call `predict_photo`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import spackle
+from spackle.bases import BasePrediction
+from spackle.bases.open import ResolvedBase
+from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
+from spackle.files import write_json
+from spackle.folders import file_records, results_folder, whole_set
+from spackle.formats import save_gray_png, save_ply, save_png, save_video
+from spackle.gaussians import Gaussians
+from spackle.image import Photo, load_photo
+from spackle.pipeline import CompletedPhoto, Pipeline
+from spackle.progress import Reporter, Step
+from spackle.render import Renderer
+from spackle.residual import hole_area_ratio, hole_mask
+
+REPORT = "report.json"
+
+
+def predict_photo(
+    path: Path,
+    folder: Path,
+    pipeline: Pipeline,
+    reporter: Reporter,
+    *,
+    lens: Mapping[str, float | None],
+    keep_frame: bool = False,
+    render: bool = True,
+    request: str | None = None,
+) -> None:
+    """One photo to `folder`: base.ply, scene.ply, a video if it is to `render`, report.json, and views/ with --cameras.
+
+    `lens` and `keep_frame` are as `load_photo` takes them; the report holds the digest `request`. The files take their
+    places once all are whole. InputError for a photo, a depth map or a folder that cannot be used.
+    """
+    reporter, options = reporter.restarted(), pipeline.options
+    with reporter.stage("load"):
+        photo = load_photo(path, keep_frame=keep_frame or options.give_geometry, **lens)
+    video_file = f"video{options.path.video.suffix}"
+    with contextlib.ExitStack() as folders:
+        files = ["base.ply", "scene.ply", REPORT, *([video_file] if render else [])]
+        folders.enter_context(results_folder(folder, files, alone=True))
+        stills = range(len(pipeline.given_views or []))
+        if stills:
+            pictures = [f"{index:04d}{kind}.png" for index in stills for kind in ("", "_base", "_mask")]
+            folders.enter_context(results_folder(folder / "views", pictures))
+        done = pipeline.complete(photo, reporter)
+        _warn_of_rougher(done, folder, options.base, reporter)
+        scene, views = done.scene, done.views
+        new = folders.enter_context(whole_set(folder, REPORT))
+        with reporter.stage("write"):
+            for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
+                save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
+        video = None
+        if render:
+            video = views.maker.note(video_file, views.cameras[views.frames[0][0]], len(views.frames))
+            with reporter.stage("video") as step:
+                save_views(done, new / video_file, pipeline.renderer, step)
+        if stills:
+            (new / "views").mkdir()
+            with reporter.stage("views") as step:
+                _save_pictures(done, new / "views", pipeline.renderer, step)
+        with reporter.stage("measure"):
+            holes = _measure_holes(done, pipeline.renderer)
+        report = {
+            **shared_report(photo, done.prediction, done.choice, pipeline, reporter),
+            "merged": len(scene.gaussians),
+            "mode": options.fill.mode,
+            "disparity": scene.disparity,
+            "video": video,
+            "hole_area_ratio": holes,
+            "request": request if done.choice.lasting else None,  # None: the next run does it again
+        }
+        size = {"width": scene.camera.width, "height": scene.camera.height}
+        frame = {} if photo.frame is None else {"frame_cut_off": dataclasses.asdict(photo.frame)}
+        report["photo"] = {"file": path.name, **size, **frame}
+        report["base"] |= done.prediction.notes
+        report["residual"]["fill"] = options.fill.texture
+        report["aux"] = {"gaussians": len(scene.aux), "share": len(scene.aux) / len(scene.base)}
+        if done.saved_view is not None:
+            report["scene_ply_view"] = done.saved_view  # the view whose aux Gaussians scene.ply holds
+        report["files"] = file_records(new, sorted(file for file in new.rglob("*") if file.is_file()))
+        write_json(report, new / REPORT)
+    before, after = (sum(view[key] for view in holes) / len(holes) for key in ("before", "after"))
+    reporter.log(
+        f"{path.name}: {len(scene.aux):,} aux Gaussians ({report['aux']['share']:.1%}, "
+        f"{report['residual']['weights']}), holes {before:.2%} -> {after:.3%}, "
+        f"{report['seconds']['total']:.1f} s -> {folder}"
+    )
+    reporter.result({"folder": folder, **report})
+
+
+def save_views(done: CompletedPhoto, path: Path, renderer: Renderer, step: Step) -> None:
+    """The frames of the planned views, all of one size; InputError for a file that cannot be written."""
+    views, video = done.views, done.views.maker.options
+
+    def frames() -> Iterator[Tensor]:
+        for index, frame in enumerate(views.frames):
+            if frame[0] in done.pictures:
+                yield done.pictures[frame[0]]
+            else:
+                with torch.no_grad():
+                    eyes = [renderer.render(done.scene.of_view(k), views.maker.sized(views.cameras[k])) for k in frame]
+                    yield views.maker.frame(eyes)
+            step(index + 1, len(views.frames))
+
+    save_video(frames(), path, video.rate, video.loop)
+
+
+@torch.no_grad()
+def _save_pictures(done: CompletedPhoto, folder: Path, renderer: Renderer, step: Step) -> None:
+    """Each given view as PNG: 0000.png completed, 0000_base.png before, 0000_mask.png its holes (white)."""
+    for index, camera in enumerate(done.views.cameras[: done.views.stills]):
+        before = renderer.render(done.scene.base, camera)
+        save_png(renderer.render(done.scene.of_view(index), camera).rgb, folder / f"{index:04d}.png")
+        save_png(before.rgb, folder / f"{index:04d}_base.png")
+        save_gray_png(hole_mask(before.alpha).to(torch.float32), folder / f"{index:04d}_mask.png")
+        step(index + 1, done.views.stills)
+
+
+@torch.no_grad()
+def _measure_holes(done: CompletedPhoto, renderer: Renderer) -> list[dict[str, Any]]:
+    """HAR (eq. 11) of each measured view, before and after completion."""
+
+    def har(gaussians: list[Gaussians], view: int) -> float:
+        return hole_area_ratio(renderer.render(gaussians, done.views.cameras[view]).alpha)
+
+    return [
+        {"view": name, "before": har([done.scene.base], index), "after": har(done.scene.of_view(index), index)}
+        for name, index in done.views.measured.items()
+    ]
+
+
+def shared_report(
+    photo: Photo, prediction: BasePrediction, choice: ResolvedBase, pipeline: Pipeline, reporter: Reporter
+) -> dict[str, Any]:
+    """What the reports of a photo and of a clip both hold, ready for JSON."""
+    path, weights = pipeline.options.path, pipeline.options.fill.weights
+    given = path.cameras or path.path
+    report: dict[str, Any] = {
+        "spackle": spackle.__version__,
+        "focal_px": round(prediction.camera.focal[0], 3),
+        "focal_source": prediction.lens_source or photo.focal_source,
+        "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
+        "residual": {"weights": weights},
+        "views": given.name if given else path.trajectory,
+        "disparity_source": None if given else pipeline.disparity_source(choice),
+        "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
+    }
+    if choice.failures:
+        report["base"]["passed_over"] = list(choice.failures)
+    if weights == "seeds":
+        report["residual"]["note"] = "no trained weights: the seeds alone filled the holes"
+    return report
+
+
+def _warn_of_rougher(done: CompletedPhoto, folder: Path, base: BaseSettings, reporter: Reporter) -> None:
+    """Warn before rougher results replace those of a network whose weights are damaged or gone."""
+    before, now = earlier_report(folder).get("base"), done.choice.base
+    better = before.get("name") if isinstance(before, dict) else None
+    if base.named == AUTO and better in AUTO_NETWORKS and now in AUTO_NETWORKS[AUTO_NETWORKS.index(better) + 1 :]:
+        file = base.files.get(str(better))
+        reporter.log(
+            f"{done.photo.path.name}: warning: {folder} was made by {better} and is made again by {now}: "
+            f"{done.choice.why}{'' if file is None else f' ({file})'}"
+        )
+
+
+def earlier_report(folder: Path) -> dict[str, Any]:
+    """An earlier run's report; empty without a whole one."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}
