@@ -58,16 +58,12 @@ def _weighted_sum(values: Tensor, weights: Sequence[float], dim: int) -> Tensor:
 
 
 def greatest_around(image: Tensor, reach: int) -> Tensor:
-    """Of an image or mask [..., H, W] the greatest value up to `reach` rows and columns away from each pixel."""
-    least = 0 if image.dtype == torch.bool else -math.inf
-    return greatest_in_windows(pad(image, (reach,) * 4, value=least), 2 * reach + 1)
-
-
-def greatest_in_windows(image: Tensor, size: int) -> Tensor:
-    """The greatest value in each window of size × size pixels: [..., H, W] to [..., H - size + 1, W - size + 1].
+    """Of an image or mask [..., H, W] the greatest value up to `reach` rows and columns away from each pixel.
 
     Of two windows one of up to twice their width is made: a processor's pooling looks at all pixels of each instead.
     """
+    size = 2 * reach + 1
+    image = pad(image, (reach,) * 4, value=0 if image.dtype == torch.bool else -math.inf)
     for dim in (-1, -2):
         width = 1
         while width < size:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.device import Precision
-from spackle.filters import far_fill, greatest_around, greatest_in_windows
+from spackle.filters import far_fill, greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render import Renderer, device_of, touched_tiles
 from spackle.render.protocol import Rendering
@@ -37,9 +36,8 @@ OPPOSITE = 2  # views that are completed before anything goes beneath the rims o
 PAINTED_VIEWS = 2  # of a scene that get the chosen texture, the exemplar's after them: they show nearly all holes
 FLAT = 0.01  # sRGB: pixels that differ less from their cell's mean need no Gaussians of their own
 SEEDS_HAR = 0.01  # holes of a path's view that are smaller are the seeds' alone: nobody sees the network's work there
-QUIET_HAR = 1e-3  # fewer holes may stay open in a frame that is checked; in between up to twice as many were seen
-SURE_HAR = QUIET_HAR / 4  # so few that more of the frames beside it may be skipped
-SPECK_PX = 4  # a square of holes as wide as this is seen, however little else is open
+FEW_HOLES = 1e-3  # so few are not seen in a frame of a path
+LEAST_VISITS = 24  # frames of a path that are looked at: so many, or half of them
 FINE_SPREAD_PX = 0.5  # standard deviation of one blob a pixel, which a wide one for its cell backs
 REACH_CELLS = 6  # how far beneath a rim an underlay goes
 COARSE = 3  # an underlay has one Gaussian for COARSE × COARSE cells, as much larger: what lies there is smooth
@@ -133,19 +131,20 @@ def fill_scene(
     Args:
         context: the photo's base, and what fills its holes.
         cameras: the frames of a path, in their order; with `exact` any views.
-        exact: look at every view and complete it if it has a hole; else skip frames beside one that needs
-            nothing, so that holes too small to see may stay open.
+        exact: look at every view and complete it if it has a hole; else holes too small to see may stay open, and
+            every second frame of a long path is looked at.
         progress: called with (views visited, views in all).
     """
     if not cameras:
         return FilledScene(Gaussians.empty(context.base.means.device), {})
     placed, device, threshold = context.placed, context.base.means.device, context.threshold
     order, stage = farthest_first(cameras, context.photo_camera), _Stage(placed)
+    visited = order if exact else order[: max(LEAST_VISITS, len(order) // 2)]
     guards = {-1: context.photo_guard()}
     for index in reversed(order[:WIDEST]):  # the widest last: it is the first to be completed
         view = stage.look(cameras[index])
         guards[index] = OcclusionGuard.of(view, cameras[index], threshold)
-    checked, pictures, filled = [False] * len(cameras), dict[int, Tensor](), 0
+    pictures, filled = dict[int, Tensor](), 0
     aux = [Gaussians.empty()]
     waiting: list[tuple[int, Gaussians]] = []  # a view, and what lies beneath its rims
 
@@ -155,34 +154,29 @@ def fill_scene(
     def underlays() -> list[Gaussians]:
         return [push_behind(rims, cameras[index].position, others(index)) for index, rims in waiting]
 
-    for count, index in enumerate(order):
-        camera = cameras[index]
-        if exact or not checked[index]:
-            view = stage.look(camera) if count else view
-            holes = hole_area_ratio(view.alpha, threshold)
-            # No frame is skipped where all are looked at.
-            gap = float(holes == 0) if exact else skipped_gap(holes, view.alpha, threshold)
-            if gap > 0:
-                pictures[index] = to_bytes(view.rgb)
-            else:
-                means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
-                if filled >= PAINTED_VIEWS and means.texture is not None:
-                    means = dataclasses.replace(means, texture=exemplar_texture)
-                enough = CLOSED_HAR if exact else QUIET_HAR
-                new, rims, view = _fill(means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1)
-                aux += new
-                waiting += [(index, part) for part in rims]
-                filled += 1
-                pictures.clear()
-                guards[index] = OcclusionGuard.of(view, camera, threshold)
-                if filled >= OPPOSITE:
-                    hidden = underlays()
-                    stage.add(*hidden)
-                    aux += hidden
-                    waiting.clear()
-            mark_checked(checked, index, gap)
+    for count, index in enumerate(visited):
+        camera, view = cameras[index], stage.look(cameras[index]) if count else view
+        holes = hole_area_ratio(view.alpha, threshold)
+        if holes <= (0 if exact else FEW_HOLES):
+            pictures[index] = to_bytes(view.rgb)
+        else:
+            means = placed.seeds_alone if holes < SEEDS_HAR and not exact else placed
+            if filled >= PAINTED_VIEWS and means.texture is not None:
+                means = dataclasses.replace(means, texture=exemplar_texture)
+            enough = CLOSED_HAR if exact else FEW_HOLES
+            new, rims, view = _fill(means, stage, view, camera, others(index), enough, beneath=len(cameras) > 1)
+            aux += new
+            waiting += [(index, part) for part in rims]
+            filled += 1
+            pictures.clear()
+            guards[index] = OcclusionGuard.of(view, camera, threshold)
+            if filled >= OPPOSITE:
+                hidden = underlays()
+                stage.add(*hidden)
+                aux += hidden
+                waiting.clear()
         if progress:
-            progress(count + 1, len(order))
+            progress(count + 1, len(visited))
     if waiting:
         pictures.clear()
     return FilledScene(Gaussians.cat([*aux, *underlays()]).to(device), pictures)
@@ -204,33 +198,6 @@ def farthest_first(cameras: Sequence[Camera], photo_camera: Camera) -> list[int]
         distance = torch.minimum(distance, (eyes - eyes[pick]).norm(dim=-1))
         distance[pick] = -1.0
     return order
-
-
-def skipped_gap(holes: float, alpha: Tensor, threshold: float) -> float:
-    """Fraction of the gap to the nearest checked frames that may be skipped beside a frame; 0: complete it.
-
-    `holes` is the hole area ratio of the frame, alpha its opacity [H, W]. Holes that lie close together are seen,
-    however few they are.
-    """
-    if holes > QUIET_HAR:
-        return 0.0
-    if min(alpha.shape) >= SPECK_PX:
-        covered = greatest_in_windows(alpha >= threshold, SPECK_PX)
-        if not bool(covered[:: SPECK_PX // 2, :: SPECK_PX // 2].all()):
-            return 0.0
-    return 0.75 if holes <= SURE_HAR else 0.5
-
-
-def mark_checked(checked: list[bool], index: int, gap: float) -> None:
-    """Mark a frame as checked, and of the frames to the nearest checked ones on both sides the fraction `gap`.
-
-    Towards an end of the path without a checked frame none is marked.
-    """
-    for frames in (range(index - 1, -1, -1), range(index + 1, len(checked))):
-        between = next((count for count, frame in enumerate(frames) if checked[frame]), 0)
-        for frame in frames[: math.ceil(gap * between)]:
-            checked[frame] = True
-    checked[index] = True
 
 
 def _fill(
