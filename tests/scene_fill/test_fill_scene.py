@@ -220,9 +220,7 @@ def test_every_second_frame_is_visited_and_all_are_closed(kind: TrajectoryKind) 
     views = [*path, *extremes(context.photo_camera, 0.3, DepthRange.of(context.base))]  # as the command line adds them
     filled = fill_scene(context, views, progress=lambda done, total: calls.append((done, total)))
     visits = len(views) // 2
-    assert (
-        len(counting.cameras) == visits + WIDEST
-    )  # the photo and the widest first, for their guards
+    assert len(counting.cameras) == visits + WIDEST  # the photo and the widest first, for their guards
     assert calls == [(k, visits) for k in range(1, visits + 1)]
     after = [CPU.render([context.base, filled.aux], camera) for camera in views]
     assert len(filled.pictures) > 3
