@@ -245,10 +245,9 @@ def predict(
         photo: a file, or a loaded photo.
         depth: of the photo, a file or a loaded depth map.
         base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`. Without it and without depth the
-            best one on this machine: the depth in the photo's file, else SHARP, MoGe or Depth Anything where its
-            weights have been downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which,
-            and warned of what could not be used. A network is then loaded for this photo alone: for many, load a base
-            once.
+            best one on this machine: the depth in the photo's file, else SHARP or MoGe where its weights have been
+            downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
+            what could not be used. A network is then loaded for this photo alone: for many, load a base once.
         kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
         disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as the base has it: 0.15 for
             lite, else 0.3.

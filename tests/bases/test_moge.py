@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from clips import moving, write_clip
+from command import report_of, run
 from moge_weights import FULL, HALF, TINY, scene, shapes_of, waves, write_tiny
-from photos import picture
+from photos import picture, write_photo
 from safetensors.torch import save_file
 from scenes import same_bits
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from spackle.bases.lift import lift
+from spackle.bases.moge import base as moge
 from spackle.bases.moge.base import SKY, MogeBase, MogeView, to_view
-from spackle.bases.moge.network import load_network
+from spackle.bases.moge.network import MogeOutput, load_network
 from spackle.bases.open import open_base
 from spackle.bases.settings import BaseSettings
 from spackle.errors import InputError
@@ -125,8 +129,10 @@ def test_whose_lens_counts_and_where_the_sky_goes(base: MogeBase, monkeypatch: p
     z, sky = seen.gaussians.means[:, 2], float((output.mask_logits < 0).float().mean())
     assert float(z.max()) == pytest.approx(SKY * 8, rel=0.02)
     assert seen.notes["sky"] == round(sky, 4)
-    output = dataclasses.replace(output, points=output.points * torch.tensor([-1, -1, 1]))  # no lens turns a photo over
-    assert (base.predict(photo).camera.focal[0], base.predict(photo).lens_source) == (120, "")
+    points = output.points
+    for factor in (-1, 30, 0.03):  # no lens turns a photo over, sees 174° or only 2°
+        output = dataclasses.replace(output, points=points * torch.tensor([factor, factor, 1]))
+        assert (base.predict(photo).camera.focal[0], base.predict(photo).lens_source) == (120, "")
     output.mask_logits.fill_(-1)
     with pytest.raises(InputError, match=r"photo\.png: MoGe sees no surface"):
         base.predict(photo)
@@ -141,6 +147,28 @@ def test_the_same_photo_gives_the_same_scene_and_bf16_nearly_so(checkpoint: Path
     assert found[2].notes["precision"] == "bf16"
     middles = [float(each.gaussians.means[:, 2].median()) for each in found]
     assert middles[2] == pytest.approx(middles[0], rel=0.02)
+
+
+def test_predict_takes_a_checkpoint_and_a_clip_keeps_one_lens(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the network sees another lens in each frame."""
+    words = ("--base", "moge", "-c", checkpoint, "-o", tmp_path)
+    done = run("predict", write_photo(tmp_path / "photo.png", 160, 90), *words, "--frames", 2)
+    assert (done.code, report_of(tmp_path / "photo")["base"]["name"]) == (0, "moge"), done.err
+    pytest.importorskip("cv2")
+    lenses, seen = iter((1.3, 0.9, 1.1)), list[float]()
+
+    def ask(*given: Any) -> MogeOutput:
+        stretch = 1.3 / next(lenses)
+        output = scene(0.5)
+        return dataclasses.replace(output, points=output.points * torch.tensor([stretch, stretch, 1]))
+
+    monkeypatch.setattr(MogeBase, "ask", ask)
+    monkeypatch.setattr(moge, "lift", lambda *given: (seen.append(given[2].focal[0]), lift(*given))[1])
+    done = run("predict", write_clip(tmp_path / "clip.mp4", moving(3, 90, 160)), *words, "--residual", "none")
+    assert (done.code, report_of(tmp_path / "clip")["focal_source"]) == (0, "MoGe"), done.err
+    assert seen == pytest.approx([1.3 * HALF] * 3, rel=1e-5)
 
 
 def changed(change: Callable[[dict[str, Any]], None], bytes_less: int = 0) -> Callable[[Path], None]:

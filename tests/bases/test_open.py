@@ -26,7 +26,7 @@ from spackle.bases.lite import LiteBase
 from spackle.bases.moge.base import MogeBase
 from spackle.bases.open import BaseError, ResolvedBase, open_base
 from spackle.bases.photo_depth.layouts import load_photo_depth
-from spackle.bases.settings import KINDS, BaseSettings
+from spackle.bases.settings import DEPTH_ANYTHING, KINDS, BaseSettings
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.encoder import TINY
 from spackle.errors import InputError
@@ -35,7 +35,7 @@ from spackle.pipeline import FillOptions
 from spackle.weights import PUBLISHED
 
 pytestmark = pytest.mark.usefixtures("shipped")
-NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe here, no Depth Anything here"
+NO_DEPTH, NO_SHARP = "no depth in the photo", "no SHARP weights here, no MoGe here"
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
     sharp.unlink()
     choice = pick(photo)[1]
     assert (choice.base, choice.why, choice.failures) == ("lite", f"{NO_DEPTH}, {NO_SHARP}", ())
-    assert "--depth FILE, `spackle weights get moge` (140.6 MB, MIT)" in choice.note
+    assert "--depth FILE, `spackle weights get depth` (140.6 MB, MIT)" in choice.note
     prediction, choice = pick(portrait)
     assert (choice.base, choice.why) == ("rgbd", "the depth in the photo")
     assert str(prediction.notes["depth"]).startswith("portrait depth of the photo")
@@ -99,9 +99,9 @@ def test_auto_takes_the_photos_depth_then_sharp_then_lite(
 
 
 def test_auto_takes_moge_before_depth_anything(tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, base in (("depth", HfBase), ("moge", MogeBase)):
+    for name, base, place in (("depth", HfBase, DEPTH_ANYTHING), ("moge", MogeBase, PUBLISHED["depth"].file)):
         monkeypatch.setattr(base, "load", lambda path, name=name, **options: StandIn(name))
-        file = tmp_path / "weights" / PUBLISHED[name].file
+        file = tmp_path / "weights" / place
         file.parent.mkdir(parents=True)
         file.write_bytes(b"weights")
         assert pick(photo)[1].base == name
@@ -221,9 +221,7 @@ def test_damaged_weights_fail_once_for_all_photos(photo: Path, sharp: Path, monk
     sharp.write_bytes(content[::-1])
     said, log, base = "SHA-256 is not the published one", list[str](), open_base(BaseSettings())
     choices = [base.predict(load_photo(photo), log=log.append)[1] for _ in range(2)]
-    assert [choice.why for choice in choices] == [
-        f"{NO_DEPTH}, SHARP cannot be used, no MoGe here, no Depth Anything here"
-    ] * 2
+    assert [choice.why for choice in choices] == [f"{NO_DEPTH}, SHARP cannot be used, no MoGe here"] * 2
     assert (len(log), said in log[0], said in choices[0].failures[0]) == (1, True, True)
     assert choices[0].lasting
     for settings in ({"name": "sharp"}, {"checkpoint": sharp}):

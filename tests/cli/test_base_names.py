@@ -26,7 +26,7 @@ from spackle.errors import InputError
 from spackle.formats import PlyFile
 from spackle.image import Photo
 
-NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe here, no Depth Anything here"
+NO_DEPTH, NO_MODEL = "no depth in the photo", "no MoGe here"
 
 
 @pytest.fixture(autouse=True)

@@ -141,4 +141,4 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     assert [Path(line["file"]).stat().st_size for line in files] == [line["bytes"] for line in files]
     assert [line["gaussians"] for line in files] == [report["merged"]] * 2
     listed = run("weights", "list", "--json").out.splitlines()
-    assert [json.loads(line)["name"] for line in listed] == ["sharp", "lama", "features", "moge", "depth"]
+    assert [json.loads(line)["name"] for line in listed] == ["sharp", "lama", "features", "depth"]

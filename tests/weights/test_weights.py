@@ -185,14 +185,13 @@ def test_places_that_cannot_be_written(site: Site, target: Path, monkeypatch: py
 
 def test_the_entries_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in PUBLISHED.values():
-        for digest in (entry.sha256, *(sha256 for _, sha256 in entry.beside.values())):
-            assert re.fullmatch("[0-9a-f]{64}", digest)
-        assert re.fullmatch(f"https://.*{re.escape(Path(entry.file).name)}", entry.address())
+        assert re.fullmatch("[0-9a-f]{64}", entry.sha256)
+        assert re.fullmatch(f"https://.*{re.escape(Path(entry.file).name)}", entry.address)
         assert all((entry.purpose, entry.licence, entry.notice, entry.option))
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example/hub/")
-    at = "https://mirror.example/hub/depth-anything/Depth-Anything-V2-Small-hf/resolve/5426e4f0f36572d16453bbda7a838931"
-    assert PUBLISHED["depth"].address("config.json") == f"{at}7b1bef99/config.json"
-    assert PUBLISHED["sharp"].address() == PUBLISHED["sharp"].url
+    at = "https://mirror.example/hub/Ruicheng/moge-2-vits-normal/resolve/26b477f41595707c5db6770294c0d1721e8ed4ed/model.pt"
+    assert PUBLISHED["depth"].address == at
+    assert PUBLISHED["sharp"].address == PUBLISHED["sharp"].url
 
 
 def test_damage_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,29 +273,13 @@ def test_get_to_a_place_of_your_own(site: Site, weights: Path, tmp_path: Path) -
         ("nothing", None, "weights nothing: unknown: there are sharp"),
         ("sharp", CLOSED, "no connection (Connection refused): check network"),
         ("sharp", "http://me:secret@127.0.0.1:1/", "password"),
-        ("depth", None, "HF_ENDPOINT"),
+        ("moge", CLOSED, "weights moge: unknown: there are sharp"),
         ("lama", None, "205,669,692 were published"),
     ],
 )
 def test_get_in_one_line_where_it_fails(site: Site, weights: Path, name: str, url: str | None, said: str) -> None:
     refuses(get(name, "--url", url or site.url), said)
     assert not weights.exists()
-
-
-def test_get_fetches_what_belongs_to_the_weights(site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    beside = {"config.json": b"{}", "preprocessor_config.json": b'{"size": 1}'}
-    facts = {name: (len(content), hashlib.sha256(content).hexdigest()) for name, content in beside.items()}
-    entry = publish(monkeypatch, "depth", CONTENT, beside=facts, needs="nothing_of_that_name")
-    monkeypatch.setenv("HF_ENDPOINT", site.url.rpartition("/")[0])
-    site.others = {**beside, "config.json": b"[]"}
-    assert f"not the SHA-256 {facts['config.json'][1]}" in get("depth").err
-    assert not weights.exists()
-    site.others = beside
-    result = gets("depth")
-    assert "Apache License 2.0" in result.err
-    assert "pip install 'spackle-nvs[hf]'" in result.lines[-1]
-    found = {file.name: file.read_bytes() for file in (weights / entry.file).parent.iterdir()}
-    assert found == {**beside, "model.safetensors": CONTENT}
 
 
 def test_get_warns_of_an_unencrypted_address(site: Site, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians
-from spackle.image import Photo
+from spackle.image import Photo, film_to_pixels
 
 Progress = Callable[[int, int], None]  # (steps done, of how many)
 USUAL_DISPARITY = 0.3  # how far a camera goes where neither a person nor the base says; the paper's S1
@@ -40,6 +40,15 @@ class Base(Protocol):
             progress: called as the work advances, where it takes long.
         """
         ...
+
+
+SEEN_LENSES_MM = (10.0, 600.0)  # 35 mm equivalents that a network is believed to see in a photo: 130° to 4°
+
+
+def believed_lens(focal_px: float, width: int, height: int) -> bool:
+    """Whether a photo of that size may have the focal length that a network sees in it."""
+    shortest, longest = (film_to_pixels(mm, width, height) for mm in SEEN_LENSES_MM)
+    return shortest <= focal_px <= longest
 
 
 NEAREST_M = 1.5  # an arm's length and a half

@@ -18,13 +18,13 @@ from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from spackle.bases import NEAREST_M, BasePrediction, Progress, nearest
+from spackle.bases import NEAREST_M, BasePrediction, Progress, believed_lens, nearest
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, reading, reason_in_a_line
-from spackle.image import LENSES, Photo, resize_photo
+from spackle.image import Photo, resize_photo
 
 NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
@@ -107,8 +107,7 @@ class HfBase:
         camera, lens_source = photo.camera, ""
         if fov is not None and photo.focal_source.startswith("default"):
             focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2) if 0 < fov < 180 else math.nan
-            shortest, longest = (lens * max(photo.width, photo.height) for lens in LENSES)
-            if not shortest <= focal <= longest:
+            if not believed_lens(focal, photo.width, photo.height):
                 seen = f"{self.name} sees a field of view of {fov:g}°, which no lens has"
                 raise InputError(f"{photo.path}: {seen}: give the focal length with --focal-mm")
             camera = Camera.from_focal(focal, photo.width, photo.height)

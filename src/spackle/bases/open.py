@@ -1,7 +1,7 @@
 """The one path from a base's settings to a photo's Gaussians.
 
-`auto` tries the depth in the photo's file, then SHARP, MoGe and Depth Anything if their weights are installed, then
-lite. It falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from
+`auto` tries the depth in the photo's file, then the networks whose weights are here: SHARP, MoGe, Depth Anything, lite.
+It falls back to the next candidate when one fails, and logs why. The focal length comes from the user, else from
 the depth map's calibration, else from the photo's file, else from a network that sees the lens, else it is the default.
 """
 
@@ -36,7 +36,7 @@ ORDER = {  # of `auto`: what a candidate is called in reports and the log, and t
     RGBD: ("the depth in the photo", "no depth in the photo"),
     "sharp": ("SHARP", "no SHARP weights here"),
     "moge": ("MoGe", "no MoGe here"),
-    "depth": ("Depth Anything", "no Depth Anything here"),
+    "depth": ("Depth Anything", ""),  # of an earlier download, which few have
     "lite": ("lite", ""),
 }
 NO_DEPTH = (
@@ -165,7 +165,7 @@ class OpenedBase:
                         base = self.load(photo, depth, name)
                     if base is None:
                         reason, short = self._failed.get(name, (absence, False))
-                        reasons.append(reason)
+                        reasons += [reason] if reason else []
                         lasting &= not short
                         continue
                     stages.close()

@@ -13,7 +13,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.sharp.base import check_windows
 from spackle.device import PRECISIONS, Precision
 from spackle.errors import InputError, check_name
-from spackle.weights import PUBLISHED, installed, published_as
+from spackle.weights import PUBLISHED, published_as, weights_folder
 
 AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # a folder, or owner/name of the hub, follows
@@ -24,7 +24,7 @@ KINDS = {  # the description below tables, and the options that only some bases 
     RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib")),
     "sharp": ("Apple's network, from the photo alone", ("-c", "--precision", "--sharp")),
     "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
-    "depth": (f"Depth-Anything-V2-Small, from the photo alone, {NOT_SHARP}", ("--precision",)),
+    "depth": (f"Depth-Anything-V2-Small of an earlier download, from the photo alone, {NOT_SHARP}", ("--precision",)),
     "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
     "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
     AUTO: ("", ("--calib", "--precision", "--sharp")),  # for the base that it chooses
@@ -38,20 +38,24 @@ def _download(name: str) -> str:
     return f"`spackle weights get {name}` ({decimal(PUBLISHED[name].bytes)}, {PUBLISHED[name].licence})"
 
 
-ROUGH = f"rough geometry; for better: --depth FILE, {_download('moge')}, or {_download('sharp')}"
+ROUGH = f"rough geometry; for better: --depth FILE, {_download('depth')}, or {_download('sharp')}"
+DEPTH_ANYTHING = "depth-anything-v2-small/model.safetensors"  # where `weights get depth` put it once
 MISSING = {  # what to do without the weights of a base
     "sharp": f"no weights of SHARP on this machine: {_download('sharp')} downloads them, -c FILE takes a local copy",
-    "moge": f"no weights of MoGe on this machine: {_download('moge')} downloads them, -c FILE takes a local copy",
-    "depth": f"not on this machine: {_download('depth')} downloads it",
+    "moge": f"no weights of MoGe on this machine: {_download('depth')} downloads them, -c FILE takes a local copy",
+    "depth": "no Depth Anything of an earlier download on this machine: give --base moge, whose weights "
+    "`spackle weights get depth` downloads, or --base hf:depth-anything/Depth-Anything-V2-Small-hf",
 }
 
 
 def _weights_here(name: str) -> Path | None:
+    """The weights of a base where they are expected; None where they are not there."""
+    places = {"sharp": PUBLISHED["sharp"].file, "moge": PUBLISHED["depth"].file, "depth": DEPTH_ANYTHING}
     try:
-        shipped = lite.SHIPPED if name == "lite" and lite.SHIPPED.is_file() else None
-        return installed(name) if name in MISSING else shipped
+        file = weights_folder() / places[name] if name in places else lite.SHIPPED if name == "lite" else None
     except InputError:  # the machine has no folder for downloads
         return None
+    return file if file is not None and file.is_file() else None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -96,6 +96,9 @@ def predict_clip(
                     prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:
                     first, base = (photo, prediction, choice), base.only(choice)  # which predicts all others, too
+                    if prediction.lens_source:  # by a network: a clip has one lens, so it holds for all other frames
+                        seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
+                        focal = seen, prediction.lens_source
                     if choice.note:
                         reporter.log(f"{path.name}: {choice.note}")
                     reporter.log(

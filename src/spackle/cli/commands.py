@@ -44,9 +44,9 @@ def predict(
         typer.Option(
             metavar="NAME",
             help="What turns the photo into Gaussians. rgbd: its depth; sharp: Apple's network; moge: MoGe-2, metric "
-            "depth and the lens; depth: Depth-Anything-V2-Small; lite: rough depth by networks that come along; "
-            "hf:OWNER/NAME or hf:FOLDER: another depth model of transformers. auto: the depth that is given or in the "
-            "photo, else sharp, moge or depth, if `spackle weights get` brought them, else lite.",
+            "depth and the lens; lite: rough depth by networks that come along; hf:OWNER/NAME or hf:FOLDER: a depth "
+            "model of transformers. auto: the depth that is given or in the photo, else sharp or moge, if `spackle "
+            "weights get` brought them, else lite.",
         ),
     ] = "auto",
     depth: Annotated[
@@ -113,7 +113,7 @@ def predict(
 ) -> None:
     """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each.
 
-    A photo alone is enough. A depth map, or what `spackle weights get moge` or `sharp` fetches, gives better geometry.
+    A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
     from spackle.bases.settings import BaseSettings
     from spackle.cli.photo import PredictOptions

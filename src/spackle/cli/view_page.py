@@ -29,7 +29,6 @@ from spackle.views import PathOptions
 from spackle.web import PageScene, page_files
 from spackle.web.handler import Tell
 from spackle.web.server import ViewerServer
-from spackle.weights import installed
 
 DOWNLOADS = (".ply", ".spz", ".sog")  # of a scene that the page shows
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
@@ -140,8 +139,7 @@ class Uploads:
     @property
     def bases(self) -> list[str]:
         """What the page offers: the command's own, auto, and those that need no download."""
-        here = [name for name in ("sharp", "depth") if installed(name)]
-        return list(dict.fromkeys([self._base.name, AUTO, *here, LiteBase.name]))
+        return list(dict.fromkeys([self._base.name, AUTO, *BaseSettings().files]))
 
     def complete(
         self, path: Path, name: str, tell: Tell, *, base: str = "", disparity: str = "", depth: Path | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,7 +23,7 @@ weights = typer.Typer(help="Weights that others publish: fetch them, list them."
 
 @weights.command("get")
 def weights_get(
-    name: Annotated[str, typer.Argument(help="Which weights: sharp, moge, depth, lama or features.")],
+    name: Annotated[str, typer.Argument(help="Which weights: depth, which is MoGe-2; sharp, lama or features.")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="OUT", help="A folder, or a file name; default: the weights' folder."),
@@ -41,31 +40,25 @@ def weights_get(
     from spackle.weights import file_digest, published_weights, weights_folder
 
     reporter, entry = Reporter(as_json=as_json), published_weights(name)
-    if url is not None and entry.beside:
-        raise InputError(f"--url {url}: {name} is several files of a hub: name a mirror of the hub in HF_ENDPOINT")
     path = (output or weights_folder()) / entry.file
-    if output is not None and output.suffix.lower() == path.suffix and not entry.beside and not os.path.isdir(output):
+    if output is not None and output.suffix.lower() == path.suffix and not os.path.isdir(output):
         path = output
     summary = f"{name}: {decimal(entry.bytes)}, SHA-256 {entry.sha256}"
     new = force or not os.path.isfile(path)
     if new:
         with results_folder(path.parent, [path.name]):
-            _fetch(entry, entry.address() if url is None else url, path, reporter)
+            _fetch(entry, url or entry.address, path, reporter)
         reporter.log(f"{summary} -> {path}" + ("" if output is None else f"; {entry.option}"))
     else:
         with reporter.stage("check"):
             if file_digest(path) != entry.sha256:
                 raise InputError(f"{path}: damaged, or your own: it has not the SHA-256 {entry.sha256}: give --force")
         reporter.log(f"{summary}, there already and intact: {path}")
-    if entry.needs and find_spec(entry.needs) is None:
-        from spackle.bases.hf import NOT_INSTALLED
-
-        reporter.log(f"{name}: not to be used yet: {NOT_INSTALLED}")
     reporter.result({"name": name, "file": path, "bytes": entry.bytes, "sha256": entry.sha256, "downloaded": new})
 
 
 def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) -> None:
-    """Download weights after what lies beside them: they tell that all is there."""
+    """Download weights; says whose they are once the first bytes come."""
     from urllib.parse import urlsplit
 
     from spackle.weights.download import check_url, download
@@ -83,8 +76,6 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
             step(done, total)
 
         try:
-            for name, (size, sha256) in entry.beside.items():
-                download(entry.address(name), path.with_name(name), size, sha256)
             download(url, path, entry.bytes, entry.sha256, advance)
         except KeyboardInterrupt:
             reporter.log(f"{entry.name}: what has come is kept; the same command goes on from there")

@@ -19,7 +19,7 @@ HUB = "https://huggingface.co"  # HF_ENDPOINT names a mirror of it
 
 @dataclasses.dataclass(frozen=True)
 class PublishedWeights:
-    """One published file of weights, and small files that belong to it."""
+    """One published file of weights."""
 
     name: str
     purpose: str
@@ -30,14 +30,12 @@ class PublishedWeights:
     licence: str  # in a few words
     notice: Sequence[str]  # lines that a person sees before the download
     option: str  # that names a copy elsewhere
-    beside: Mapping[str, tuple[int, str]] = dataclasses.field(default_factory=dict)  # name to bytes and SHA-256
-    needs: str = ""  # a package that is not always installed
 
-    def address(self, file: str | None = None) -> str:
-        """The address of the weights, or of a file beside them, on the mirror of the hub if one is named."""
-        url = self.url if file is None else f"{self.url.rpartition('/')[0]}/{file}"
+    @property
+    def address(self) -> str:
+        """Where the file is, on the mirror of the hub if one is named."""
         mirror = os.environ.get("HF_ENDPOINT", "").rstrip("/")
-        return mirror + url.removeprefix(HUB) if mirror and url.startswith(f"{HUB}/") else url
+        return mirror + self.url.removeprefix(HUB) if mirror and self.url.startswith(f"{HUB}/") else self.url
 
 
 _FACTS = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))

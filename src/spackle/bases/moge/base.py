@@ -11,14 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spackle.bases import BasePrediction, Progress
+from spackle.bases import BasePrediction, Progress, believed_lens
 from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.bases.moge.network import FINEST, MogeNetwork, MogeOutput, load_network, token_grid, view_plane
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError
-from spackle.image import LENSES, Photo, resize_photo
+from spackle.image import Photo, resize_photo
 
 TOKENS = 1800  # that a photo is seen as, where the checkpoint's range has it
 SAMPLES = 64  # of a side of the map: so many points tell focal length and shift
@@ -76,8 +76,7 @@ class MogeBase:
             output = self.ask(photo.rgb, tokens, size)
         view = to_view(output, photo.width, photo.height, photo.focal_px if known else None)
         camera, lens_source = photo.camera, ""
-        shortest, longest = (lens * max(photo.width, photo.height) for lens in LENSES)
-        if not known and shortest <= view.focal_px <= longest:
+        if not known and believed_lens(view.focal_px, photo.width, photo.height):
             camera, lens_source = Camera.from_focal(view.focal_px, photo.width, photo.height), "MoGe"
         elif not known:
             view = to_view(output, photo.width, photo.height, photo.focal_px)
