@@ -32,7 +32,7 @@ from spackle.gaussians import Gaussians
 from spackle.inpaint.plain import OpenCV
 from spackle.render import get_renderer
 from spackle.render.protocol import Rendering
-from spackle.residual.network import shipped_network
+from spackle.residual.architectures import shipped_network
 from spackle.scene_fill import FillContext, fill_scene
 from spackle.surface import surface_gaussians
 

@@ -41,7 +41,7 @@ from spackle.render.cuda import GsplatRenderer, Material, load_gsplat
 from spackle.render.project import KernelCamera
 from spackle.render.protocol import NEAR_PLANE, TILE, Rendering
 from spackle.residual import hole_area_ratio
-from spackle.residual.network import ResidualNet, shipped_network
+from spackle.residual.architectures import UNet, shipped_network
 from spackle.scene_fill import FillContext, fill_view
 from spackle.training.losses import total_loss
 from spackle.training.residual import complete_samples
@@ -240,13 +240,14 @@ def training(options: argparse.Namespace) -> Iterator[str]:
     gpu = renderer()
     scene, camera = holed_scene(768)
     view = find_view(scene, camera, gpu)[1]
-    whole = Sample.of(scene, CpuRenderer().render(scene, view), view, camera, torch.rand(view.height, view.width, 3))
+    photo, target = torch.rand(2, view.height, view.width, 3)
+    whole = Sample.of(scene, CpuRenderer().render(scene, view), view, camera, photo, target)
     cells = whole.cues.mask[:-CROP, :-CROP].nonzero()
     picked = cells[torch.linspace(0, len(cells) - 1, BATCH).long()].tolist()
     crops = [whole.crop(max(row - CROP // 2, 0), max(column - CROP // 2, 0), CROP, CROP) for row, column in picked]
 
     def task(device: torch.device, drawer: GsplatRenderer | CpuRenderer) -> Callable[[], object]:
-        network = ResidualNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = UNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
         def step() -> None:
             done = complete_samples(network, crops, drawer)

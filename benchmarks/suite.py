@@ -48,7 +48,7 @@ from spackle.render import CpuRenderer, Renderer, get_renderer
 from spackle.render.cpu import blend, list_tiles, project, sort_by_depth, wanted_tiles
 from spackle.render.project import KernelCamera
 from spackle.residual import ResidualNet, hole_area_ratio
-from spackle.residual.network import load_residual
+from spackle.residual.architectures import load_residual
 from spackle.scene_fill import FillContext, fill_scene, fill_view
 
 LIMIT_RUNS = 7  # at least: the best run counts

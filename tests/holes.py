@@ -15,7 +15,8 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet, Seeds, ViewFeatures, make_seeds
-from spackle.residual.network import Rim, find_rim, shipped_network
+from spackle.residual.architectures import open_residual, shipped_network
+from spackle.residual.network import Rim, find_rim
 from spackle.scene_fill import FillContext
 
 CPU = CpuRenderer()
@@ -39,17 +40,19 @@ def box_view(disparity: float = 0.2, side: int = 1, width: int = 96, height: int
     return context, extremes(scene.camera, disparity, DepthRange.of(context.base))[side]
 
 
-def features_of(base: Gaussians | Rendering, camera: Camera, photo_camera: Camera) -> tuple[ViewFeatures, Seeds, Rim]:
+def features_of(
+    base: Gaussians | Rendering, camera: Camera, photo_camera: Camera, photo: Tensor | None = None
+) -> tuple[ViewFeatures, Seeds, Rim]:
     """What f_res is given of a view: of Gaussians, or of a rendering."""
     features = ViewFeatures.of(base if isinstance(base, Rendering) else CPU.render(base, camera))
     seeds = make_seeds(features, camera, photo_camera)
-    return features, seeds, find_rim(features, seeds, camera, photo_camera)[0]
+    return features, seeds, find_rim(features, seeds, camera, photo_camera, photo)[0]
 
 
-def random_network(seed: int = 0, size: float = 0.02) -> ResidualNet:
+def random_network(seed: int = 0, size: float = 0.02, name: str = "unet") -> ResidualNet:
     """A network whose last layers are not zero, so that everything in it matters, if nothing sensible."""
     torch.manual_seed(seed)
-    network = ResidualNet()
+    network = open_residual(name)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(size * torch.randn_like(parameter))
@@ -63,8 +66,10 @@ def shipped() -> ResidualNet:
     return network
 
 
-class CountingNetwork(nn.Module):
+class CountingNetwork(ResidualNet):
     """A network that keeps how many cells it was shown."""
+
+    name, sees_photo, local = "counting", False, True
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()

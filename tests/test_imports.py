@@ -30,7 +30,7 @@ ALLOWED: dict[str, set[str]] = {
     "render": {"values"},
     "bases": {"values", "weights"},
     "inpaint": {"values", "weights"},
-    "residual": {"values", "render"},
+    "residual": {"values", "render", "bases"},
     "scene_fill": {"values", "render", "residual", "inpaint"},
     "clips": {"values", "render", "bases", "residual", "scene_fill", "inpaint", "formats"},
     "web": {"values", "formats"},

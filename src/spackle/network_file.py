@@ -152,6 +152,15 @@ def read_checkpoint(path: str | os.PathLike[str], name: str, advice: str) -> tup
         return root[name], _tensors(root)
 
 
+def read_note(path: str | os.PathLike[str], name: str) -> str | None:
+    """What the metadata of a file that can be read says under a name; None where it has none, or is no safetensors."""
+    with open(path, "rb") as file:
+        if file.read(9)[8:] != b"{":
+            return None
+    with safe_open(path, framework="pt") as opened:
+        return (opened.metadata() or {}).get(name)
+
+
 @contextmanager
 def _reading_weights(path: str | os.PathLike[str], advice: str) -> Iterator[None]:
     check_file(path, "weight file")

@@ -29,7 +29,8 @@ from spackle.image import Photo, load_photo
 from spackle.inpaint import InpainterOptions, get_inpainter
 from spackle.progress import Reporter, Step, progress_line
 from spackle.render import Renderer, get_renderer
-from spackle.residual.network import SHIPPED, ResidualNet, load_residual, shipped_network
+from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
+from spackle.residual.network import ResidualNet
 from spackle.scene import Scene
 from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture

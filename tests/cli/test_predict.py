@@ -30,7 +30,7 @@ import spackle
 from spackle.folders import results_folder
 from spackle.image import film_to_pixels
 from spackle.pipeline import FillOptions
-from spackle.residual import ResidualNet
+from spackle.residual.architectures import UNet
 from spackle.weights import published_weights
 
 
@@ -137,7 +137,7 @@ def test_weights_and_texture_are_named_and_change_the_scene(
 ) -> None:
     torch.manual_seed(0)
     weights = tmp_path / "random.safetensors"
-    save_file({name: 0.02 * torch.randn_like(value) for name, value in ResidualNet().state_dict().items()}, weights)
+    save_file({name: 0.02 * torch.randn_like(value) for name, value in UNet().state_dict().items()}, weights)
     requests, scenes = list[str](), list[bytes]()
     for words, named, texture in (
         (("--workers", 4), "shipped", "exemplar"),  # a single photo needs none

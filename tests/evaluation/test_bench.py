@@ -27,6 +27,7 @@ from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
+from spackle.residual.architectures import UNet, open_residual
 from spackle.scene_fill import FillContext, fill_view
 
 CPU = torch.device("cpu")
@@ -56,12 +57,13 @@ def results() -> Results:
             view = image._replace(setting=f"{disparity:g}", view="right", method="spackle")
             rows += [view._replace(metric=name, value=value) for name, value in cost(10 * k, 2.0**k).items()]
     rows.append(Row("Middlebury", "broken", "", "", "", "problem", "no such file"))
-    return Results(config, rows, {"parameters": bench.count_parameters()})
+    return Results(config, rows, {"parameters": bench.count_parameters(UNet())})
 
 
-def test_the_networks_have_the_papers_parameters() -> None:
-    found, paper = bench.count_parameters(), PAPER["parameters"]
-    assert (found["base"], found["residual"]) == (702_305_169, 8_023_153)
+@pytest.mark.parametrize(("name", "count"), [("unet", 8_023_153), ("sharp-decoder", 8_022_894)])
+def test_the_networks_have_the_papers_parameters(name: str, count: int) -> None:
+    found, paper = bench.count_parameters(open_residual(name)), PAPER["parameters"]
+    assert (found["base"], found["residual"]) == (702_305_169, count)
     assert round(found["base"] / 1e6, 2) == paper["base_m"]
     assert round(found["residual"] / 1e6, 2) == paper["residual_m"]
     assert round(100 * found["share"], 2) == paper["share_percent"]

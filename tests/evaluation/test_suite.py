@@ -19,7 +19,8 @@ from spackle.errors import InputError
 from spackle.evaluation.bench import complete_in_laps
 from spackle.image import Photo
 from spackle.render import CpuRenderer
-from spackle.residual import ResidualNet, hole_area_ratio
+from spackle.residual import hole_area_ratio
+from spackle.residual.architectures import UNet
 from spackle.scene_fill import FillContext, fill_view
 
 SIDE = 64
@@ -45,7 +46,7 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
 
 def test_a_view_is_found_by_its_share_of_holes_and_completed() -> None:
     torch.manual_seed(0)
-    network = ResidualNet().eval().requires_grad_(False)
+    network = UNet().eval().requires_grad_(False)
     base, camera = holed_scene(96)
     assert hole_area_ratio(CpuRenderer().render(base, camera).alpha) == 0
     disparity, view = find_view(base, camera, CpuRenderer())

@@ -18,6 +18,7 @@ from spackle.gaussians import Gaussians
 from spackle.render.protocol import Rendering
 from spackle.render.reference import ReferenceRenderer
 from spackle.residual import ResidualNet, Seeds, ViewFeatures, complete_view, hole_area_ratio, make_seeds
+from spackle.residual.architectures import open_residual
 from spackle.residual.complete import compose
 from spackle.residual.network import COLOR_MARGIN, DELTA_CHANNELS, find_rim, network_input
 from spackle.surface import surface_gaussians
@@ -97,12 +98,13 @@ def test_cells_are_as_many_as_holes_and_the_paper_keeps_64() -> None:
         assert len(complete_view(base, scene.camera, scene.camera, CPU, network, least=64)) == 64
 
 
-def test_without_holes_or_network_there_is_nothing_or_the_seeds() -> None:
+@pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
+def test_without_holes_or_network_there_is_nothing_or_the_seeds(name: str) -> None:
     scene = box_before_wall(width=48, height=36, focal=40)
     base = scene.base()
     assert len(complete_view(base, scene.camera, scene.camera, CPU, None)) == 0
     camera = away(scene.camera)
-    seeds, untrained = (complete_view(base, camera, scene.camera, CPU, network) for network in (None, ResidualNet()))
+    seeds, untrained = (complete_view(base, camera, scene.camera, CPU, f_res) for f_res in (None, open_residual(name)))
     assert len(seeds) == 24 * 18  # every cell: nothing is seen there
     torch.testing.assert_close(seeds.means, untrained.means, rtol=1e-3, atol=1e-3)
 

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from holes import CPU, box_view, features_of, random_network, random_view
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.torch import save_file
+from sharp_weights import tiny_weights, write_tiny
 
+from spackle.camera import Camera
 from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError
+from spackle.network_file import channels_last
 from spackle.render.protocol import Rendering
-from spackle.residual import ResidualNet, ViewFeatures, hole_area_ratio, hole_mask
-from spackle.residual.network import DELTA_CHANNELS, IN_CHANNELS, network_input
+from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask
+from spackle.residual.architectures import NOTE, SharpDecoder, load_residual, open_residual
+from spackle.residual.base_values import seen_in_photo
+from spackle.residual.network import DELTA_CHANNELS, PHOTO, RIM_CHANNELS, network_input, predict_deltas
+from spackle.training.residual import first_network
+
+ARCHITECTURES = ("unet", "sharp-decoder")
 
 
 def test_a_hole_is_where_alpha_is_below_the_threshold() -> None:
@@ -51,16 +62,17 @@ def test_features_match_a_plain_loop_and_are_detached(seed: int, size: tuple[int
             assert bool(cues.mask[row, column]) == mask
 
 
+@pytest.mark.parametrize("name", ARCHITECTURES)
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 31)])
-def test_the_network_takes_any_size_and_does_not_mix_a_batch(size: tuple[int, int]) -> None:
-    network = random_network()
-    assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(8.02e6, abs=0.02e6)
-    features = torch.randn(2, IN_CHANNELS, *size, generator=torch.Generator().manual_seed(0))
+def test_the_network_takes_any_size_and_does_not_mix_a_batch(name: str, size: tuple[int, int]) -> None:
+    network = random_network(name=name)
+    assert sum(parameter.numel() for parameter in network.parameters()) == pytest.approx(8.02e6, rel=2e-3)
+    features = torch.randn(2, PHOTO.stop, *size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         deltas, alone = network(features), torch.cat([network(f[None]) for f in features])
     assert deltas.shape == (2, DELTA_CHANNELS, *size)
     assert bool((deltas != 0).any())
-    assert not ResidualNet()(features).any()  # untrained: the view is the seeds
+    assert not open_residual(name)(features).any()  # untrained: the view is the seeds
     torch.testing.assert_close(deltas, alone, rtol=1e-3, atol=1e-4)
 
 
@@ -73,6 +85,45 @@ def test_the_networks_input_knows_no_unit_of_length() -> None:
         seen = dataclasses.replace(view, depth=view.depth * unit)
         scaled = dataclasses.replace(camera, world_to_camera=pose)
         found.append(network_input(*features_of(seen, scaled, context.photo_camera)))
-    assert found[0].shape == (1, IN_CHANNELS, 36, 48)
+    assert found[0].shape == (1, RIM_CHANNELS, 36, 48)
     assert bool(found[0].isfinite().all())
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_a_file_says_its_architecture_and_gives_the_same_network(name: str, tmp_path: Path) -> None:
+    network, path = random_network(name=name).half().float().eval(), tmp_path / "weights.safetensors"
+    channels_last(network)  # as it is read, so that sums have one order
+    tensors = {key: value.half().contiguous() for key, value in network.state_dict().items()}
+    save_file(tensors, path, {NOTE: name})
+    loaded = load_residual(path)
+    assert loaded.name == name
+    context, camera = box_view()
+    view = features_of(context.base, camera, context.photo_camera, CPU.render(context.base, context.photo_camera).rgb)
+    assert torch.equal(predict_deltas(loaded, *view, "fp32"), predict_deltas(network, *view, "fp32"))
+    for wrong, said in ((next(n for n in ARCHITECTURES if n != name), "another network's"), ("vit", "not known here")):
+        save_file(tensors, path, {NOTE: wrong})
+        with pytest.raises(InputError, match=said):
+            load_residual(path)
+
+
+def test_the_photo_is_seen_where_a_cells_point_lies_in_it() -> None:
+    camera = Camera.from_focal(40, 64, 48)
+    pose = torch.eye(4)
+    pose[0, 3] = -0.8  # two metres away everything moves by 16 pixels, 8 cells
+    photo, nowhere = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)), torch.zeros(24, 32, 3)
+    cells = photo.unflatten(1, (32, 2)).unflatten(0, (24, 2)).mean((1, 3))
+    view = dataclasses.replace(camera, world_to_camera=pose)
+    seen = seen_in_photo(photo, nowhere, torch.full((24, 32), 0.5), view, camera)
+    torch.testing.assert_close(seen[:, :24], cells[:, 8:])
+    assert not seen[:, 24:].any()
+
+
+def test_the_paper_architecture_starts_as_sharps_decoder(tmp_path: Path) -> None:
+    network = first_network("sharp-decoder", write_tiny(tmp_path / "tiny.pt"))
+    assert isinstance(network, SharpDecoder)
+    weights = {f"feature_model.{key}": value for key, value in network.feature_model.state_dict().items()}
+    assert all(torch.equal(value, tiny_weights()[key]) for key, value in weights.items())
+    assert not network(torch.randn(1, PHOTO.stop, 16, 16)).any()
+    with pytest.raises(InputError, match=r"tiny.pt: .*another network"):
+        first_network("unet", tmp_path / "tiny.pt")

@@ -19,7 +19,8 @@ from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer, touched_tiles
 from spackle.render.protocol import Rendering
-from spackle.residual import ResidualNet, ViewFeatures, hole_area_ratio, hole_mask, make_seeds
+from spackle.residual import ViewFeatures, hole_area_ratio, hole_mask, make_seeds
+from spackle.residual.architectures import UNet
 from spackle.residual.base_values import inside_photo
 from spackle.scene_fill import FillContext, fill, fill_scene, fill_view
 from spackle.scene_fill.fill import COARSE, REACH_CELLS, WIDEST, farthest_first, rim_underlay
@@ -54,7 +55,7 @@ def test_a_completed_view_is_that_of_drawing_everything(network: bool) -> None:
 def test_a_view_of_nothing_at_all_becomes_a_wall(size: tuple[int, int], network: bool, empty: bool) -> None:
     scene = wall(4.0, *size)
     base, camera = (Gaussians.empty(), scene.camera) if empty else (scene.base(), away(scene.camera))
-    aux = fill_view(FillContext(base, scene.camera, CPU, ResidualNet() if network else None), camera).aux
+    aux = fill_view(FillContext(base, scene.camera, CPU, UNet() if network else None), camera).aux
     assert holes_of(camera, base) == 1
     assert all(bool(t.isfinite().all()) for t in aux.tensors)
     assert holes_of(camera, base, aux) < 0.01

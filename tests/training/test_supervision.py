@@ -140,7 +140,7 @@ def whole(request: pytest.FixtureRequest) -> Sample:
     if request.param == "box from aside":
         scene = box_before_wall(width=144, height=112, focal=120)
         view, base = shifted(scene.camera, 0.4), scene.base()
-        return Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb)
+        return Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb, scene.rgb)
     scene = slanted_plane(1.5, 4.5, 0, 144, 112, 120)
     scene.depth[40:80, 50:90] = 1.2  # a stone
     return reverse(scene, looking(scene.camera, -0.4, 0.1, 0.1))

@@ -26,7 +26,7 @@ from spackle.pipeline import Options, Pipeline, complete
 from spackle.progress import Reporter
 from spackle.render import Renderer
 from spackle.residual import hole_area_ratio, hole_mask
-from spackle.residual.network import shipped_network
+from spackle.residual.architectures import shipped_network
 from spackle.training.losses import hole_psnr
 from spackle.views import PathOptions
 

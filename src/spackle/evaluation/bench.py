@@ -74,7 +74,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if slow else runs)}
     config["base"] |= {"device": device.type}
     config |= {"hardware": hardware(device), "versions": versions()}
-    about = {"parameters": count_parameters()}
+    about = {"parameters": count_parameters(evaluation.network)}
     timed: list[str] = []  # an image of this process, after which it is warm
 
     def time_next(index: int, case: Case) -> tuple[list[Row], list[Path]]:
@@ -167,16 +167,17 @@ def view_figures(base: int, added: int, seconds: Mapping[str, Sequence[float]]) 
     return [*figures.items(), *each]
 
 
-def count_parameters() -> dict[str, float]:
-    """Of SHARP as its checkpoint has it, 702.31 M; of that used by inference; of the residual, 8.02 M; and its share.
+def count_parameters(residual: ResidualNet | None) -> dict[str, float]:
+    """Of SHARP as its checkpoint has it, 702.31 M; of that used by inference; of the residual; and its share.
 
-    They are counted in the networks, without weights. Inference needs neither SHARP's classifiers nor the part that
+    SHARP's are counted in the network, without weights. Inference needs neither SHARP's classifiers nor the part that
     aligns depths.
     """
     with torch.device("meta"):
-        used, residual = (sum(p.numel() for p in n.parameters()) for n in (SharpNetwork(FULL), ResidualNet()))
+        used = sum(p.numel() for p in SharpNetwork(FULL).parameters())
+    extra = 0 if residual is None else sum(p.numel() for p in residual.parameters())
     base = used + sum(map(math.prod, unused_shapes(FULL).values()))
-    return {"base": base, "base_used": used, "residual": residual, "share": residual / base}
+    return {"base": base, "base_used": used, "residual": extra, "share": extra / base}
 
 
 # --- the clock

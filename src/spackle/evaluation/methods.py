@@ -93,6 +93,7 @@ def _paper(context: FillContext, cameras: Sequence[Camera], before: Sequence[Ren
             threshold=placed.threshold,
             least=LEAST_AUX,
             rendering=rendering,
+            photo=placed.photo,
             precision=placed.precision,
         )
         yield _drawn(placed, aux, camera, rendering)
@@ -122,7 +123,7 @@ def _dense(context: FillContext, cameras: Sequence[Camera], before: Sequence[Ren
         seeds = make_seeds(features, camera, photo_camera)
         deltas = None
         if network is not None:
-            rim, _ = find_rim(features, seeds, camera, photo_camera)
+            rim, _ = find_rim(features, seeds, camera, photo_camera, context.photo)
             deltas = predict_deltas(network, features, seeds, rim, context.precision, dense=True).flatten(0, 1)
         aux = compose(seeds.select(torch.ones_like(features.mask)), deltas, camera)
         yield _drawn(context, push_behind(aux, camera.position, [guard]), camera, rendering)

@@ -3,7 +3,7 @@
 - `complete`: one view, eqs. 2 to 9: base values and deltas to Gaussians; those of the masked cells are 𝒢̃_aug (eq. 7).
 - `view_features`: M_v (eq. 4), HAR (eqs. 10 and 11), and what the rendered view shows, in cells of 2×2 pixels.
 - `base_values`: colour and depth of the aux Gaussians before the network; `epipolar_walk` finds what is extended.
-- `network`: f_res (eq. 5) and what it sees.
+- `network`: f_res (eq. 5) and what it sees; `architectures`: the two that it may have, and their weight files.
 """
 
 from spackle.residual.base_values import Seeds, make_seeds

@@ -11,6 +11,7 @@ import dataclasses
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
 
 from spackle.camera import Camera, beside
 from spackle.filters import FAR_BIAS, distance_to, far_fill, greatest_around, nearest_known
@@ -64,11 +65,27 @@ def make_seeds(features: ViewFeatures, camera: Camera, photo_camera: Camera) -> 
 
 def inside_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> Tensor:
     """[h, w] bool: which cells' points lie in the photo's frame."""
+    place, z = _place_in_photo(inverse_depth, camera, photo_camera)
+    return ((z > 0) & (place >= 0) & (place < z)).all(-1)
+
+
+def seen_in_photo(
+    photo: Tensor, elsewhere: Tensor, inverse_depth: Tensor, camera: Camera, photo_camera: Camera
+) -> Tensor:
+    """[h, w, 3] sRGB: the photo [H, W, 3] where the cells' points lie in it, and `elsewhere` [h, w, 3] outside."""
+    place, z = _place_in_photo(inverse_depth, camera, photo_camera)
+    cells = avg_pool2d(photo.cpu().movedim(-1, 0)[None], CELL, ceil_mode=True, count_include_pad=False)
+    grid = (2 * place / z.clamp_min(LEAST) - 1).clamp(-2, 2).to(cells)[None]
+    seen = grid_sample(cells, grid, padding_mode="border", align_corners=False)[0].movedim(0, -1)
+    return torch.where(((z > 0) & (place >= 0) & (place < z)).all(-1, keepdim=True), seen, elsewhere)
+
+
+def _place_in_photo(inverse_depth: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:
+    """Where the cells' points lie: x and y [h, w, 2] in widths and heights of the photo, times z, and z [h, w, 1]."""
     rays, motion = _rays_in_photo(cell_centers(camera).double(), camera, photo_camera)
     points, lens = rays + inverse_depth[..., None] * motion[:3, 3], photo_camera.K.cpu().double()
     place, z = points[..., :2] * lens.diagonal()[:2] + points[..., 2:] * lens[:2, 2], points[..., 2:]
-    size = torch.tensor([photo_camera.width, photo_camera.height])
-    return ((z > 0) & (place >= 0) & (place < size * z)).all(-1)
+    return place / torch.tensor([photo_camera.width, photo_camera.height]), z
 
 
 def _rays_in_photo(uv: Tensor, camera: Camera, photo_camera: Camera) -> tuple[Tensor, Tensor]:

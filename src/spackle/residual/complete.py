@@ -43,6 +43,7 @@ def complete_view(
     threshold: float = MASK_THRESHOLD,
     least: int = 0,
     rendering: Rendering | None = None,
+    photo: Tensor | None = None,
     precision: Precision = "auto",
 ) -> Gaussians:
     """𝒢̃_aug of a view (eq. 7): one Gaussian for each masked cell, on top of the base, which is only read.
@@ -60,6 +61,7 @@ def complete_view(
         least: so many Gaussians come in any case, where few cells are masked those of the least opaque cells; 64 in
             the paper (training details), 0 where a view without holes shall stay as it is.
         rendering: ℛ(𝒢_base, v), where that is at hand.
+        photo: I as [H, W, 3] sRGB, for a network that `sees_photo`; where None, what the base shows of it.
         precision: of the network; auto is bfloat16 where the hardware multiplies it natively.
     """
     view = renderer.render(base, camera) if rendering is None else rendering  # eqs. 2 and 3
@@ -72,7 +74,9 @@ def complete_view(
         return Gaussians.empty(base.means.device)
     seeds, deltas = make_seeds(features, camera, photo_camera), None
     if network is not None:
-        rim, _ = find_rim(features, seeds, camera, photo_camera)
+        if network.sees_photo and photo is None:
+            photo = renderer.render(base, photo_camera).rgb
+        rim, _ = find_rim(features, seeds, camera, photo_camera, photo)
         deltas = predict_deltas(network, features, seeds, rim, precision)[mask]  # eq. 5
     return compose(seeds.select(mask), deltas, camera).to(base.means.device)  # eq. 7
 

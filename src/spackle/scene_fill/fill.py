@@ -65,6 +65,12 @@ class FillContext:
         network = None if self.network is None else copy.deepcopy(self.network).to(device)
         return dataclasses.replace(self, base=self.base.to(device), network=network)
 
+    @functools.cached_property
+    def photo(self) -> Tensor | None:
+        """[H, W, 3] sRGB: the photo as the base shows it, for a network that sees it."""
+        seen = self.network is not None and self.network.sees_photo
+        return self.renderer.render(self.placed.base, self.photo_camera).rgb if seen else None
+
     @property
     def seeds_alone(self) -> FillContext:
         """The same without network and texture."""
@@ -244,7 +250,7 @@ def _propose(
     mask, seeds = features.mask, make_seeds(features, camera, context.photo_camera)
     chosen, eye, deltas, picture, beyond, parts = seeds.select(mask), camera.position, None, None, None, []
     if context.network is not None or context.texture is not None:
-        rim, patches = find_rim(features, seeds, camera, context.photo_camera)
+        rim, patches = find_rim(features, seeds, camera, context.photo_camera, context.photo)
         beyond = rim.beyond[mask]
     if context.network is not None:
         deltas = predict_deltas(context.network, features, seeds, rim, context.precision)[mask]

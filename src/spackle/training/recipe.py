@@ -168,7 +168,9 @@ class Recipe(AnyRecipe):
 
     data: DataRecipe = DataRecipe()
     loss: LossRecipe = LossRecipe()
-    init: Path | None = None  # weights to start from
+    # Of the residual. A checkpoint of another does not fit, and older ones lack the key.
+    network: Annotated[Literal["unet", "sharp-decoder"], FREE] = "unet"
+    init: Path | None = None  # weights to start from; for sharp-decoder also SHARP's own
 
     @model_validator(mode="after")
     def _has_features(self) -> Recipe:

@@ -18,14 +18,17 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from spackle.device import pick_dtype
+from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.folders import make_folder
 from spackle.formats.png import sheet
+from spackle.network_file import load_strict, read_tensors
 from spackle.progress import Reporter
 from spackle.render import Renderer, device_of, get_renderer, render_batch
 from spackle.render.protocol import Rendering
+from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
-from spackle.residual.network import ResidualNet, load_residual, network_input
+from spackle.residual.network import ResidualNet, network_input
 from spackle.residual.view_features import ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
@@ -167,6 +170,26 @@ def training_cells(cues: ViewFeatures, least: int = MIN_AUX) -> Tensor:
     return cells.view_as(cues.mask)
 
 
+def first_network(name: str, init: Path | None = None) -> ResidualNet:
+    """A network of an architecture to begin with: untrained, or from a file.
+
+    The file holds such a network's weights, or for a "sharp-decoder" those of SHARP, which has no such stem and heads.
+    InputError for a missing, broken or foreign file.
+    """
+    if init is None:
+        return open_residual(name)
+    tensors, prefix = read_tensors(init, "give init=FILE"), "feature_model."
+    if name == SharpDecoder.name and "prediction_head.geometry_prediction_head.weight" in tensors:
+        sharp = SharpDecoder(decoder_size(tensors))
+        decoder = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+        load_strict(sharp.feature_model, decoder, init, "give SHARP's checkpoint as it was downloaded")
+        return sharp
+    network = load_residual(init)
+    if network.name != name:
+        raise InputError(f"{init}: weights of the network {network.name}: give network={network.name}, or another init")
+    return network
+
+
 class ResidualTask(ViewTask):
     """Items are samples, of one size; all of a step go through the network together."""
 
@@ -175,13 +198,9 @@ class ResidualTask(ViewTask):
     def __init__(self, recipe: Recipe, device: torch.device) -> None:
         """Find a recipe's files, make no sample yet; InputError where they cannot be used."""
         super().__init__(recipe, device)
-        if recipe.init is not None:
-            network = load_residual(recipe.init)
-        else:
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(recipe.run.seed)
-                network = ResidualNet()
-        self.network = network.requires_grad_()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(recipe.run.seed)
+            self.network = first_network(recipe.network, recipe.init).requires_grad_()
         self.sources = find_sources(recipe.data, self.renderer)
         self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources), recipe.optim.batch
 
@@ -234,4 +253,4 @@ class ResidualTask(ViewTask):
     def export(self, network: nn.Module, path: Path) -> None:
         """Weights in half precision, for `spackle predict --residual`."""
         tensors = {name: tensor.detach().half().cpu().contiguous() for name, tensor in network.state_dict().items()}
-        write_whole(path, save(tensors))
+        write_whole(path, save(tensors, {NOTE: self.recipe.network}))

@@ -40,7 +40,7 @@ REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
 EXACT = ("camera.K", "camera.world_to_camera", "base.means", "seeds.uv", "seeds.inverse_depth")
 PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
-SAMPLES_VERSION = 4  # goes up whenever the same recipe would make other samples
+SAMPLES_VERSION = 5  # goes up whenever the same recipe would make other samples
 P = TypeVar("P")
 
 
@@ -57,14 +57,16 @@ class Sample:
     target: Tensor  # [H, W, 3] sRGB
 
     @staticmethod
-    def of(base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, target: Tensor) -> Sample:
+    def of(
+        base: Gaussians, rendering: Rendering, camera: Camera, photo_camera: Camera, photo: Tensor, target: Tensor
+    ) -> Sample:
         """A whole view: frozen Gaussians, their rendering from `camera`, and the truth `target` [H, W, 3] sRGB.
 
-        `photo_camera` is that of the base's photo.
+        `photo_camera` is that of the base's `photo` [h, w, 3] sRGB.
         """
         rendering, cues = rendering.detach(), ViewFeatures.of(rendering)
         seeds = make_seeds(cues, camera, photo_camera)
-        rim, _ = find_rim(cues, seeds, camera, photo_camera)
+        rim, _ = find_rim(cues, seeds, camera, photo_camera, photo)
         return Sample(camera, base.detach(), rendering, seeds, cues, rim, target)
 
     @property

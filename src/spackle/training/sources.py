@@ -104,18 +104,17 @@ def reverse_view(prediction: BasePrediction, photo: Tensor, viewer: Camera, rend
         renderer: draws the views.
     """
     camera, gaussians = prediction.camera, prediction.gaussians
-    seen = with_backing(seen_from(gaussians, viewer, renderer), gaussians, camera)
-    kept = gaussians.select(seen)
-    return Sample.of(kept, renderer.render(kept, camera), camera, viewer, photo)
+    view = renderer.render(gaussians, viewer)
+    kept = gaussians.select(with_backing(seen_from(gaussians, viewer, view.depth), gaussians, camera))
+    return Sample.of(kept, renderer.render(kept, camera), camera, viewer, view.rgb, photo)
 
 
-def seen_from(gaussians: Gaussians, viewer: Camera, renderer: Renderer) -> Tensor:
-    """[N] bool: which Gaussians a camera sees, by the depth that it renders around their centres.
+def seen_from(gaussians: Gaussians, viewer: Camera, depth: Tensor) -> Tensor:
+    """[N] bool: which Gaussians a camera sees, by their rendered `depth` [H, W] around their centres.
 
     Around, because a blob is wider than a pixel: at an outline the nearer surface's depth bleeds over
     the farther one, and on steep ground a pixel's depth is behind half of what lies in it.
     """
-    depth = renderer.render(gaussians, viewer).depth
     around = max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     uv, z = viewer.project(gaussians.means)
     column, row = uv.floor().long().unbind(-1)
@@ -157,7 +156,7 @@ def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Rend
     """The left photo of a stereo pair seen from the right camera, whose photo is the truth."""
     left, right, depth, camera, beside = load_pair(_chosen(rng, folders))
     base = lift(left, depth, camera).gaussians
-    return Sample.of(base, renderer.render(base, beside), beside, camera, right)
+    return Sample.of(base, renderer.render(base, beside), beside, camera, left, right)
 
 
 def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
@@ -181,7 +180,7 @@ def pseudo_view(rng: np.random.Generator, files: DatasetFiles, places: Sequence[
     photo, index = places[int(rng.integers(len(places)))]
     view = files.group(photo).view(index, with_base=True)
     assert view.base is not None
-    return Sample.of(view.base, view.rendering, view.camera, view.photo_camera, view.target)
+    return Sample.of(view.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
 
 
 # Photos with depth --------------------------------------------------------------------------------

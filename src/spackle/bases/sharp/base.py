@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
@@ -34,7 +33,7 @@ from spackle.errors import InputError, one_line, reading, reason_in_a_line
 from spackle.files import sha256_of
 from spackle.gaussians import Gaussians
 from spackle.image import Photo, working_size
-from spackle.network_file import Shapes, load_strict, read_tensors
+from spackle.network_file import Shapes, load_strict, read_note, read_tensors
 
 LOG = logging.getLogger("spackle")
 Forward = Callable[[Tensor, float, int, Progress | None], SharpOutput]  # as `SharpNetwork.forward`
@@ -267,11 +266,7 @@ def link_owner(owner: Owner, folder: Path) -> None:
 
 def owner_of(path: str | os.PathLike[str]) -> Owner | None:
     """The checkpoint that a readable file with a decoder names; None for other files, InputError if it names none."""
-    with open(path, "rb") as file:
-        if file.read(9)[8:] != b"{":  # no safetensors
-            return None
-    with safe_open(path, framework="pt") as opened:
-        note = (opened.metadata() or {}).get(NOTE)
+    note = read_note(path, NOTE)
     if note is None:
         return None
     with reading(path, "does not say which checkpoint it was trained on: train it again"):

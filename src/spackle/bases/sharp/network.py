@@ -106,9 +106,11 @@ class Decoder(nn.Module):
         self.convs = nn.ModuleList([finest, *coarser])
         self.fusions = nn.ModuleList(Fusion(width, doubles=level > 0) for level in range(len(dims)))
 
-    def forward(self, maps: Sequence[Tensor]) -> Tensor:
-        """Maps from fine to coarse, [1, dims[i], H/2^i, W/2^i], to [1, width, H, W]."""
-        features: Tensor | None = None
+    def forward(self, maps: Sequence[Tensor], features: Tensor | None = None) -> Tensor:
+        """Maps from fine to coarse, [1, dims[i], H/2^i, W/2^i], to [1, width, H, W].
+
+        The coarsest are added to `features`; SHARP has none, and leaves out the layers that would add to them.
+        """
         for level in reversed(range(len(maps))):
             projected = self.convs[level](maps[level])
             fuse = self.fusions[level]
@@ -216,9 +218,9 @@ class FeatureNetwork(nn.Module):
         self.texture_head = _head(width, config.feature_width)
         self.geometry_head = _head(width, config.feature_width)
 
-    def forward(self, picture: Tensor, maps: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Texture and geometry features [1, F, side/2, side/2] of [1, 5, side, side] in -1..1."""
-        features = self.decoder(maps)
+    def forward(self, picture: Tensor, maps: list[Tensor], coarser: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Texture and geometry features [1, F, side/2, side/2] of [1, 5, side, side] in -1..1; see `Decoder`."""
+        features = self.decoder(maps, coarser)
         features = self.fusion(features, self.image_encoder.conv(picture).to(features))  # type: ignore[operator]
         return self.texture_head(features), self.geometry_head(features)
 

@@ -1,0 +1,188 @@
+"""The architectures of f_res, and their weight files.
+
+`UNet` is small where a view has few holes. `SharpDecoder` is the paper's: "replicates the baseline architecture".
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, pad
+
+from spackle.bases.sharp.encoder import CONFIGS, FULL, ExactConv, SharpConfig
+from spackle.bases.sharp.network import FeatureNetwork
+from spackle.errors import InputError, one_line
+from spackle.network_file import channels_last, load_strict, read_note, read_tensors
+from spackle.residual.network import (
+    COLOR,
+    DELTA_CHANNELS,
+    GEOMETRY_CHANNELS,
+    KNOWN_COLORS,
+    PHOTO,
+    RIM_CHANNELS,
+    SEED_DEPTH,
+    SEED_RGB,
+    STRIDE,
+    TEXTURE_CHANNELS,
+    VIEW_CHANNELS,
+    VIEW_DEPTH,
+    ResidualNet,
+)
+
+SHIPPED = Path(__file__).parent.parent / "weights" / "residual.safetensors"
+NOTE = "spackle.residual"  # in a file's metadata: the architecture's name; older files, all of them UNet's, lack it
+WIDTHS = (48, 80, 128, 256, 256)  # channels of the U-Net from the finest grid to the coarsest
+COARSE_BLOCKS = 3  # residual blocks at the coarsest grid, where context is wide and cheap
+STEM_WIDTH = 48  # channels of the decoder's stem, which has the 0.24 M parameters that the paper's 8.02 M leave
+STEM_GAIN = 3.0  # the features are of order 0.3
+
+
+def padded(features: Tensor) -> Tensor:
+    """Features [B, C, h, w], completed so that each level's sides are twice the next one's."""
+    height, width = features.shape[-2:]
+    return pad(features, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(act(conv(act(x)))), starting as the identity; no norm, for its statistics would depend on the crop."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, h, w] to the same shape."""
+        # In place where no gradient needs what was there: at this size fresh memory costs as much as the arithmetic.
+        out: Tensor = self.second(self.first(torch.relu(x)).relu_())
+        return out.add_(x)
+
+
+class UNet(ResidualNet):
+    """Encoder of a view's features, decoder, and SHARP's two heads: 8.02 M parameters."""
+
+    name, sees_photo, local = "unet", False, True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(RIM_CHANNELS, WIDTHS[0], 3, padding=1)
+        pairs = list(itertools.pairwise(WIDTHS))
+        self.down = nn.ModuleList(nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in pairs)
+        self.encode = nn.ModuleList(ResidualBlock(width) for width in WIDTHS[:-1])
+        self.coarse = nn.Sequential(*(ResidualBlock(WIDTHS[-1]) for _ in range(COARSE_BLOCKS)))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairs)
+        self.decode = nn.ModuleList(ResidualBlock(width) for width in WIDTHS[:-1])
+        self.geometry = _head(WIDTHS[0], GEOMETRY_CHANNELS)
+        self.texture = _head(WIDTHS[0], TEXTURE_CHANNELS + len(KNOWN_COLORS))
+        _initialise(self)
+
+    def forward(self, features: Tensor) -> Tensor:
+        height, width = features.shape[-2:]
+        x = self.stem(padded(features[:, :RIM_CHANNELS]))
+        skips = []
+        for encode, down in zip(self.encode, self.down, strict=True):
+            x = encode(x)
+            skips.append(x)
+            x = down(x)
+        x = self.coarse(x)
+        for skip, up, decode in reversed(list(zip(skips, self.up, self.decode, strict=True))):
+            fine = interpolate(up(x), scale_factor=2, mode="bilinear", align_corners=False)
+            x = decode(fine.add_(skip))
+        heads = torch.cat([self.geometry(x), self.texture(x)], dim=1)[..., :height, :width]
+        # The last outputs say how much of the known colours to take.
+        deltas, shares = torch.split(heads, [DELTA_CHANNELS, len(KNOWN_COLORS)], dim=1)
+        copied = sum(shares[:, k : k + 1] * features[:, colors] for k, colors in enumerate(KNOWN_COLORS))
+        return torch.cat([deltas[:, : COLOR.start], deltas[:, COLOR] + copied, deltas[:, COLOR.stop :]], dim=1)
+
+
+class SharpDecoder(ResidualNet):
+    """SHARP's Gaussian decoder on features of a view instead of a photo: 8.02 M parameters, 7.78 M of them SHARP's own.
+
+    A stem takes the place of SHARP's encoder. Where SHARP's decoder looks at its picture and at two layers of
+    disparity, this one looks at the base values, and at the depth that the view shows.
+    """
+
+    name, sees_photo, local = "sharp-decoder", True, False  # group norms compare a cell with all others
+
+    def __init__(self, config: SharpConfig = FULL) -> None:
+        super().__init__()
+        dims = (config.depth_width, *config.pyramid)
+        self.stem = nn.Conv2d(VIEW_CHANNELS + 3, STEM_WIDTH, 3, padding=1)
+        self.down = nn.ModuleList(nn.Conv2d(STEM_WIDTH, STEM_WIDTH, 3, stride=2, padding=1) for _ in dims[1:])
+        self.maps = nn.ModuleList(nn.Conv2d(STEM_WIDTH, dim, 1) for dim in dims)
+        self.feature_model = FeatureNetwork(config)
+        self.geometry = ExactConv(config.feature_width, GEOMETRY_CHANNELS, 1)
+        self.texture = ExactConv(config.feature_width, TEXTURE_CHANNELS, 1)
+        _scale(STEM_GAIN, self.stem)
+        _scale(math.sqrt(2), *self.down, *self.maps)
+        _scale(0.0, self.geometry, self.texture)
+
+    def forward(self, features: Tensor) -> Tensor:
+        height, width = features.shape[-2:]
+        features = padded(features)
+        seen = torch.cat([features[:, :VIEW_CHANNELS], features[:, PHOTO]], dim=1)
+        x, maps = torch.relu(self.stem(seen)), list[Tensor]()
+        for to_map, down in itertools.zip_longest(self.maps, self.down):
+            maps.append(to_map(x))
+            x = torch.relu(down(x)) if down is not None else x
+        # Depths as SHARP has disparities, in -1..1: tanh(log(d) / 2) = (d - 1) / (d + 1).
+        depths = torch.tanh(features[:, [VIEW_DEPTH, SEED_DEPTH]] / 2)
+        picture = torch.cat([2 * features[:, SEED_RGB], depths], dim=1)
+        pixels = interpolate(picture, scale_factor=2, mode="nearest")
+        texture, geometry = self.feature_model(pixels, maps, x.new_zeros(()))
+        return torch.cat([self.geometry(geometry), self.texture(texture)], dim=1)[..., :height, :width]
+
+
+def _head(width: int, channels: int) -> nn.Sequential:
+    return nn.Sequential(ResidualBlock(width), nn.ReLU(), nn.Conv2d(width, channels, 1))
+
+
+def _initialise(network: UNet) -> None:
+    """Numbers of order one at every scale, blocks that start as the identity, and heads that start at zero."""
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Conv2d):
+            zero = name.endswith("second") or name in ("geometry.2", "texture.2")
+            gain = math.sqrt(2) if name.endswith("first") else 1.0
+            _scale(0.0 if zero else STEM_GAIN if name == "stem" else gain, module)
+
+
+def _scale(gain: float, *layers: Any) -> None:
+    """Random weights that multiply the size of what comes in by about `gain`, and no bias."""
+    for layer in layers:
+        nn.init.normal_(layer.weight, std=gain / math.sqrt(layer.weight[0].numel()))
+        nn.init.zeros_(layer.bias)
+
+
+def open_residual(name: str, config: SharpConfig = FULL) -> ResidualNet:
+    """An untrained network of an architecture, of SHARP's size where it has one."""
+    return UNet() if name == UNet.name else SharpDecoder(config)
+
+
+@functools.cache
+def shipped_network() -> ResidualNet | None:
+    """The network with the weights that come with the package; None if a build has none."""
+    return load_residual(SHIPPED) if SHIPPED.is_file() else None
+
+
+def load_residual(path: str | os.PathLike[str]) -> ResidualNet:
+    """Read a network; InputError for a missing or broken file, or weights of another architecture than it says."""
+    advice = "give the residual's weights, 'seeds' or 'none'"
+    tensors, name = read_tensors(path, advice), read_note(path, NOTE) or UNet.name
+    if name not in (UNet.name, SharpDecoder.name):
+        raise InputError(f"{path}: of an architecture that is not known here, {one_line(name)[:60]}: {advice}")
+    return load_strict(open_residual(name, decoder_size(tensors)), tensors, path, advice, prepare=channels_last)
+
+
+def decoder_size(tensors: Mapping[str, Tensor]) -> SharpConfig:
+    """SHARP's size, published or tiny, by what a file holds of its decoder; the published one where that is nothing."""
+    last = tensors.get("feature_model.fusion.out_conv.bias")
+    width = FULL.gaussian_width if last is None else last.numel()
+    return next((config for config in CONFIGS.values() if config.gaussian_width == width), FULL)
