@@ -67,6 +67,8 @@ def results(title: str, near: bool, figures: Callable[[int], Figures], count: in
         "methods": list(figures(0)),
         "base": {"title": "rgbd", "says": "the dataset's own depth", "weights": None},
         "disparities": None if near else [0.3, 0.4, 0.5],
+        "second_views": "all" if near else None,
+        "side": 1280,
         "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
         "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
     }

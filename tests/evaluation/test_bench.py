@@ -31,6 +31,8 @@ from spackle.residual.architectures import UNet, open_residual
 from spackle.scene_fill import FillContext, fill_view
 
 CPU = torch.device("cpu")
+EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
+PAPER_LABELS = {table["label"] for table in PAPER["tables"]}  # all six
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rerender": 9.0}
 
 
@@ -40,23 +42,25 @@ def cost(added: int = 20, factor: float = 1.0) -> dict[str, float]:
     return {name: value for name, value in bench.view_figures(1000, added, runs) if not name.endswith("_run_ms")}
 
 
-def results() -> Results:
-    """Three images of Middlebury, the second twice as slow and the third four times, and one that failed."""
-    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": ["spackle"], "title": "Middlebury"}
-    config |= {"disparities": [0.3, 0.4, 0.5], "runs": 3, "base_runs": 1}
+def results(title: str = "Middlebury", factor: float = 1.0) -> Results:
+    """Three images, the second twice as slow and the third four times, and one that failed."""
+    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(bench.TIMED), "title": title}
+    config |= {"disparities": [0.3, 0.4, 0.5], "runs": 3, "base_runs": 1, "side": 1280, "device": "cuda"}
     config["base"] = {"title": "SHARP", "says": "a network", "device": "cpu"}
     config["residual"] = {"weights": "shipped", "sha256": "0123456789abcdef", "precision": "bfloat16"}
     config["hardware"] = {"cpu": "A Processor", "cores": 2, "threads": 2}
     config["versions"] = {"spackle": "0", "torch": "2"}
     rows = []
     for k in range(3):
-        image = Row("Middlebury", f"image {k}", "", "", "", "", None)
+        image = Row(title, f"image {k}", "", "", "", "", None)
         facts = {"load": 1.5, "warm": 1, "note.precision": "bf16"}
         rows += [image._replace(metric=metric, value=value) for metric, value in facts.items()]
         for disparity in config["disparities"]:
-            view = image._replace(setting=f"{disparity:g}", view="right", method="spackle")
-            rows += [view._replace(metric=name, value=value) for name, value in cost(10 * k, 2.0**k).items()]
-    rows.append(Row("Middlebury", "broken", "", "", "", "problem", "no such file"))
+            view = image._replace(setting=f"{disparity:g}", view="right")
+            for method, count in (("paper", 10 * k), ("spackle", 40 * k)):
+                figures = cost(count, factor * 2.0**k).items()
+                rows += [view._replace(method=method, metric=name, value=value) for name, value in figures]
+    rows.append(Row(title, "broken", "", "", "", "problem", "no such file"))
     return Results(config, rows, {"parameters": bench.count_parameters(UNet())})
 
 
@@ -78,43 +82,52 @@ def test_times_are_medians_of_runs_that_add_up() -> None:
     assert (found["base_fps"], found["aux_share"], found["merged"]) == (pytest.approx(1 / 1.4), 0.02, 1020)
 
 
-def test_the_layouts_are_the_papers() -> None:
-    evaluation = evaluation_data.results("Middlebury", False, lambda image: {"spackle": {"aux": 30}})
-    *others, overhead, expanded, stages = make_tables([evaluation, results()])
-    assert len({table.label for table in (*others, overhead, expanded, stages)}) == 6
-    groups = [f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3)]
-    assert list(dict.fromkeys(group for group, _ in overhead.heads)) == ["", *groups]
+def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
+    counted = evaluation_data.results("LLFF", False, lambda image: {"spackle": {"aux": 30, "aux_share": 0.5}})
+    runs = [results(), results("Booster", 4.0), counted]
+    tables = {table.label: table for table in make_tables(runs)}
+    assert [*tables][-3:] == ["tab:efficiency_gaussian_overhead", EXPANDED, "tab:efficiency_stages"]
+    overhead, expanded, stages = [*tables.values()][-3:]
+    groups = dict.fromkeys(group for group, _ in overhead.heads)
+    assert [*groups] == ["", *(f"S{k}: disparity 0.{k + 2}" for k in (1, 2, 3))]
     lines = [cells for rows in overhead.bodies for cells in rows]
-    datasets = {cells[0] or None: k for k, cells in enumerate(lines)}
-    ours = lines[datasets["Middlebury"]]
-    assert ours == ("Middlebury", "SHARP", *("10", "1.00") * 3)
-    theirs = lines[datasets["LLFF"]]
-    assert theirs[2:] == ("8,425", "0.71", "15,629", "1.32", "23,397", "1.98")
-    assert lines[datasets["Median time with Spackle (ms)"]][2::2] == ("2,828.0",) * 3
-    assert lines[datasets["Median time overhead"]][2::2] == ("1.00%",) * 3
+    at = {cells[0]: k for k, cells in enumerate(lines) if cells[0]}
+    paper, spackle = ("Spackle, eqs. 2 to 9‡ (SHARP)", "10", "1.00"), ("Spackle‡ (SHARP)", "40", "4.00")
+    large = ("Spackle‡ (rgbd)", "30", "50.00")
+    for name, *found in (
+        ("Middlebury", paper, spackle),
+        ("LLFF", large, ("Spackle on SHARP (paper)", "8,425", "0.71")),
+        ("Average", paper, spackle, large),
+        ("Tanks", ("not run", "", "")),
+        ("Median Spackle time (ms)", (paper[0], "7,070.0", "")),  # of 2,828 and 11,312
+        ("Median time overhead", (paper[0], "1.00%", "")),
+    ):
+        assert [tuple(line[1:4]) for line in lines[at[name] :][: len(found)]] == found
     lines = [cells for rows in expanded.bodies for cells in rows]
-    assert len(lines) == 3 + 18
-    ours, theirs = lines[0], lines[1]
-    assert ours[:6] == ("Middlebury", "S1", "SHARP", "10", "1.00", "1,010")
-    assert ours[6:] == ("2,800.0", "2,828.0", "1.00%", "0.357", "0.354", "3/23")
-    assert theirs[3:9] == ("3,387", "0.29", "1,183,035", "6,410.3†", "1,449.4", "-3.3%†")
+    assert tuple(lines[0][:6]) == ("Middlebury", "S1", *paper, "1,010")
+    assert tuple(lines[0][6:]) == ("2,800.0", "2,828.0", "1.00%", "0.357", "0.354", "3/23")
+    assert tuple(lines[2][3:9]) == ("3,387", "0.29", "1,183,035", "6,410.3†", "1,449.4", "-3.3%†")
     assert sum("†" in "".join(cells) for cells in lines) == 1
     for table in (overhead, expanded, stages):
-        assert "A Processor, 2 cores, 2 threads" in table.caption
+        assert any(
+            "renderer and residual on cuda. Machine: A Processor, 2 cores, 2 threads" in note for note in table.notes
+        )
         assert any("1 of 4 images" in note and "broken" in note for note in table.notes)
+    assert {table.label for table in make_tables([counted], whole=True)} == {*PAPER_LABELS}
 
 
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
     context = FillContext(prediction.gaussians, prediction.camera, renderer)
     view = large_views(prediction, (0.3,), 1280)[0]
-    rows = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
-    assert dict(rows)["aux"] == len(fill_view(context, view.camera).aux) > 0
+    found = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
+    paper, spackle = (dict(found[name])["aux"] for name in bench.TIMED)
+    assert spackle == len(fill_view(context, view.camera).aux) > paper > 64
     for stage in STAGES:
-        assert sum(name == f"{stage}_run_ms" and value > 0 for name, value in rows) == 3
+        assert sum(name == f"{stage}_run_ms" and value > 0 for name, value in found["spackle"]) == 3
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
     closed = FillContext(opaque, prediction.camera, renderer)
-    whole = dict(bench.time_view([1.0], closed, view._replace(camera=prediction.camera), 1, CPU))
+    whole = dict(bench.time_view([1.0], closed, view._replace(camera=prediction.camera), 1, CPU)["spackle"])
     assert (whole["aux"], whole["rerender_run_ms"]) == (0, 0.0)  # a view without holes: no second render
 
 
@@ -143,7 +156,7 @@ def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, mo
     for warm, calls in ((False, 2), (True, 1)):
         predictions.clear()
         found = bench.time_case(case, tools, config, warm)
-        assert (len(predictions), sum(row.metric == "base_run_ms" for row in found)) == (calls, 1)
+        assert (len(predictions), sum(row.metric == "base_run_ms" for row in found)) == (calls, 2 * 2)
 
 
 def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
@@ -157,9 +170,11 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     assert (found.settings, found.measured) == (["0.3", "0.5"], ["Ball", "Chair"])
     assert set(found.numbers("warm")) == {1}
     for setting in found.settings:
-        assert {len(found.numbers(f"{stage}_run_ms", setting)) for stage in STAGES} == {2 * 2}
-        counts = zip(found.numbers("base_gaussians"), found.numbers("aux", setting), strict=True)
-        assert found.numbers("merged", setting) == [base + aux for base, aux in counts]
+        for method in bench.TIMED:  # both ends of the swipe, as `evaluate` looks from
+            assert {len(found.numbers(f"{stage}_run_ms", setting, method)) for stage in STAGES} == {2 * 2 * 2}
+            bases = [base for base in found.numbers("base_gaussians") for _ in range(2)]
+            added = zip(bases, found.numbers("aux", setting, method), strict=True)
+            assert found.numbers("merged", setting, method) == [base + aux for base, aux in added]
     refuses(run(*words, "--runs", 3), "holds a benchmark of another kind (base_runs: 2 -> 3; runs: 2 -> 3)")
     refuses(run("evaluate", *words[1:], "--metrics", "none"), "config.json: not of `spackle evaluate`")
 
@@ -171,7 +186,7 @@ def test_sharp_is_timed_once(scenes: Path, tmp_path: Path) -> None:
     assert done.code == 0, done.err
     found = load_run(tmp_path / "out")
     assert found.numbers("base_gaussians") == [gaussians_of(TINY)]
-    assert len(found.numbers("base_run_ms", "0.3")) == len(found.numbers("overhead", "0.3")) == 1
+    assert len(found.numbers("base_run_ms", "0.3", "paper")) == len(found.numbers("overhead", "0.3", "paper")) == 2
     assert found.numbers("warm") == [0]  # the first prediction, which counts
     assert "network in fp32 on" in (tmp_path / "out" / "bench.md").read_text()
 

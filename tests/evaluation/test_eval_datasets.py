@@ -19,6 +19,7 @@ from photos import write_photo
 from PIL import Image
 
 from spackle.bases.depth_map import DepthMap
+from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, known_depth, load_case
@@ -26,6 +27,7 @@ from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.datasets.multiview import spread
 from spackle.evaluation.protocols import Alignment, align, to_base
 from spackle.evaluation.rows import IMAGES
+from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.image import working_size
 
 Array = NDArray[Any]
@@ -377,23 +379,27 @@ def test_second_views_are_the_nearest_but_not_the_same(tmp_path: Path) -> None:
     eyes = [Eye((x, 0, 0)) for x in beside] + [Eye((0.25, 0, 0), 1.0)]
     llff(tmp_path / "fern", eyes)
     first = read_cases("llff", tmp_path)[0]
-    assert [view.name for view in first.seconds] == ["fern/image002", "fern/image003", "fern/image004"]
+    assert [view.name for view in first.seconds if view.near] == ["fern/image002", "fern/image003", "fern/image004"]
+    assert len(first.seconds) == len(eyes) - 1  # all, the nearest first
+    assert [view.name for view in first.seconds][::6] == ["fern/image001", "fern/image006"]
+    settings: dict[str, Any] = {"base": BaseSettings("lite"), "metrics": (), "residual": "seeds"}
+    for choice, count in (("all", 7), ("nearest", 3)):
+        evaluation = open_evaluation(EvaluateOptions("llff", tmp_path, "near-view", second_views=choice, **settings))
+        assert len(evaluation.cases[0].seconds) == count
+        assert evaluation.config["second_views"] == choice
     assert first.bounds == (3.0, 6.0)
 
 
 def test_a_broken_photo_costs_its_own_case_and_no_others(tmp_path: Path) -> None:
-    eyes = [Eye((x, 0, 0)) for x in (0.0, 0.3, 0.6, 3.0, 3.3)]  # at a middle depth of 4: 0.2 to 1 is near
+    eyes = [Eye((x, 0, 0)) for x in (0.0, 0.3, 0.6, 3.0, 3.3)]
     llff(tmp_path / "fern", eyes)
     broken = tmp_path / "fern/images_4/image001.png"
     broken.write_bytes(broken.read_bytes()[:60])
     first, own, third, *others = read_cases("llff", tmp_path)
-    for case, left in ((first, "fern/image002"), (third, "fern/image000")):
+    for case in (first, third, *others):
         loaded = load_case(case)
-        assert [view.name for view in loaded.seconds] == [left]
+        assert len(loaded.seconds) == 3
         assert [str(broken) in lack for lack in loaded.lacks] == [True]
-    for case in others:
-        loaded = load_case(case)
-        assert (len(loaded.seconds), loaded.lacks) == (1, ())
     for case in (own, dataclasses.replace(first, seconds=first.seconds[:1])):  # itself, or all that there is
         with pytest.raises(InputError, match=r"image001\.png"):
             load_case(case)
@@ -431,7 +437,7 @@ def test_photos_and_cameras_are_brought_to_the_working_size(tmp_path: Path) -> N
     assert loaded.photo.focal_px == pytest.approx(FOCAL * 64 / 48)
     (second,) = loaded.seconds
     assert second.truth is not None
-    assert second.truth.shape == (26, 36, 3)
+    assert second.truth().shape == (26, 36, 3)
     for eye, camera, width in ((EYES[0], loaded.camera, 64), (EYES[1], second.camera, 36)):
         uv, _ = camera.project(torch.tensor(POINTS).float())
         expected = torch.tensor([eye.pixel(point)[:2] for point in POINTS]).float() * width / WIDTH

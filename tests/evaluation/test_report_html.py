@@ -17,7 +17,8 @@ from evaluation_data import write_boxes
 from PIL import Image
 
 from spackle.evaluation.folder import image_file
-from spackle.evaluation.plots import STYLES, evenly, overhead_plot
+from spackle.evaluation.methods import METHODS as FACTS
+from spackle.evaluation.plots import evenly, overhead_plot
 from spackle.evaluation.report import BUDGET, encode, fitting, make_report
 from spackle.evaluation.rows import Run as Results
 from spackle.evaluation.tables import make_tables
@@ -139,13 +140,13 @@ def test_many_evaluations_and_images_still_fit(tmp_path: Path) -> None:
 
 
 def test_plots_show_each_value_once_in_a_form_of_its_method() -> None:
-    assert len(set(STYLES.values())) == len({form for _, form in STYLES.values()}) == len(STYLES)
+    assert len({facts.color for facts in FACTS.values()}) == len({facts.form for facts in FACTS.values()}) == len(FACTS)
     assert [evenly(11, 4), evenly(3, 8), evenly(5, 1)] == [[0, 3, 7, 10], [0, 1, 2], [0]]
     plot = overhead_plot(results(near=True, count=3))
     assert plot is not None
     drawn = [part.get("style", "") for part in ElementTree.fromstring(plot.svg).iter() if part.tag.endswith("}use")]
     for method in ("seeds", "spackle"):  # a dot for each image and view, and one in the legend
-        assert sum(f"fill: {STYLES[method][0]}" in style for style in drawn) == 3 * 2 + 1
+        assert sum(f"fill: {FACTS[method].color}" in style for style in drawn) == 3 * 2 + 1
 
 
 def test_the_command_writes_it_and_tables_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,6 +69,9 @@ def evaluate(
     ] = "base,paper,spackle",
     disparity: Disparity = "0.3,0.4,0.5",
     side: Side = None,
+    second_views: Annotated[
+        str, typer.Option(metavar="all|nearest", help="Near-view: a photo's second photos, of its scene.")
+    ] = "all",
     metrics: Annotated[
         str | None,
         typer.Option(
@@ -108,6 +111,7 @@ def evaluate(
         methods=split_words(methods),
         disparities=parse_disparities(numbers),
         side=side,
+        second_views=second_views,
         metrics=None if metrics is None else () if metrics == "none" else split_words(metrics),
         base=BaseSettings(base, checkpoint=checkpoint, precision=precision, device=device, **sharp_speed(sharp)),
         residual=residual,
@@ -166,6 +170,7 @@ def bench(
 ) -> None:
     """Count and time what Spackle adds to the base, in the paper's tables: rows.jsonl, bench.md, bench.tex."""
     from spackle.bases.settings import BaseSettings
+    from spackle.evaluation.bench import TIMED
     from spackle.evaluation.bench import bench as run
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter
@@ -174,7 +179,7 @@ def bench(
     options = EvaluateOptions(
         dataset=dataset,
         root=given_input("FOLDER", source, root),
-        methods=("spackle",),
+        methods=TIMED,
         disparities=parse_disparities(numbers),
         side=side,
         metrics=(),

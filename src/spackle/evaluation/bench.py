@@ -7,6 +7,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
 from spackle.evaluation.case import Case, Viewpoint, load_case
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
+from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
@@ -29,10 +31,10 @@ from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
 from spackle.machine import hardware, load_average, versions
 from spackle.progress import Reporter
-from spackle.render import Renderer
+from spackle.render import Renderer, device_of
 from spackle.render.protocol import Rendering
 from spackle.residual import ResidualNet
-from spackle.scene_fill import FillContext, fill_view
+from spackle.scene_fill import FillContext
 
 FILES = ("bench.md", "bench.tex")
 SHARED = (
@@ -44,11 +46,12 @@ SHARED = (
     "disparities",
     "base",
     "residual",
+    "device",
 )  # of an evaluation's configuration
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")
-SIDE = "right"  # the end of the swipe where the second camera of Middlebury's and Booster's pairs stands
+TIMED = ("paper", "spackle")  # methods
 
 Lap = Callable[[str], None]
 Task = Callable[[Lap], Any]
@@ -68,12 +71,11 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
             memory for the base.
     """
     evaluation, slow = open_evaluation(options), options.base.named == "sharp"
-    device = options.device if options.base.network else torch.device("cpu")
-    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": ["spackle"]}
+    config: dict[str, Any] = {"kind": "bench", "protocol": "bench", "methods": list(TIMED)}
     config |= {name: evaluation.config[name] for name in SHARED}
-    config |= {"view": SIDE, "runs": runs, "base_runs": base_runs or (1 if slow else runs)}
-    config["base"] |= {"device": device.type}
-    config |= {"hardware": hardware(device), "versions": versions()}
+    config |= {"runs": runs, "base_runs": base_runs or (1 if slow else runs)}
+    config["base"] |= {"device": options.device.type if options.base.network else "cpu"}
+    config |= {"hardware": hardware(options.device), "versions": versions()}
     about = {"parameters": count_parameters(evaluation.network)}
     timed: list[str] = []  # an image of this process, after which it is warm
 
@@ -86,12 +88,14 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
         run = measure_images(evaluation.cases, time_next, output, config, about, options.root, reporter)
         if run is None:
             return "stopped"
-        write_tables(make_tables([run]), output, FILES)
+        write_tables(make_tables([run]), output, FILES, run.label_suffix)
         write_rows(run.rows, output / ROWS)
-    overheads = {s: statistics.median(run.numbers("overhead", s)) for s in run.settings}
-    listed = ", ".join(f"{setting}: {100 * overhead:.2f} %" for setting, overhead in overheads.items())
     count, total = len(run.measured), len(run.images)
-    reporter.log(f"{run.title}: {count} of {total} images, overhead {listed} -> {output}")
+    reporter.log(f"{run.title}: {count} of {total} images -> {output}")
+    for method in TIMED:
+        overheads = {s: statistics.median(run.numbers("overhead", s, method)) for s in run.settings}
+        listed = ", ".join(f"{setting}: {100 * overhead:.2f} %" for setting, overhead in overheads.items())
+        reporter.log(f"overhead of {METHODS[method].title} {listed}")
     reporter.result({"folder": output, "images": total, "measured": count})
     return "complete"
 
@@ -103,13 +107,13 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
         InputError: a file that cannot be used, depth that the case lacks, or Gaussians that are not finite.
         BaseError: no image can be worked on.
     """
-    load, device, options = load_average(), torch.device(config["base"]["device"]), evaluation.options
-    loaded = load_case(dataclasses.replace(case, seconds=()), options.max_side)
+    load, options, device = load_average(), evaluation.options, device_of(evaluation.renderer)
+    loaded = load_case(case, options.max_side)
     opened = evaluation.open(loaded)
     opened.load(loaded.full)  # before the clock starts
     latest: dict[str, BasePrediction] = {}
     # Compiling kernels is a small part of SHARP's first prediction on a processor, which takes a minute.
-    counts = warm or (options.base.named == "sharp" and device.type == "cpu")
+    counts = warm or (options.base.named == "sharp" and config["base"]["device"] == "cpu")
     times = measure(
         config["base_runs"], {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}, device, warm=counts
     )
@@ -120,27 +124,28 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
     rows = [Row(config["title"], case.name, "", "", "", metric, value) for metric, value in facts.items()]
     for view in large_views(prediction, options.disparities, options.max_side):
-        if view.name == SIDE:
-            figures = time_view(seconds, context, view, config["runs"], device)
-            row = Row(config["title"], case.name, view.setting, SIDE, "spackle", "", None)
+        for method, figures in time_view(seconds, context, view, config["runs"], device).items():
+            row = Row(config["title"], case.name, view.setting, view.name, method, "", None)
             rows += [row._replace(metric=metric, value=value) for metric, value in figures]
     return rows
 
 
 def time_view(
     base_s: Sequence[float], context: FillContext, view: Viewpoint, runs: int, device: torch.device
-) -> list[tuple[str, float]]:
-    """A view's figures; the base, on `device`, took `base_s` seconds."""
-    added = 0
+) -> dict[str, list[tuple[str, float]]]:
+    """A view's figures by each method of `TIMED`, on `device`; the base took `base_s` seconds."""
+    added: dict[str, int] = {}
 
-    def complete(lap: Lap) -> None:
-        nonlocal added
-        added = len(complete_in_laps(context, view.camera, lap))
+    def complete(method: str, lap: Lap) -> None:
+        added[method] = len(complete_in_laps(context, view.camera, lap, method))
 
-    times = measure(runs, {"": complete}, device)
-    none = np.zeros(runs)  # of a view without holes, which is not rendered again
-    stages = {name: (times.get(("", name), none) / MS).tolist() for name in STAGES if name != "base"}
-    return view_figures(len(context.base), added, {"base": base_s, **stages})
+    times = measure(runs, {method: partial(complete, method) for method in TIMED}, device)
+    none = np.zeros(runs)  # of a stage that a method has not, or a view without holes, which is not rendered again
+    figures = {}
+    for method, count in added.items():
+        stages = {name: (times.get((method, name), none) / MS).tolist() for name in STAGES if name != "base"}
+        figures[method] = view_figures(len(context.base), count, {"base": base_s, **stages})
+    return figures
 
 
 def view_figures(base: int, added: int, seconds: Mapping[str, Sequence[float]]) -> list[tuple[str, float]]:
@@ -232,14 +237,16 @@ class _LappedRenderer:
 
 
 @torch.no_grad()
-def complete_in_laps(context: FillContext, camera: Camera, lap: Lap) -> Gaussians:
+def complete_in_laps(context: FillContext, camera: Camera, lap: Lap, method: str = "spackle") -> Gaussians:
     """A view's aux Gaussians; laps "view", "photo", "completion" and, where there are holes, "rerender"."""
-    context = context.placed
+    context, prepared = context.placed, False
     before = context.renderer.render(context.base, camera)
     lap("view")
-    guard = context.photo_guard()
+    renderer = _LappedRenderer(context.renderer, lambda stage: lap(stage if prepared else "photo"))
+    fill = make_method(method, dataclasses.replace(context, renderer=renderer))([camera])
     lap("photo")
-    inside = dataclasses.replace(context, renderer=_LappedRenderer(context.renderer, lap))
-    aux = fill_view(inside, camera, [guard], before).aux
+    prepared = True
+    aux = fill(camera, before).aux
     lap("completion")
+    assert aux is not None
     return aux

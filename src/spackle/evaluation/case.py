@@ -15,7 +15,7 @@ from spackle.camera import Camera
 from spackle.errors import InputError
 from spackle.evaluation.rows import NEAR
 from spackle.files import files_in
-from spackle.image import MAX_SIDE, PHOTO_SUFFIXES, Photo, load_photo, resize_photo
+from spackle.image import MAX_SIDE, PHOTO_SUFFIXES, Photo, load_photo, resize_photo, working_size
 
 SHAPE_TOLERANCE = 0.01  # of the aspect ratio, between a photo and the camera that is said to be its
 
@@ -27,6 +27,7 @@ class SecondView:
     name: str
     photo: Path
     camera: Camera  # on any grid of the photo's shape; the world is the input photo's camera, in the dataset's lengths
+    near: bool = True  # one of the few that look at the same from beside the input photo
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Viewpoint(NamedTuple):
     setting: str
     name: str
     camera: Camera
-    truth: Tensor | None = None  # [H, W, 3] sRGB 0..1, of the camera's size
+    truth: Callable[[], Tensor] | None = None  # reads [H, W, 3] sRGB 0..1, of the camera's size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,13 +126,16 @@ def load_case(case: Case, max_side: int = MAX_SIDE) -> LoadedCase:
 
 
 def _load_view(view: SecondView, max_side: int) -> Viewpoint:
+    """Its photo is read again when it is wanted: a scene may have hundreds of them."""
     stored = load_photo(view.photo)
     _check_shape(view.photo, stored, view.camera)
-    photo = resize_photo(stored, max_side)
-    camera = view.camera.resized(photo.width, photo.height)
-    width, height = (max(1, side - side % 2) for side in (photo.width, photo.height))
-    rgb = photo.rgb[:height, :width].contiguous()
-    return Viewpoint(NEAR, view.name, dataclasses.replace(camera, width=width, height=height), rgb)
+    camera = view.camera.resized(*working_size(stored.width, stored.height, max_side))
+    width, height = (max(1, side - side % 2) for side in (camera.width, camera.height))
+
+    def truth() -> Tensor:
+        return resize_photo(load_photo(view.photo), max_side).rgb[:height, :width].contiguous()
+
+    return Viewpoint(NEAR, view.name, dataclasses.replace(camera, width=width, height=height), truth)
 
 
 def _check_shape(path: Path, photo: Photo, camera: Camera) -> None:

@@ -60,7 +60,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
         if run is None:
             return "stopped"
-        write_tables(make_tables([run]), output)
+        write_tables(make_tables([run]), output, suffix=run.label_suffix)
         write_sheets(run, output)
         if html:
             write_whole(output / REPORT, make_report([(run, output)]).encode())
@@ -92,7 +92,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     options = evaluation.options
     if options.near and not case.seconds and case.problem is None:
         raise InputError(f"{case.name}: has no second photo")
-    loaded = load_case(case if options.near else dataclasses.replace(case, seconds=()), options.max_side)
+    loaded = load_case(case, options.max_side)
     prediction = evaluation.open(loaded).predict(loaded.full)[0]
     alignment = _align(loaded, prediction, evaluation, not options.base.network) if options.near else None
     if alignment:
@@ -143,7 +143,7 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     if html:
         check_matplotlib("--html")
     runs = [load_run(folder) for folder in folders]
-    tables = make_tables(runs)  # what does not go together is refused before anything is written
+    tables = make_tables(runs, whole=True)  # what does not go together is refused before anything is written
     files = (*FILES, *([REPORT] if html else []))
     with results_folder(output, files, alone=True):
         write_tables(tables, output)

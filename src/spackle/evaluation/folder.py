@@ -5,6 +5,7 @@ config.json is what decides the figures; rows.jsonl vouches that all images are 
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import time
@@ -95,12 +96,14 @@ def measure_images(
     open_folder(output, config, about)
     rows: list[Row] = []
     run, begun = Run(config, rows, about), False
+    digest = functools.cache(_photo_digest)  # a photo may be the second one of many
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
                 reporter.log("stopped; the same command goes on from here")
                 return None
-            part, inputs = image_file(output, index, case.name, ".json"), _inputs_digest(case)
+            part = image_file(output, index, case.name, ".json")
+            inputs = digest_of([digest(photo) for photo in (case.photo, *(second.photo for second in case.seconds))])
             rows_of_case = _load_part(part, inputs)
             if rows_of_case is None:
                 if index and not begun:
@@ -136,15 +139,12 @@ def _load_part(path: Path, inputs: str) -> list[Row] | None:
         return None
 
 
-def _inputs_digest(case: Case) -> str:
-    """What the photos of a case hold, in one digest; a missing one has its turn later."""
-    parts = []
-    for path in (case.photo, *(second.photo for second in case.seconds)):
-        try:
-            parts.append(fingerprint(path, "photo"))
-        except InputError:
-            parts.append("none")
-    return digest_of(parts)
+def _photo_digest(path: Path) -> str:
+    """What a photo holds; a missing one has its turn later."""
+    try:
+        return fingerprint(path, "photo")
+    except InputError:
+        return "none"
 
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:

@@ -1,16 +1,16 @@
-"""What is compared: ways to views of a photo from elsewhere, all on top of one base prediction."""
+"""What is compared (methods.json): ways to views of a photo from elsewhere, all on top of one base prediction."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from spackle.camera import Camera
+from spackle.evaluation.rows import load_data
 from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
 from spackle.render.protocol import Rendering
@@ -28,25 +28,23 @@ class MethodView(NamedTuple):
 
     rgb: Tensor  # [H, W, 3] sRGB 0..1
     alpha: Tensor | None  # [H, W]; None where the hole is not filled by anything in 3D
-    aux: int | None  # Gaussians added for it; None where there are none by nature
+    aux: Gaussians | None  # added for it; None where there are none by nature
 
 
-# (cameras, the base's renderings from them) to a view for each, one at a time: there may be many.
-Method = Callable[[Sequence[Camera], Sequence[Rendering]], Iterator[MethodView]]
+Fill = Callable[[Camera, Rendering], MethodView]  # of a view and the base's rendering of it
+Method = Callable[[Sequence[Camera]], Fill]  # of all views of a setting, which a method may complete together
+
+
+class MethodFacts(NamedTuple):
+    title: str  # in tables
+    says: str  # in notes
+    color: str  # in plots: Okabe and Ito's, which the colour-blind tell apart
+    form: str  # of a plot's dots
+
+
+METHODS = {name: MethodFacts(**facts) for name, facts in load_data("methods.json").items()}
 LEAST_AUX = 64  # that the paper keeps in each view (training details)
-METHODS = {  # title in tables, description in captions
-    "base": ("base alone", "the base's render, holes black"),
-    "paper": (
-        "Spackle, eqs. 2 to 9",
-        "the paper's method: one pass for each view, an aux Gaussian for each masked cell",
-    ),
-    "spackle": ("Spackle", "ours: each view by itself in two passes, behind what the photo shows, with texture"),
-    "spackle-scene": ("Spackle, one scene", "one set of aux Gaussians for all views of a setting"),
-    "seeds": ("seeds", "as Spackle, without a network: deltas of zero"),
-    "dense": ("dense grid", "an aux Gaussian for every cell, in one pass"),
-    "inpaint2d": ("2D inpainting", "the base's render, its hole inpainted as a flat picture"),
-    "direct-ft": ("direct FT", "the base fine-tuned on completed views, no aux Gaussians"),
-}
+RESIDUAL = ("paper", "spackle", "spackle-scene", "dense")  # methods that run the residual network
 
 
 def make_method(
@@ -65,90 +63,102 @@ def make_method(
     """
     if name == "direct-ft":
         assert direct_ft is not None
-        return partial(_direct_ft, context, *direct_ft())
+        return _direct_ft(context, *direct_ft())
     if name == "inpaint2d":
         assert inpainter is not None
-        return partial(_inpaint_2d, inpainter)
+        return _inpaint_2d(inpainter)
     methods: dict[str, Method] = {
-        "base": lambda cameras, before: (MethodView(view.rgb, view.alpha, 0) for view in before),
-        "paper": partial(_paper, context),
-        "spackle": partial(_per_view, context),
-        "spackle-scene": partial(_one_scene, context),
-        "seeds": partial(_per_view, context.seeds_alone),
-        "dense": partial(_dense, context),
+        "base": lambda cameras: lambda camera, before: MethodView(before.rgb, before.alpha, Gaussians.empty()),
+        "paper": lambda cameras: _paper(context.placed),
+        "spackle": lambda cameras: _per_view(context),
+        "spackle-scene": lambda cameras: _one_scene(context, cameras),
+        "seeds": lambda cameras: _per_view(context.seeds_alone),
+        "dense": lambda cameras: _dense(context),
     }
     return methods[name]
 
 
-def _paper(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+def _paper(context: FillContext) -> Fill:
     """Aux Gaussians for each view, as eqs. 2 to 9 say."""
-    placed = context.placed
-    for camera, rendering in zip(cameras, before, strict=True):
+    photo = context.photo
+
+    def fill(camera: Camera, before: Rendering) -> MethodView:
         aux = complete_view(
-            placed.base,
+            context.base,
             camera,
-            placed.photo_camera,
-            placed.renderer,
-            placed.network,
-            threshold=placed.threshold,
+            context.photo_camera,
+            context.renderer,
+            context.network,
+            threshold=context.threshold,
             least=LEAST_AUX,
-            rendering=rendering,
-            photo=placed.photo,
-            precision=placed.precision,
+            rendering=before,
+            photo=photo,
+            precision=context.precision,
         )
-        yield _drawn(placed, aux, camera, rendering)
+        return _drawn(context, aux, camera, before)
+
+    return fill
 
 
-def _per_view(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+def _per_view(context: FillContext) -> Fill:
     """Aux Gaussians for each view by itself (paper, section 3.4)."""
     guard = context.photo_guard()
-    for camera, rendering in zip(cameras, before, strict=True):
-        filled = fill_view(context, camera, [guard], rendering)
-        yield MethodView(filled.rendering.rgb, filled.rendering.alpha, len(filled.aux))
+
+    def fill(camera: Camera, before: Rendering) -> MethodView:
+        filled = fill_view(context, camera, [guard], before)
+        return MethodView(filled.rendering.rgb, filled.rendering.alpha, filled.aux)
+
+    return fill
 
 
-def _one_scene(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+def _one_scene(context: FillContext, cameras: Sequence[Camera]) -> Fill:
     """One set of aux Gaussians for all views together."""
     aux = fill_scene(context, cameras, exact=True).aux
-    for camera, rendering in zip(cameras, before, strict=True):
-        yield _drawn(context, aux, camera, rendering)
+    return lambda camera, before: _drawn(context, aux, camera, before)
 
 
-@torch.no_grad()
-def _dense(context: FillContext, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+def _dense(context: FillContext) -> Fill:
     """An aux Gaussian for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
     guard, network, photo_camera = context.photo_guard(), context.network, context.photo_camera
-    for camera, rendering in zip(cameras, before, strict=True):
-        features = ViewFeatures.of(rendering)
+
+    @torch.no_grad()
+    def fill(camera: Camera, before: Rendering) -> MethodView:
+        features = ViewFeatures.of(before)
         seeds = make_seeds(features, camera, photo_camera)
         deltas = None
         if network is not None:
             rim, _ = find_rim(features, seeds, camera, photo_camera, context.photo)
             deltas = predict_deltas(network, features, seeds, rim, context.precision, dense=True).flatten(0, 1)
         aux = compose(seeds.select(torch.ones_like(features.mask)), deltas, camera)
-        yield _drawn(context, push_behind(aux, camera.position, [guard]), camera, rendering)
+        return _drawn(context, push_behind(aux, camera.position, [guard]), camera, before)
+
+    return fill
 
 
 def _drawn(context: FillContext, aux: Gaussians, camera: Camera, before: Rendering) -> MethodView:
     """A view with aux Gaussians on top of the base."""
     drawn = context.renderer.render([context.base, aux], camera) if len(aux) else before
-    return MethodView(drawn.rgb, drawn.alpha, len(aux))
+    return MethodView(drawn.rgb, drawn.alpha, aux)
 
 
-def _inpaint_2d(inpainter: Inpainter, cameras: Sequence[Camera], before: Sequence[Rendering]) -> Iterator[MethodView]:
+def _inpaint_2d(inpainter: Inpainter) -> Method:
     """The base's render with its hole inpainted as a flat picture."""
-    for view in before:
-        hole = hole_mask(view.alpha)
-        flat = (view.rgb, hole, known_inverse_depth(view.depth, hole))
-        yield MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)
+
+    def fill(camera: Camera, before: Rendering) -> MethodView:
+        hole = hole_mask(before.alpha)
+        flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
+        return MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)
+
+    return lambda cameras: fill
 
 
-def _direct_ft(
-    context: FillContext, base: Gaussians, unit: float, cameras: Sequence[Camera], before: Sequence[Rendering]
-) -> Iterator[MethodView]:
+def _direct_ft(context: FillContext, base: Gaussians, unit: float) -> Method:
     """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
-    for camera in cameras:
+
+    def fill(camera: Camera, before: Rendering) -> MethodView:
         pose = camera.world_to_camera.clone()
         pose[:3, 3] *= unit
         drawn = context.renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
-        yield MethodView(drawn.rgb, drawn.alpha, None)
+        return MethodView(drawn.rgb, drawn.alpha, None)
+
+    return lambda cameras: fill

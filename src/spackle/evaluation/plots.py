@@ -19,17 +19,6 @@ from spackle.evaluation.tables import method_name
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
 
-# Okabe and Ito's colours, which the colour-blind tell apart, and a form for each method.
-STYLES = {
-    "base": ("#5b6066", "o"),
-    "spackle": ("#0072b2", "D"),
-    "spackle-scene": ("#3a9fd8", "P"),
-    "paper": ("#7a4fb5", "<"),
-    "seeds": ("#008a66", "^"),
-    "dense": ("#b5568c", "s"),
-    "inpaint2d": ("#c87f00", "v"),
-    "direct-ft": ("#d55e00", "X"),
-}
 RC: Any = {
     "svg.fonttype": "none",  # the letters stay text
     "svg.hashsalt": "spackle",  # the same plot gives the same bytes
@@ -57,7 +46,7 @@ class Series(NamedTuple):
     """Points of one method."""
 
     title: str
-    method: str  # of `STYLES`
+    method: str  # of `METHODS`
     points: Sequence[tuple[float, float]]
     hollow: bool = False
     line: str = "none"  # or "-", "--"
@@ -105,7 +94,7 @@ def _draw(
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         axes = figure.subplots()
         for one in series:
-            colour, form = STYLES[one.method]
+            _, _, colour, form = METHODS[one.method]
             places = ([p[0] for p in one.points], [p[1] for p in one.points])
             face = "white" if one.hollow else colour
             axes.plot(*places, form, color=colour, ls=one.line, mfc=face, alpha=0.8, label=one.title)
@@ -202,7 +191,7 @@ def scenes_plot(run: Run, metric: str) -> Plot | None:
 
     title, x = SCENE_FIGURES[metric]
     some = f" {len(names)} of {len(order)} scenes, spread evenly." if len(names) < len(order) else ""
-    note = f"In the order of {METHODS[leader][0]}, best first.{some}"
+    note = f"In the order of {METHODS[leader].title}, best first.{some}"
     return _draw(title, series, x, "", finish, note, HEIGHT / 2 + ROW * len(names))
 
 

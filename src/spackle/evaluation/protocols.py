@@ -20,14 +20,14 @@ from spackle.evaluation.methods import Method
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.rows import REMARK, Row
 from spackle.image import working_size
-from spackle.residual import hole_area_ratio, hole_mask
+from spackle.residual import CELL, hole_area_ratio, hole_mask
 from spackle.scene_fill import FillContext
 from spackle.training.losses import FeatureNet, hole_distance
 
 MIN_PIXELS = 8  # fewer give no scale
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 BOUNDS_QUANTILES = (0.001, 0.999)  # what LLFF's near and far are, of the points in a view
-TRUTH = "truth"  # among the pictures of a view
+TRUTH, HOLE = "truth", "hole"  # among the pictures of a view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,34 +202,38 @@ def measure_views(
     """Every method on every view of a base; views of one setting are a method's to see together.
 
     Returns:
-        Rows, which take dataset and name from `image`; and the view with the largest hole by each method,
-        [H, W, 3], the truth last where there is one.
+        Rows, which take dataset and name from `image`; and pictures of the view with the largest hole, [H, W, 3]: its
+        hole (white), the view by each method, the truth last where there is one.
     """
-    before = [context.renderer.render(context.base, view.camera) for view in viewpoints]
-    holes = [hole_area_ratio(view.alpha) for view in before]
-    largest, base = max(range(len(viewpoints)), key=holes.__getitem__), len(context.base)
     rows: list[Row] = []
     remarks: dict[Row, None] = {}
     pictures: dict[str, Tensor] = {}
+    largest, base = -1.0, len(context.base)
     for setting in dict.fromkeys(view.setting for view in viewpoints):
-        indices = [index for index, view in enumerate(viewpoints) if view.setting == setting]
-        cameras, renderings = [viewpoints[index].camera for index in indices], [before[index] for index in indices]
-        for name, method in methods.items():
-            for index, filled in zip(indices, method(cameras, renderings), strict=True):
-                figures: list[tuple[str, float | str]] = [("har_before", holes[index])]
-                if filled.alpha is not None:  # of what is left open (paper, eq. 11 and 10)
-                    open_share = hole_area_ratio(filled.alpha)
+        views = [view for view in viewpoints if view.setting == setting]
+        fills = {name: method([view.camera for view in views]) for name, method in methods.items()}
+        for view in views:
+            before = context.renderer.render(context.base, view.camera)
+            hole, truth = hole_mask(before.alpha), view.truth() if view.truth else None
+            share = hole_area_ratio(before.alpha)
+            filled = {name: fill(view.camera, before) for name, fill in fills.items()}
+            for name, (rgb, alpha, aux) in filled.items():
+                figures: list[tuple[str, float | str]] = [("har_before", share)]
+                if alpha is not None:  # of what is left open (paper, eq. 11 and 10)
+                    open_share = hole_area_ratio(alpha)
                     figures += [("har", open_share), ("coverage", 1 - open_share)]
-                if filled.aux is not None:
-                    figures += [("aux", filled.aux), ("aux_share", filled.aux / base), ("merged", base + filled.aux)]
-                view, hole = viewpoints[index], hole_mask(before[index].alpha)
+                if aux is not None:
+                    count = len(aux)
+                    figures += [("aux", count), ("aux_share", count / base), ("merged", base + count)]
+                    figures.append(("hole_cells", share * hole.numel() / CELL**2))
                 row = image._replace(setting=setting, view=view.name, method=name)
-                for metric, value in (*figures, *gauges.measure(filled.rgb, view.truth, hole)):
+                for metric, value in (*figures, *gauges.measure(rgb, truth, hole)):
                     if isinstance(value, str):
                         remarks[image._replace(metric=metric, value=value)] = None
                     else:
                         rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
-                if index == largest:
-                    pictures[name] = filled.rgb
-    truth = viewpoints[largest].truth
-    return [*rows, *remarks], pictures | ({} if truth is None else {TRUTH: truth})
+            if share > largest:
+                largest, shown = share, hole.cpu()[..., None].expand(-1, -1, 3).float()
+                pictures = {HOLE: shown, **{name: made.rgb for name, made in filled.items()}}
+                pictures |= {} if truth is None else {TRUTH: truth}
+    return [*rows, *remarks], pictures

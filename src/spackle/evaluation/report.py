@@ -84,7 +84,7 @@ def columns(run: Run) -> list[str]:
 
 def column_title(run: Run, name: str) -> str:
     """What a picture is called."""
-    return TRUTH if name == TRUTH else f"base ({run.base})" if name == "base" else METHODS[name][0]
+    return TRUTH if name == TRUTH else f"base ({run.base})" if name == "base" else METHODS[name].title
 
 
 def rank(run: Run) -> Ranking | None:
@@ -93,7 +93,7 @@ def rank(run: Run) -> Ranking | None:
     for metric in ORDER[str(run.config["protocol"])]:
         if values := run.by_image(metric, method):
             title = METRICS[metric].title if metric in METRICS else NAMES[metric]
-            return Ranking(ranked(values, metric), f"{title} of {METHODS[method][0]}", values)
+            return Ranking(ranked(values, metric), f"{title} of {METHODS[method].title}", values)
     return None
 
 
@@ -191,7 +191,7 @@ def findings(run: Run) -> list[str]:
     lines = []
     for metric, (what, unit, digits) in HEADLINES.items() if run.near else ():
         means = {method: mean_of(metric, method, NEAR) for method in run.methods}
-        texts = [f"{METHODS[method][0]} {v:.{digits}f}{unit}" for method, v in means.items() if v is not None]
+        texts = [f"{METHODS[method].title} {v:.{digits}f}{unit}" for method, v in means.items() if v is not None]
         lines += [f"{what}: {', '.join(texts)}."] if texts else []
     adding = {row.method for row in run.rows if row.metric == "aux"} - {"base"}
     for method in [name for name in run.methods if name in adding and not run.near][:1]:
@@ -200,7 +200,7 @@ def findings(run: Run) -> list[str]:
             before, after, share, added = (value or 0.0 for value in figures)
             lines.append(
                 f"At disparity {setting} the base alone leaves {_percent(before)} of the pixels open, "
-                f"{METHODS[method][0]} {_percent(after)}, with {TEXTS['count'](added)} added Gaussians a view "
+                f"{METHODS[method].title} {_percent(after)}, with {TEXTS['count'](added)} added Gaussians a view "
                 f"({_percent(share)} of the base's)."
             )
     return lines

@@ -18,7 +18,7 @@ STAGES = {
     "view": "render of the view",
     "photo": "render at the photo's camera",
     "completion": "mask, seeds, network, placing",
-    "rerender": "re-render of touched tiles, after each pass",
+    "rerender": "re-render with the aux Gaussians",
 }
 BASE_PATH = ("base", "view")  # from the photo to a picture without Spackle
 EXTRA = ("photo", "completion", "rerender")  # what Spackle adds to it
@@ -88,6 +88,11 @@ class Run:
         return str(self.config["base"]["title"])
 
     @property
+    def label_suffix(self) -> str:
+        """What tells the LaTeX labels of this run's own tables from those of others."""
+        return f":{self.title}-{self.config['protocol']}".lower()
+
+    @property
     def timed(self) -> bool:
         """Whether it is a benchmark."""
         return bool(self.config["kind"] == "bench")
@@ -121,9 +126,10 @@ class Run:
         problems = self.problems
         return [image for image in self.images if image not in problems]
 
-    def numbers(self, metric: str, setting: str = "") -> list[float]:
-        """A figure's finite values at a setting, by all methods."""
-        values = (row.value for row in self.rows if (row.setting, row.metric) == (setting, metric))
+    def numbers(self, metric: str, setting: str = "", method: str = "") -> list[float]:
+        """A figure's finite values at a setting by a method; without both, what is known of each image."""
+        key = setting, method, metric
+        values = (row.value for row in self.rows if (row.setting, row.method, row.metric) == key)
         return [float(value) for value in values if value is not None]
 
     def by_image(self, metric: str, method: str) -> dict[str, float]:

@@ -15,7 +15,7 @@ from spackle.bases.lift import RgbdBase
 from spackle.bases.open import OpenedBase, open_base, open_loaded
 from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY
-from spackle.device import PRECISIONS, pick_dtype
+from spackle.device import pick_dtype
 from spackle.errors import InputError, check_name
 from spackle.evaluation.case import Case, LoadedCase, known_depth
 from spackle.evaluation.datasets import DATASETS, read_cases
@@ -27,7 +27,7 @@ from spackle.folders import digest_of
 from spackle.image import MAX_SIDE
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.pipeline import FillOptions
-from spackle.render import Renderer, get_renderer
+from spackle.render import Renderer, device_of, get_renderer
 from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext
 from spackle.training.losses import load_features
@@ -36,6 +36,7 @@ from spackle.weights import weights_digest, weights_digests
 BASE = BaseSettings("sharp")
 LARGE_SIDE = 1280  # of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
 MAX_DISPARITIES = 6  # columns of a table
+SECOND_VIEWS = ("all", "nearest")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,7 @@ class EvaluateOptions:
     direct_ft: Path | None = None  # weights of the method direct-ft
     inpainter: str = "opencv"  # of the method inpaint2d
     features: Path | None = None  # SqueezeNet's weights, for the metric distance
+    second_views: str = "all"  # of `SECOND_VIEWS`, that a photo is compared with in near-view
     side: int | None = None  # long side of the views; the paper's where None: 1280 for large views, 1536 for near ones
     limit: int | None = None  # so many images, spread over the dataset
     download: bool = False  # pyiqa may fetch weights
@@ -91,13 +93,13 @@ class EvaluateOptions:
         for method in self.methods:
             check_name("--methods", method, METHODS)
         check_name("--inpainter", self.inpainter, INPAINTERS)
+        check_name("--second-views", self.second_views, SECOND_VIEWS)
         for metric in self.metrics or ():
             check_name("--metrics", metric, METRICS)
             if METRICS[metric].truth and not self.near:
                 raise InputError(f"--metrics {metric}: needs a true second view: add --protocol near-view")
         if not self.methods:
             raise InputError(f"--methods: none is given: choose of {', '.join(METHODS)}")
-        check_name("--precision", self.base.precision, PRECISIONS)
         self.opened.check(one=True)
         if self.residual == "none":
             raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
@@ -166,6 +168,11 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     cases, limit = read_cases(dataset.name, options.root), options.limit
     if limit is not None and limit < len(cases):  # evenly over their order
         cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+    every = options.near and options.second_views == "all"
+    cases = [
+        dataclasses.replace(case, seconds=tuple(s for s in case.seconds if every or (options.near and s.near)))
+        for case in cases
+    ]
     _check_cases(cases, options)
     network, direct, features, inpainter = fill.load(), None, None, None
     if "inpaint2d" in options.methods:
@@ -179,7 +186,8 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     states = dict.fromkeys(wanted, OWN) | states
     if "distance" in wanted and features is None:
         states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
-    precision = str(pick_dtype(base.precision, torch.device("cpu"))).removeprefix("torch.")
+    renderer = get_renderer(base.device)
+    precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
     config: dict[str, Any] = {
         "kind": "evaluate",
         "spackle": spackle.__version__,
@@ -190,14 +198,15 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
         "protocol": options.protocol,
         "side": options.max_side,
         "disparities": None if options.near else list(options.disparities),
+        "second_views": options.second_views if options.near else None,
         "base": {
             "name": base.public_name,
             "title": "SHARP" if base.named == "sharp" else base.public_name,
             "says": base.description,
             "weights": weights_digests(base.files),
             "precision": base.precision,
-            "device": options.device.type,
         },
+        "device": device_of(renderer).type,  # of the renderer, the residual and networks of bases
         "methods": list(options.methods),
         "residual": {
             "weights": "seeds" if fill.file is None else "shipped" if options.residual is None else "given",
@@ -211,7 +220,7 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
         config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
-    renderer, gauges = get_renderer(base.device), Gauges(wanted, metrics, features)
+    gauges = Gauges(wanted, metrics, features)
     return Evaluation(options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config)
 
 

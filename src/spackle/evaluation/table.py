@@ -56,9 +56,9 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
     return [f"{BEST}{text}{BEST}" if text == best else text for text in texts]
 
 
-def write_table(table: Table, form: Literal["md", "tex"]) -> str:
-    """For a page of Markdown, or for a LaTeX document with the packages booktabs and graphicx."""
-    return {"md": _markdown, "tex": _latex}[form](table)
+def write_table(table: Table, form: Literal["md", "tex"], suffix: str = "") -> str:
+    """For a page of Markdown, or for LaTeX with the packages booktabs and graphicx, the label ending with `suffix`."""
+    return _markdown(table) if form == "md" else _latex(table, suffix)
 
 
 def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
@@ -69,7 +69,7 @@ def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
 def _markdown(table: Table) -> str:
     """A group's head is put before the heads of its columns."""
     head = [f"{group}: {column}" if group else column for group, column in table.heads]
-    lines = [f"**{table.label}.** {table.caption}", "", _row(head), "|" + "---|" * len(head)]
+    lines = [f"**{table.title}** (`{table.label}`). {table.caption}", "", _row(head), "|" + "---|" * len(head)]
     lines += [_row(cells) for rows in table.bodies for cells in rows]
     lines += ["", *(f"- {note}" for note in table.notes)] if table.notes else []
     return "\n".join(lines) + "\n"
@@ -83,21 +83,27 @@ SIGNS = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "$": r"\$", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "×": r"$\times$",
     "±": r"$\pm$", "−": "$-$", "–": "--", "…": r"\ldots{}", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "≥": r"$\geq$",
-    "†": r"$\dagger$", "→": r"$\to$",
+    "†": r"$\dagger$", "‡": r"$\ddagger$", "→": r"$\to$",
 }  # fmt: skip
+LAST_LETTER = "\u017f"  # that pdfLaTeX has in its usual fonts; a scene may be called in other letters
 
 
 def tex(text: str) -> str:
     """Plain text for LaTeX; what stands between ** is bold."""
-    safe = "".join(SIGNS.get(sign, sign) for sign in text)
+    safe = "".join(SIGNS.get(sign, sign if " " <= sign <= LAST_LETTER else "?") for sign in text)
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 
-def _latex(table: Table) -> str:
+def _latex(table: Table, suffix: str) -> str:
+    """The notes stand below the table, so that its caption is short."""
     shape = "l" * table.words + "c" * (len(table.heads) - table.words)
-    caption = " ".join([table.caption, *table.notes])
-    lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(caption)}}}"]
-    lines += [rf"\label{{{table.label}}}", r"\resizebox{\textwidth}{!}{", rf"\begin{{tabular}}{{{shape}}}", r"\toprule"]
+    lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(table.caption)}}}"]
+    lines += [
+        rf"\label{{{table.label}{suffix}}}",
+        r"\resizebox{\textwidth}{!}{",
+        rf"\begin{{tabular}}{{{shape}}}",
+        r"\toprule",
+    ]
     column, over, rules = 1, [], []
     for name, count in groups(table.heads):
         over.append(rf"\multicolumn{{{count}}}{{c}}{{{tex(name)}}}" if name else " & ".join([""] * count))
@@ -107,4 +113,6 @@ def _latex(table: Table) -> str:
     lines.append(" & ".join(tex(head) for _, head in table.heads) + r" \\")
     for rows in table.bodies:
         lines += [r"\midrule", *(" & ".join(map(tex, cells)) + r" \\" for cells in rows)]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", "}", r"\end{table*}"]) + "\n"
+    lines += [r"\bottomrule", r"\end{tabular}", "}"]
+    lines += [rf"\par\smallskip\parbox{{\textwidth}}{{\tiny {tex(' '.join(table.notes))}}}"] if table.notes else []
+    return "\n".join([*lines, r"\end{table*}"]) + "\n"

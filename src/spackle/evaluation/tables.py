@@ -1,4 +1,4 @@
-"""The paper's tables, and some of ours, as pivots of rows; the paper's figures in rows beside ours.
+"""The paper's six tables, and two of ours, as pivots of rows; the paper's figures in rows beside ours.
 
 tables.json has their titles, captions, columns (group, title, metric, and how a figure is written) and notes.
 """
@@ -13,15 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from spackle.errors import InputError
-from spackle.evaluation.methods import METHODS
+from spackle.evaluation.methods import METHODS, RESIDUAL
 from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, definitions, reduction
 from spackle.evaluation.rows import (
-    BASE_PATH,
-    EXTRA,
     IMAGES,
     NEAR,
     NOTE,
     PAPER,
+    SETTINGS,
     STAGES,
     Mean,
     Row,
@@ -38,10 +37,8 @@ from spackle.evaluation.table import EMPTY, NOT_RUN, TEXTS, Cells, Table, mark_b
 from spackle.files import write_whole
 
 FILES = ("tables.md", "tables.tex")
-TABLES = load_data("tables.json")
-NOTES: dict[str, str] = TABLES["notes"]
-EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
-THEIRS = "SHARP (paper)"  # what the paper's figures come from
+TABLES, NOTES = load_data("tables.json").values()
+EFFICIENCY, EXPANDED = "tab:efficiency_gaussian_overhead", "tab:expanded_efficiency_gaussian_overhead"
 FROM_PAPER = " (paper)"  # ends the method of the paper's rows
 # Relative decreases: of which method (None: the row's own) which figure, and by which of the row's it is replaced.
 REDUCED: dict[str, tuple[str | None, str, str]] = {
@@ -50,7 +47,7 @@ REDUCED: dict[str, tuple[str | None, str, str]] = {
 }
 TIMES = ("base_ms", "spackle_ms", "overhead", "base_fps", "spackle_fps")  # medians, where all others are means
 ODD = {("Middlebury", "0.3", metric) for metric in ("base_ms", "overhead", "base_fps")}  # figures that do not agree
-ODD_MARK = NOTES["odd"][0]
+ODD_MARK, RECIPE_MARK = NOTES["odd"][0], NOTES["recipe"][0]
 
 
 class Column(NamedTuple):
@@ -64,133 +61,127 @@ class Column(NamedTuple):
     lower: bool | None = None  # is better; None: no best one is set off
 
 
-def make_tables(runs: Sequence[Run]) -> list[Table]:
-    """All tables; InputError for a dataset twice with one protocol and base, or for different disparities."""
+def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
+    """The tables that the runs have figures for; with `whole` all of the paper's.
+
+    Gaussians are counted, and times taken, from benchmarks; datasets without one have the counts of their large views.
+
+    Raises:
+        InputError: a dataset twice with one protocol and base, or different disparities.
+    """
     seen: set[tuple[str, str, str]] = set()
     for run in runs:
         key = str(run.config["protocol"]), run.title, run.base
         if key in seen:
             raise InputError(f"two results for {run.title} under {key[0]} with the base {run.base}: give one of them")
         seen.add(key)
-    kinds: dict[str, list[Run]] = {"large": [], "near": [], "bench": []}
-    for run in runs:
-        kinds["bench" if run.timed else "near" if run.near else "large"].append(run)
-    for kind in (kinds["large"], kinds["bench"]):
-        if any(run.settings != kind[0].settings for run in kind):
-            raise InputError("the results have different disparities: make their tables apart")
+    of = {"near": [run for run in runs if run.near], "bench": [run for run in runs if run.timed]}
+    of["large"] = [run for run in runs if not run.near and not run.timed]
+    of["cost"] = of["bench"] + [run for run in of["large"] if ("bench", run.title, run.base) not in seen]
+    settings = next((run.settings for run in runs if not run.near), SETTINGS)
+    if any(run.settings != settings for run in runs if not run.near):
+        raise InputError("the results have different disparities: make their tables apart")
     return [
-        _table(label, spec, name, of_kind)
-        for name, of_kind in kinds.items()
-        if of_kind
-        for label, spec in TABLES[name].items()
+        _table(label, spec, of[spec["of"]], [NEAR] if spec["of"] == "near" else settings)
+        for label, spec in TABLES.items()
+        if of[spec["of"]] or (whole and paper_rows(label))
     ]
 
 
-def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES) -> None:
-    """As a file of Markdown and one of LaTeX."""
+def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = "") -> None:
+    """As a file of Markdown and one of LaTeX, whose labels end with `suffix`: a document may take in several."""
     write_whole(folder / files[0], "\n".join(write_table(table, "md") for table in tables).encode())
     head = "% needs \\usepackage{booktabs,graphicx}\n"
-    write_whole(folder / files[1], (head + "\n".join(write_table(table, "tex") for table in tables)).encode())
+    texts = [write_table(table, "tex", suffix) for table in tables]
+    write_whole(folder / files[1], (head + "\n".join(texts)).encode())
 
 
-def method_name(run: Run, method: str) -> str:
-    """What a row is called; the base's name is always in it."""
-    return f"{run.base} alone" if method == "base" else f"{METHODS[method][0]} ({run.base})"
+def method_name(run: Run, method: str, title: str = "") -> str:
+    """What a row is called; the base's name is always in it, and a mark where the residual is not the paper's."""
+    if method == "base":
+        return f"{run.base} alone"
+    mark = RECIPE_MARK if method in RESIDUAL and run.config["residual"]["weights"] != "given" else ""
+    return f"{title or METHODS[method].title}{mark} ({run.base})"
 
 
-def _table(label: str, spec: Mapping[str, Any], kind: str, runs: Sequence[Run]) -> Table:
-    make, words = {
-        "tab:near_view": (_near_table, 1),
-        "tab:efficiency_gaussian_overhead": (_overhead_table, 2),
-        EXPANDED: (_expanded_table, 3),
-        "tab:efficiency_stages": (_stages_table, 1),
-    }.get(label, (_dataset_table, 2))
-    heads, bodies = make({"label": spec.get("paper", label), **spec}, runs)
-    facts = {"views": TABLES["views"][kind], "base_gaussians": f"{PAPER['base_gaussians']:,}"}
-    facts["datasets"] = ", ".join(dict.fromkeys(run.title for run in runs))
-    facts["images"] = ", ".join(f"{run.title} {images_text(run)}" for run in runs)
-    facts |= _timed_facts(runs) if kind == "bench" else _measured_facts(runs)
-    notes = _timed_notes(runs) if kind == "bench" else _measured_notes(spec, runs)
-    if label == EXPANDED:
-        notes.append(_parameters_note(runs[0]))
-        notes += [NOTES["odd"]] if any(ODD_MARK in cell for rows in bodies for cells in rows for cell in cells) else []
-    return Table(label, spec["title"], spec["caption"].format(**facts), heads, bodies, words=words, notes=notes)
+def _table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Table:
+    makers = {
+        "tab:near_view": _near_table,
+        EFFICIENCY: _overhead_table,
+        EXPANDED: _expanded_table,
+        "tab:efficiency_stages": _stages_table,
+    }
+    heads, bodies = makers.get(label, _dataset_table)(label, spec, runs, settings)
+    cells = "".join(cell for rows in bodies for cells in rows for cell in cells)
+    notes = list(dict.fromkeys([*_notes(spec, runs, cells), *(_timed_notes(runs) if spec["of"] != "near" else [])]))
+    return Table(label, spec["title"], spec["caption"], heads, bodies, words=spec.get("words", 2), notes=notes)
 
 
-# --- captions and notes
+# --- notes
 
 
-def _measured_facts(runs: Sequence[Run]) -> dict[str, str]:
-    """Which base the rows stand on, what they are, and whose weights the residual has."""
-    bases = dict.fromkeys(f"{run.base}: {run.config['base']['says']}" for run in runs)
-    names = dict.fromkeys(method for run in runs for method in run.methods)
-    residuals = [run.config["residual"] for run in runs]
-    weights = dict.fromkeys(
-        f"{one['weights']} weights {one['sha256'][:8]}" if one["sha256"] else "no weights, seeds alone"
-        for one in residuals
-    )
-    rows = "; ".join(": ".join(METHODS[name]) for name in names)
-    return {"bases": f"Base {'; '.join(bases)}.", "rows": f"Rows: {rows}. Residual: {' and '.join(weights)}."}
-
-
-def _measured_notes(spec: Mapping[str, Any], runs: Sequence[Run]) -> list[str]:
-    """Definitions, what was not run and why, images without figures, terms of pyiqa."""
+def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str]:
+    """Views, bases, rows, whose weights the residual has, definitions, what is missing and why, terms of pyiqa."""
     names = tuple(dict.fromkeys(name for name in (_metric(column[2]) for column in spec["columns"]) if name))
-    notes = definitions(names)
+    notes = [NOTES["swipe"].format(side=run.config["side"]) for run in runs if not run.near]
+    for kind in dict.fromkeys(run.config["second_views"] for run in runs if run.near):
+        titles = dict.fromkeys(run.title for run in runs if run.config["second_views"] == kind)
+        notes.append(NOTES[kind].format(datasets=", ".join(titles)))
+    notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
+    titles = {name: facts.title for name, facts in METHODS.items()} | spec.get("rows", {})
+    shown = dict.fromkeys(name for run in runs for name in run.methods if titles[name] in cells)
+    notes += [f"Rows: {'; '.join(f'{titles[name]}: {METHODS[name].says}' for name in shown)}."] if shown else []
+    for weights in dict.fromkeys(_weights(run) for run in runs):
+        foreign = not weights.startswith("given")
+        notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
+    notes += definitions(names)
     for run in runs:
-        state = run.config["metrics"]
+        state = run.config.get("metrics", {})
         idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]
         notes += [f"{run.title}: {METRICS[name].title[:-2]} {state[name]}." for name in idle]
         if passed := list(run.problems):
             more = f" and {len(passed) - 5} more" if len(passed) > 5 else ""
             listed = f"{', '.join(passed[:5])}{more}"
             notes.append(f"{run.title}: {len(passed)} of {len(run.images)} images gave no figures: {listed}.")
-    if any(name in DEFINITIONS for name in names):
-        notes.append(f"{NOTICE}.")
-    return list(dict.fromkeys(notes))
+    notes += [NOTES[mark] for mark, sign in (("best", "**"), ("n", "/"), ("odd", ODD_MARK)) if sign in cells]
+    notes += [NOTES["average"]] if "Average" in cells else []
+    return [*notes, f"{NOTICE}."] if any(name in DEFINITIONS for name in names) else notes
 
 
-def _timed_facts(runs: Sequence[Run]) -> dict[str, str]:
-    """The view, the bases, the weights and the machines."""
-    texts = []
-    for run in runs:
-        base, residual = run.config["base"], run.config["residual"]
-        hardware, versions = run.config["hardware"], run.config["versions"]
-        precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
-        network = f"network in {precision} on {base['device']}" if precision else "no network"
-        weights = "seeds, no weights"
-        if residual["sha256"]:
-            weights = f"{residual['weights']} weights {residual['sha256'][:8]} in {residual['precision']}"
-            weights += ", on the processor"
-        place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
-        place += f", {hardware['gpu']} for the base, the rest on the processor" if "gpu" in hardware else ""
-        named = ", ".join(f"{name} {version}" for name, version in versions.items())
-        texts.append(
-            f"Base {base['title']}: {base['says']} ({network}). Residual: {weights}. Machine: {place}; {named}."
-        )
-    return {"setup": " ".join([f"{TABLES['views']['bench']}.", *dict.fromkeys(texts)])}
+def _weights(run: Run) -> str:
+    """What the residual's network has learned from."""
+    residual = run.config["residual"]
+    if not residual["sha256"]:
+        return "the residual has no weights, its deltas are 0"
+    origin = (
+        "given weights" if residual["weights"] == "given" else "the residual has the weights that ship with Spackle"
+    )
+    return f"{origin} ({residual['sha256'][:8]})"
 
 
 def _timed_notes(runs: Sequence[Run]) -> list[str]:
-    """How the times were taken, and what disturbed them."""
+    """Where and how times were taken, what disturbed them, and how large the networks are."""
     notes = []
-    for run in runs:
+    for run in (run for run in runs if run.timed):
+        base, hardware, versions = run.config["base"], run.config["hardware"], run.config["versions"]
+        precision = next((row.value for row in run.rows if row.metric == f"{NOTE}precision"), None)
+        network = f"{run.base}'s network in {precision} on {base['device']}; " if precision else ""
+        if run.config["residual"]["precision"]:
+            network += f"residual in {run.config['residual']['precision']}; "
+        place = f"{hardware['cpu']}, {hardware['cores']} cores, {hardware['threads']} threads"
+        place += f", {hardware['gpu']}" if "gpu" in hardware else ""
+        named = ", ".join(f"{name} {version}" for name, version in versions.items())
+        notes.append(f"Times: {network}renderer and residual on {run.config['device']}. Machine: {place}; {named}.")
         notes.append(NOTES["runs"].format(**run.config))
         if cold := [row.image for row in run.rows if row.metric == "warm" and not row.value]:
             notes.append(NOTES["cold"].format(images=", ".join(cold)))
         if loads := run.numbers("load"):
             notes.append(NOTES["load"].format(median=statistics.median(loads), least=min(loads), most=max(loads)))
-        if failed := list(run.problems):
-            notes.append(f"{len(failed)} of {len(run.images)} images gave no figures: {', '.join(failed[:5])}.")
-    return list(dict.fromkeys(notes))
-
-
-def _parameters_note(run: Run) -> str:
-    """How large the networks are, and how large the paper says they are."""
-    counted = run.about["parameters"]
-    base, residual = counted["base"] / 1e6, counted["residual"] / 1e6
-    sizes = {"base": base, "used": counted["base_used"] / 1e6, "residual": residual, "merged": base + residual}
-    return NOTES["parameters"].format(**sizes, share=100 * counted["share"], **PAPER["parameters"])
+        counted = {name: value / 1e6 for name, value in run.about["parameters"].items()}
+        sizes = {"base": counted["base"], "used": counted["base_used"], "residual": counted["residual"]}
+        sizes |= {"merged": counted["base"] + counted["residual"], "share": 1e8 * counted["share"]}
+        notes.append(NOTES["parameters"].format(**sizes, **PAPER["parameters"]))
+    return notes
 
 
 # --- the pivots
@@ -224,6 +215,9 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
         """Derived figures, too; what is known of images alone is all methods'."""
         if values := values_of.get((method, setting, metric)) or values_of.get(("", "", metric)):
             return mean(values, statistics.median if metric in TIMES else statistics.fmean)
+        if metric == "aux_per_cell":
+            aux, holes = find(method, setting, "aux"), find(method, setting, "hole_cells")
+            return Mean(aux.value / holes.value, 0) if aux and aux.value and holes and holes.value else None
         if metric in REDUCED:
             of, figure, after = REDUCED[metric]
             base, left = find(of or method, setting, figure), find(method, setting, after)
@@ -258,14 +252,23 @@ def _grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
 
-def _of(label: str, dataset: str) -> list[Row]:
-    """The paper's figures for a dataset in a table."""
-    return [row for row in paper_rows(label) if row.dataset == dataset]
+def _papers(label: str, dataset: str, columns: Sequence[Column]) -> dict[str, list[str]]:
+    """The paper's rows for a dataset in a table, by their names."""
+    rows = [row for row in paper_rows(label) if row.dataset == dataset]
+    return {name: _cells(rows, columns, [name])[0] for name in dict.fromkeys(row.method for row in rows)}
 
 
-def _dataset_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
+def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
+    """The methods of a run that a table shows (all, those named by it, or those having a figure), and their names."""
+    if "rows" in spec:
+        return {name: method_name(run, name, title) for name, title in spec["rows"].items() if name in run.methods}
+    having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
+    return {method: method_name(run, method) for method in run.methods if having is None or method in having}
+
+
+def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """For each dataset a row for each method, and the paper's rows; the columns repeat for each disparity."""
-    columns = _columns(spec, runs[0].settings, "" if runs[0].near else "{}: disparity {}")
+    columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
     bodies = []
     for dataset in datasets(runs):
         rows: list[Cells] = []
@@ -274,113 +277,100 @@ def _dataset_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
             for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
                 rows.append((name, images_text(run), *cells))
         rows = rows or [(NOT_RUN, *[EMPTY] * (1 + len(columns)))]
-        papers = _of(spec["label"], dataset)
-        for name in dict.fromkeys(row.method for row in papers):
-            rows.append((name, str(IMAGES[dataset]), *_cells(papers, columns, [name])[0]))
+        rows += [(name, str(IMAGES[dataset]), *cells) for name, cells in _papers(label, dataset, columns).items()]
         bodies.append(_grouped(dataset, rows))
     return [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)], bodies
 
 
-def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
-    """The methods of a run that a table shows (all, those named by it, or those having a figure), and their names."""
-    if "rows" in spec:
-        return {method: f"{title} ({run.base})" for method, title in spec["rows"].items() if method in run.methods}
-    having = {row.method for row in run.rows if row.metric == spec["having"]} - {"base"} if "having" in spec else None
-    return {method: method_name(run, method) for method in run.methods if having is None or method in having}
-
-
-def _near_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
-    """A row for each method, columns for each dataset (tab:near_view)."""
-    columns, titles = _columns(spec, [NEAR]), datasets(runs)
-    bodies: list[list[Cells]] = []
+def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
+    """A row for each method, columns for each dataset."""
+    columns, titles = _columns(spec, settings), datasets(runs)
     ours: dict[str, dict[str, list[str]]] = {}
+    theirs: dict[str, dict[str, list[str]]] = {}
     for run in runs:
         names = _row_names(spec, run)
         for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
             ours.setdefault(name, {})[run.title] = cells
-    methods = dict.fromkeys(row.method for row in paper_rows(spec["label"]))
-    theirs = {
-        name: {title: _cells(_of(spec["label"], title), columns, [name])[0] for title in IMAGES} for name in methods
-    }
-    for group in (ours, theirs):
-        empty = [EMPTY] * len(columns)
-        bodies.append([(name, *(cell for t in titles for cell in by.get(t, empty))) for name, by in group.items()])
+    for title in titles:
+        for name, cells in _papers(label, title, columns).items():
+            theirs.setdefault(name, {})[title] = cells
+    empty = [EMPTY] * len(columns)
+    bodies: list[list[Cells]] = [
+        [(name, *(cell for title in titles for cell in by.get(title, empty))) for name, by in group.items()]
+        for group in (ours or {NOT_RUN: {}}, theirs)
+    ]
     return [("", "Method"), *((title, column.title) for title in titles for column in columns)], bodies
 
 
-def _overhead_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
-    """Added Gaussians of each dataset, their average, and median times."""
-    settings, label = runs[0].settings, spec["label"]
+def _adding(runs: Sequence[Run]) -> list[tuple[Run, str]]:
+    """The runs, and the methods of each that the tables of costs show."""
+    return [(run, method) for run in runs for method in run.methods if method in ("paper", "spackle")]
+
+
+def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
+    """Added Gaussians of each dataset and on average, and medians of the datasets' median times."""
     counts = _columns(spec, settings, "{}: disparity {}")
-    bases = {base: [run for run in runs if run.base == base] for base in dict.fromkeys(run.base for run in runs)}
-    (summary,) = dict.fromkeys(row.method for row in paper_rows(label))
+    pools: dict[str, list[Row]] = {}  # of each row's name the figures of each dataset
     bodies: list[list[Cells]] = []
     for dataset in datasets(runs):
-        rows: list[Cells] = [
-            (run.base, *_cells(run.rows, counts, run.methods)[0]) for run in runs if run.title == dataset
-        ]
-        if theirs := _of(EXPANDED, dataset):
-            rows.append((THEIRS, *_cells(theirs, counts, [theirs[0].method])[0]))
+        rows: list[Cells] = []
+        for run, method in _adding([run for run in runs if run.title == dataset]):
+            name = method_name(run, method)
+            rows.append((name, *_cells(run.rows, counts, [method])[0]))
+            for (setting, metric), values in pivot(_rows_of(run, method), "setting", "metric").items():
+                over = mean(values, statistics.median if metric in TIMES else statistics.fmean)
+                pools.setdefault(name, []).append(Row("", dataset, setting, "", name, metric, over.value))
+        rows = rows or [(NOT_RUN, *[EMPTY] * len(counts))]
+        rows += [(name, *cells) for name, cells in _papers(EXPANDED, dataset, counts).items()]
         bodies.append(_grouped(dataset, rows))
-    averages: list[Cells] = []
-    for base, group in bases.items():
-        if len(group) > 1:  # of the datasets' means, as the paper's
-            means = [
-                Row(run.title, "", setting, "", base, metric, mean(values).value)
-                for run in group
-                for (setting, metric), values in pivot(run.rows, "setting", "metric").items()
-                if metric in ("aux", "aux_share")
-            ]
-            averages.append((base, *_cells(means, counts, [base])[0]))
-    averages.append((THEIRS, *_cells(paper_rows(label), counts, [summary])[0]))
+    for row in paper_rows(label):
+        pools.setdefault(row.method, []).append(row)
+    averages = [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]
     bodies.append(_grouped("Average", averages))
     times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
-    pools = {base: ([row for run in group for row in run.rows], group[0].methods[0]) for base, group in bases.items()}
-    pools[THEIRS] = (list(paper_rows(label)), summary)
     for column in spec["runtime"]:
-        rows = []
-        for name, (pool, method) in pools.items():
-            cells = _cells(pool, _columns({"columns": [column]}, settings), [method])[0]
-            rows.append((name, *(part for cell in cells for part in (cell, EMPTY))))
-        times += _grouped(column[1], rows)
+        columns = _columns({"columns": [column]}, settings)
+        cells = {name: _cells(pool, columns, [name])[0] for name, pool in pools.items()}
+        spread = [(name, *(part for cell in row for part in (cell, EMPTY))) for name, row in cells.items()]
+        times += _grouped(column[1], spread)
     return [("", "Dataset"), ("", "From"), *((column.group, column.title) for column in counts)], [*bodies, times]
 
 
-def _expanded_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
-    """Counts, times and rates, a row for each setting."""
+def _rows_of(run: Run, method: str) -> list[Row]:
+    return [row for row in run.rows if row.method == method]
+
+
+def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
+    """Counts, times and rates, a row for each setting and method."""
     bodies = []
     for dataset in datasets(runs):
         rows: list[Cells] = []
-        theirs = _of(EXPANDED, dataset)
-        for setting in runs[0].settings:
-            name, columns = setting_title(setting), _columns(spec, [setting])
-            for run in (run for run in runs if run.title == dataset):
-                rows.append((name, run.base, *_cells(run.rows, columns, run.methods)[0], images_text(run)))
-            if any(row.setting == setting for row in theirs):
-                figures = _cells(theirs, columns, [theirs[0].method])[0]
-                rows.append((name, THEIRS, *figures, str(IMAGES[dataset])))
+        for setting in settings:
+            title, columns, before = setting_title(setting), _columns(spec, [setting]), len(rows)
+            for run, method in _adding([run for run in runs if run.title == dataset]):
+                name, cells = method_name(run, method), _cells(run.rows, columns, [method])[0]
+                rows.append((title, name, *cells, images_text(run)))
+            rows += [] if len(rows) > before else [(title, NOT_RUN, *[EMPTY] * (1 + len(columns)))]
+            for name, cells in _papers(label, dataset, columns).items():
+                rows += [(title, name, *cells, str(IMAGES[dataset]))] if setting in SETTINGS else []
         bodies.append(_grouped(dataset, rows))
     return [("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")], bodies
 
 
-def _stages_table(spec: Mapping[str, Any], runs: Sequence[Run]) -> Layout:
-    """Where the time goes: stages, and what they come to; a column for each run and setting."""
-    base = [(STAGES[name], f"{name}_stage_ms", "tenths") for name in BASE_PATH]
-    extra = [(STAGES[name], f"{name}_stage_ms", "tenths") for name in EXTRA]
-    sums = [(f"base path: the first {len(base)}", "base_ms", "tenths")]
-    sums += [(f"Spackle's own: the other {len(extra)}", "extra_ms", "tenths")]
-    sums += [(title, figure, text) for _, title, figure, text in spec["columns"]]
-    places = [(run, setting) for run in runs for setting in run.settings]
+def _stages_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
+    """Where the time goes: a row for each setting and method, columns for the stages and what they come to."""
+    stages = [("", title, f"{name}_stage_ms", "tenths") for name, title in STAGES.items()]
+    columns = [(title, metric, TEXTS[text]) for _, title, metric, text in (*stages, *spec["columns"])]
     bodies = []
-    for group in (base, extra, sums):
+    for run in runs:
         rows: list[Cells] = []
-        for title, metric, text in group:
-            cells = []
-            for run, setting in places:
-                low, middle, high = map(TEXTS[text], np.quantile(run.numbers(metric, setting), [0.25, 0.5, 0.75]))
-                cells.append(f"{middle} [{low}, {high}]")
-            rows.append((title, *cells))
-        bodies.append(rows)
-    over = [f"{run.title}, {run.base}" if len(runs) > 1 else "" for run, _ in places]
-    titles = [setting_title(setting, "{}: disparity {}") for _, setting in places]
-    return [("", "Stage"), *zip(over, titles, strict=True)], bodies
+        for setting in settings:
+            for method in run.methods:
+                cells = []
+                for _, metric, text in columns:
+                    numbers = run.numbers(metric, setting, method)
+                    low, middle, high = map(text, np.quantile(numbers, [0.25, 0.5, 0.75]))
+                    cells.append(f"{middle} [{low}, {high}]")
+                rows.append((setting_title(setting), method_name(run, method), *cells))
+        bodies.append(_grouped(run.title, rows))
+    return [("", head) for head in ("Dataset", "Setting", "From", *(title for title, *_ in columns))], bodies

@@ -21,7 +21,7 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case, Points, SecondView
 from spackle.evaluation.datasets.colmap import Model
 
-MAX_SECONDS = 3
+MAX_NEAR = 3  # second views of a photo that count as near
 BASELINES = (0.05, 0.25)  # of the photo's middle depth; a rectified pair of Middlebury's has 0.05 to 0.2
 MAX_TURN = 30.0  # degrees between the optical axes
 MIN_SHARED = 0.3  # of the points that a photo sees, where points are known
@@ -63,51 +63,37 @@ def check_two(scene: Path, count: int) -> None:
 
 
 def make_cases(views: Sequence[Posed], wanted: Iterable[int] | None = None) -> list[Case]:
-    """Photos as cases, their second views (of all `views`) in their own frames.
+    """Photos as cases, all other photos as their second views, in the case's frame and the nearest eye first.
+
+    A second view is a near one, of at most three, if its eye is 5 % to 25 % of the photo's middle depth away and turned
+    by at most 30°, and if it sees at least 30 % of the points that the photo sees; where no points are known, if each
+    camera has the middle of the other's view in its picture. A photo may have none.
 
     Args:
         views: all photos of a scene.
         wanted: indices of the photos that become cases; all where None.
     """
-    cases = []
-    for index, others in near_views(views, range(len(views)) if wanted is None else wanted).items():
-        view, to_world = views[index], torch.linalg.inv(views[index].camera.world_to_camera)
-        seconds = [
-            SecondView(other.name, other.photo, _placed(other.camera, other.camera.world_to_camera @ to_world))
-            for other in (views[k] for k in others)
-        ]
-        camera = _placed(view.camera, torch.eye(4))
-        cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, tuple(seconds)))
-    return cases
-
-
-def _placed(camera: Camera, world_to_camera: Tensor) -> Camera:
-    """In float32."""
-    return dataclasses.replace(camera, world_to_camera=world_to_camera).to(dtype=torch.float32)
-
-
-def near_views(views: Sequence[Posed], wanted: Iterable[int]) -> dict[int, tuple[int, ...]]:
-    """For each wanted photo its second views: the nearest cameras that are neither the same nor far off.
-
-    A camera qualifies at a distance of 5 % to 25 % of the photo's middle depth, turned by at most 30°, if it sees
-    at least 30 % of the points that the photo sees; where no points are known, if each camera has the middle of the
-    other's view in its picture. Of those the three nearest are taken, by distance, then name. A photo may have none.
-
-    Returns:
-        Index in `views` to such indices.
-    """
+    poses = torch.stack([view.camera.world_to_camera for view in views])
     eyes = torch.stack([view.camera.position for view in views]).numpy()
-    axes = torch.stack([view.camera.world_to_camera[2, :3] for view in views]).numpy()
-    chosen = {}
-    for index in wanted:
+    axes = poses[:, 2, :3].numpy()
+    lenses = [view.camera.to(dtype=torch.float32) for view in views]
+    cases = []
+    for index in range(len(views)) if wanted is None else wanted:
         view = views[index]
         apart = np.linalg.norm(eyes - eyes[index], axis=1)
         fits = (apart >= BASELINES[0] * view.depth) & (apart <= BASELINES[1] * view.depth)
         fits &= axes @ axes[index] >= math.cos(math.radians(MAX_TURN))
-        order = sorted(np.flatnonzero(fits).tolist(), key=lambda other: (float(apart[other]), views[other].name))
-        sees = (other for other in order if _sees_the_same(view, views[other]))
-        chosen[index] = tuple(itertools.islice(sees, MAX_SECONDS))
-    return chosen
+        order = sorted(set(range(len(views))) - {index}, key=lambda k: (float(apart[k]), views[k].name))
+        near = set(itertools.islice((k for k in order if fits[k] and _sees_the_same(view, views[k])), MAX_NEAR))
+        placed = (poses @ torch.linalg.inv(poses[index])).float()
+        seconds = tuple(SecondView(views[k].name, views[k].photo, _at(lenses[k], placed[k]), k in near) for k in order)
+        camera = _at(lenses[index], torch.eye(4))
+        cases.append(Case(view.name, view.photo, camera, None, view.points, view.bounds, seconds))
+    return cases
+
+
+def _at(lens: Camera, world_to_camera: Tensor) -> Camera:
+    return dataclasses.replace(lens, world_to_camera=world_to_camera)
 
 
 def _sees_the_same(view: Posed, other: Posed) -> bool:

@@ -46,7 +46,7 @@ def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
     Multi-view: `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and
     `SCENE/images/dslr_images_undistorted/*.JPG`. The model is metric (it was aligned to laser scans); its sparse points
-    give the scale. The dense truth is of the distorted photos, and not used. Second views: see `near_views`. The
+    give the scale. The dense truth is of the distorted photos, and not used. Second views: see `make_cases`. The
     paper's 454 images are the 13 training scenes'.
 
     Two-view: `SCENE_1l/im0.png`, `im1.png`, `calib.txt`, and the truth beside them or, as it is unpacked, in
@@ -96,7 +96,7 @@ def tanks_cases(scenes: Mapping[str, Path]) -> list[Case]:
     without lenses, which are not read. Lengths are arbitrary.
 
     512 photos are taken from all scenes by `spread`: evenly, and by names alone; second views come from all photos,
-    see `near_views`. The paper's 331,776 cells are those of 1920×1080, the size of most scenes' frames; those of
+    see `make_cases`. The paper's 331,776 cells are those of 1920×1080, the size of most scenes' frames; those of
     2048×1080 give 1536×810, and the 980×545 that came with 3D Gaussian splatting stay as they are.
     """
     read = {name: _tanks_views(scene) for name, scene in scenes.items()}
@@ -123,7 +123,7 @@ def llff_cases(scenes: Mapping[str, Path]) -> list[Case]:
 
     Where there is a COLMAP model, its cameras and points are used (the poses were made from it), and the near and far
     bounds only where it has no points. Its photos' names need not be the files': those are matched by name, else by
-    their order, as `poses_bounds.npy` always is. Lengths are arbitrary. Second views: see `near_views`; without a
+    their order, as `poses_bounds.npy` always is. Lengths are arbitrary. Second views: see `make_cases`; without a
     model, the middle depth is that of the bounds, half way in inverse depth.
 
     The paper's 190,512 cells are those of `images_4` (1008×756); `images` (4032×3024) gives 1536×1152.
@@ -200,7 +200,7 @@ def wildrgbd_cases(scenes: Mapping[str, Path]) -> list[Case]:
     takes it. `cam_poses.txt` has a line for each frame: its number and 16 numbers, camera to world, OpenCV.
 
     512 frames are taken by `spread`, in turns over the categories: with 512 scenes or more, one of each. Second views
-    come from all frames of the scene, see `near_views`, the middle depth taken as 0.8 m. At 640×480, upright or not,
+    come from all frames of the scene, see `make_cases`, the middle depth taken as 0.8 m. At 640×480, upright or not,
     the photos stay as they are: the paper's 76,800 cells.
     """
     read: dict[str, list[Posed]] = {}
