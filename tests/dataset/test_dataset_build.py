@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import shutil
 import signal
@@ -218,7 +219,7 @@ def test_too_many_photos_and_a_missing_package_are_a_line(
 
 def test_another_configuration_and_a_held_folder_are_refused(whole: Path, place: Path, copy: Path) -> None:
     done = build(place, copy, "--inpainter", "none", "--disparity", "0.2", "0.3")
-    refuses(done, 'inpainter.name: "geometry" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
+    refuses(done, 'inpainter.name: "exemplar" -> "none"', "views.disparity: [0.1, 0.6] -> [0.2, 0.3]")
     assert content(copy) == content(whole)
     with hold(copy / ".lock"):
         refuses(build(place, copy), "another run is at work")
@@ -236,22 +237,31 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -
     assert config["base"]["weights"] == hashlib.sha256(weights.read_bytes()).hexdigest()
 
 
-def test_training_draws_the_views_of_a_dataset(whole: Path, place: Path, tmp_path: Path) -> None:
-    def sources(folder: Path) -> tuple[DataRecipe, list[Source]]:
-        recipe = DataRecipe(pseudo=folder)
-        return recipe, find_sources(recipe, get_renderer())
+def test_training_takes_each_view_once_and_judges_by_other_photos(whole: Path, copy: Path) -> None:
+    def sources(folder: Path, validation_views: int = 8) -> tuple[DataRecipe, list[Source]]:
+        recipe = DataRecipe(pseudo=folder, validation_views=validation_views)
+        parts = [find_sources(recipe, get_renderer(), validation=judges) for judges in (False, True)]
+        return recipe, [source for (source,) in parts]
 
-    (source,) = sources(whole)[1]
-    sample, again = (source.view(np.random.default_rng(3)) for _ in range(2))
-    assert torch.equal(sample.target, again.target)
-    assert bool(sample.hole.any())
-    (view,) = [view for view in ViewDataset(whole) if torch.equal(view.target, sample.target)]
-    assert torch.equal(view.mask, sample.hole)
-    options = ("--sample", 1, "--views", 2)
-    assert build(place, tmp_path / "none", *options, "--inpainter", "none").code == 0
-    with pytest.raises(InputError, match="--inpainter none"):
-        sources(tmp_path / "none")
-    assert build(place, tmp_path / "other", *options).code == 0
-    places = whole, shutil.copytree(whole, tmp_path / "copy"), tmp_path / "other"
-    one, same, other = (digest_of_samples(*sources(at)) for at in places)
+    rng, views, found = np.random.default_rng(0), list(ViewDataset(whole)), list[list[tuple[str, int]]]()
+    for source in sources(whole)[1]:
+        samples = [source.view(rng, number) for number in range(source.views or 0)]
+        pairs = itertools.product(samples, views)
+        found.append([(v.key, v.index) for s, v in pairs if torch.equal(v.target, s.target)])
+        assert all(bool(sample.hole.any()) for sample in samples)
+    learned, judged = found
+    assert sorted(learned + judged) == [(view.key, view.index) for view in views if bool(view.mask.any())]
+    assert len({key for key, _ in judged}) == 2
+    assert not {key for key, _ in learned} & {key for key, _ in judged}
+    one, same, other = (digest_of_samples(*sources(*at)) for at in ((whole,), (copy,), (whole, 4)))
     assert one == same != other
+
+
+@pytest.mark.parametrize("name", ["none", "geometry"])
+def test_targets_that_the_untrained_network_draws_are_refused(copy: Path, tmp_path: Path, name: str) -> None:
+    manifest = load_manifest(copy)
+    manifest.model_copy(update={"config": {**manifest.config, "inpainter": {"name": name}}}).save(copy)
+    options = (f"data.pseudo={copy}", "loss.features=none")
+    done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options)
+    refuses(done, f"{copy}: built with --inpainter {name}", "teach nothing: build another with --inpainter propainter")
+    assert not (tmp_path / "out").exists()

@@ -6,13 +6,13 @@ import dataclasses
 
 import pytest
 import torch
-from scenes import box_before_wall, shifted
+from scenes import box_before_wall, cast, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
-from spackle.dataset.views import APART, ViewStack, complete_views, paint, path_cameras, render_views
-from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter
+from spackle.dataset.views import APART, ViewStack, complete_views, paint_video, path_cameras, render_views
+from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, known_inverse_depth
 from spackle.render import get_renderer
 
 
@@ -35,7 +35,7 @@ def stack_of(*rights: float) -> ViewStack:
     return render_views(scene.lift(), views, get_renderer())
 
 
-@pytest.mark.parametrize("name", ["geometry", "opencv", "none"])
+@pytest.mark.parametrize("name", ["exemplar", "geometry", "opencv", "none"])
 def test_completion_touches_the_holes_alone(name: str) -> None:
     if name == "opencv":
         pytest.importorskip("cv2")
@@ -46,6 +46,30 @@ def test_completion_touches_the_holes_alone(name: str) -> None:
     assert bool((targets[stack.mask].amax(-1) > 0.2).all()) == (name != "none")
     whole = dataclasses.replace(stack, mask=torch.zeros_like(stack.mask))
     assert torch.equal(complete_views(whole, name, inpainter, get_renderer()), stack.rgb)
+
+
+@pytest.mark.parametrize("name", ["exemplar", "opencv"])
+def test_views_that_are_painted_in_turn_show_the_same_wall(name: str) -> None:
+    if name == "opencv":
+        pytest.importorskip("cv2")
+    stack, inpainter = stack_of(0.4, 0.3, 0.2), get_inpainter(name, InpainterOptions())
+    in_turn = complete_views(stack, name, inpainter, get_renderer())
+    alone = inpainter.paint(stack.rgb, stack.mask, known_inverse_depth(stack.depth, stack.mask))
+
+    def difference(targets: Tensor) -> float:
+        """Mean, where two views have a hole before the same spot of the wall."""
+        found = []
+        for here, there in ((1, 2), (1, 3), (2, 3)):
+            uv, _ = stack.cameras[there].project(cast(stack.cameras[here], 6.0))
+            x, y = uv.long().unbind(-1)
+            inside = (uv >= 0).all(-1) & (x < 96) & (y < 72)
+            x, y = x.clamp(0, 95), y.clamp(0, 71)
+            both = inside & stack.mask[here] & stack.mask[there][y, x]
+            assert int(both.sum()) > 200
+            found.append((targets[here] - targets[there][y, x]).abs()[both].mean())
+        return float(torch.stack(found).mean())
+
+    assert difference(in_turn) < 0.4 * difference(alone)
 
 
 class Numbering:
@@ -59,7 +83,7 @@ class Numbering:
 def test_an_inpainter_gets_the_views_in_the_order_of_the_path() -> None:
     stack = stack_of(0.3, -0.3, -0.4)
     inpainter, order = Numbering(), [1, 0, 2, 3]
-    targets = paint(inpainter, stack)  # type: ignore[arg-type]  # no inpainter in all respects
+    targets = paint_video(inpainter, stack)  # type: ignore[arg-type]  # no inpainter in all respects
     rgb, hole, inverse_depth = inpainter.inputs
     assert torch.equal(rgb, stack.rgb[order])
     assert torch.equal(hole, stack.mask[order])

@@ -180,6 +180,7 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
         (["data.pseudo=null"], "data: --method direct-ft learns from data.pseudo"),
         (["data.photos={place}/photos"], "samples of other sources have Gaussians that cannot change"),
         (["data.pseudo={place}/rgbd"], "rgbd: built with --base rgbd, so its holes are not SHARP's"),
+        (["data.pseudo={place}/geometry"], "built with --inpainter geometry, which draws what the untrained residual"),
         (["-c", "{place}/other.safetensors"], "data: built with other weights of SHARP (SHA-256 "),
         (["-c", "{place}/whole/best.safetensors"], "best.safetensors: a decoder that was trained already"),
         (["optim.batch=6"], "optim.batch=6: --method direct-ft takes 4 views"),
@@ -190,9 +191,10 @@ def test_a_step_has_the_own_view_and_a_photo_teaches_or_judges(place: Path) -> N
 def test_what_cannot_be_trained_is_said_in_a_line(
     place: Path, whole: Path, tmp_path: Path, options: list[str], said: str
 ) -> None:
-    if "{place}/rgbd" in str(options):  # a dataset of another base
-        manifest = load_manifest(shutil.copytree(place / "data", place / "rgbd"))
-        manifest.model_copy(update={"config": {**manifest.config, "base": {"name": "rgbd"}}}).save(place / "rgbd")
+    for key, name in (("base", "rgbd"), ("inpainter", "geometry")):  # a dataset of that
+        if f"{{place}}/{name}" in str(options):
+            manifest = load_manifest(shutil.copytree(place / "data", place / name))
+            manifest.model_copy(update={"config": {**manifest.config, key: {"name": name}}}).save(place / name)
     if "{place}/other.safetensors" in options:
         save_file(deterministic_weights(expected_shapes(MICRO)), place / "other.safetensors")
     done = train(place, tmp_path / "out", *(option.format(place=place) for option in options))

@@ -270,7 +270,7 @@ def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[fl
     """The samples of five views of a box, some of which have no hole, and from where these views were made."""
     asked: list[float] = []
 
-    def view(rng: np.random.Generator) -> Sample:
+    def view(rng: np.random.Generator, number: int) -> Sample:
         if len(asked) == killed_at:
             raise KeyboardInterrupt
         asked.append(float(rng.uniform(-0.4, 0.4)))

@@ -56,8 +56,8 @@ def dataset_build(
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")
     ] = (0.1, 0.6),
     inpainter: Annotated[
-        str, typer.Option(help="What completes the views: geometry, exemplar, lama, opencv, propainter; or none.")
-    ] = "geometry",
+        str, typer.Option(help="What completes the views: exemplar, lama, opencv, propainter; geometry; or none.")
+    ] = "exemplar",
     inpainter_weights: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Its weights: propainter's folder, or a file of lama's.")
     ] = None,

@@ -46,7 +46,7 @@ class DatasetOptions:
     views: int = 20  # of a photo, its own among them, as in the paper
     trajectory: TrajectoryKind | None = None  # drawn for each photo where None
     disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
-    inpainter: str = "geometry"  # of `COMPLETIONS`
+    inpainter: str = "exemplar"  # of `COMPLETIONS`
     inpainter_weights: Path | None = None  # a file or a folder, for one with a network
     inpainter_side: int | None = None  # long side in pixels at which its network works
     workers: int = 1  # processes

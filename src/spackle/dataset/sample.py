@@ -6,6 +6,7 @@ Colours, opacity and depth lose less than anybody sees, Gaussians less than 1e-3
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import json
 import math
@@ -131,7 +132,7 @@ class PhotoGroup:
                 rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
                 mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
                 target=target,
-                base=decode_gaussians(self.files[f"{self.key}.base.safetensors"]) if with_base else None,
+                base=self.base if with_base else None,
             )
             for camera, pictures in (
                 (view.camera, (rgb, depth, view.rendering.alpha, view.mask, target)),
@@ -140,6 +141,11 @@ class PhotoGroup:
                 if any(picture.shape[:2] != (camera.height, camera.width) for picture in pictures):
                     raise ValueError("a picture has another size than its camera")
             return view
+
+    @functools.cached_property
+    def base(self) -> Gaussians:
+        """The photo's Gaussians; of a damaged file any exception."""
+        return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
     def only(self, index: int, *, with_base: bool = False) -> PhotoGroup:
         """The files that one view needs, so the bytes of the others are free again."""

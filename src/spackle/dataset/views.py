@@ -1,6 +1,6 @@
 """The views of a photo along a controlled camera path, and their completed targets (paper, appendix).
 
-Targets are drawn from one completed scene, left open, or painted by an inpainter.
+Targets are painted by an inpainter, the same surface alike in all views; drawn from one completed scene; or left open.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from spackle.bases import BasePrediction
 from spackle.camera import Camera
@@ -20,12 +21,14 @@ from spackle.filters import far_fill
 from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
 from spackle.render import Renderer
-from spackle.render.protocol import Rendering
 from spackle.residual import hole_mask
+from spackle.scene_fill.fill import farthest_first
 
 APART = 1e-3  # eyes nearer than this to each other, in units of the path's width, show the same
 SPARE = 6  # frames of a path that may coincide with others
-COMPLETIONS = ("geometry", *INPAINTERS, "none")  # values of --inpainter
+SAME_SURFACE = 0.03  # depths that differ less, relative to each other, are of one surface
+LEAST = 1e-6  # inverse depth that is divided by
+COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
 
 
 def draw_path(
@@ -90,36 +93,70 @@ def complete_views(views: ViewStack, completion: str, inpainter: Inpainter | Non
 
     `completion` is one of `COMPLETIONS`; "none" leaves the holes to somebody else.
     """
-    if inpainter is not None:
-        return paint(inpainter, views)
-    return views.rgb if completion == "none" else render_completed(views, renderer)
+    if completion == "none":
+        return views.rgb
+    if inpainter is None:
+        return torch.where(views.mask[..., None], render_completed(views, renderer)[0], views.rgb)
+    return paint_video(inpainter, views) if inpainter.video else paint_in_turn(inpainter, views, renderer)
 
 
 @torch.no_grad()
-def render_completed(views: ViewStack, renderer: Renderer) -> Tensor:
-    """Each hole as one completed scene shows it, filled by seeds alone in the widest view: the same in all views."""
+def render_completed(views: ViewStack, renderer: Renderer) -> tuple[Tensor, Tensor]:
+    """Colours [V, H, W, 3] and inverse depth [V, H, W] of one completed scene, filled by seeds alone: all views agree.
+
+    The few pixels that are uncovered even then get those of pixels around.
+    """
     prediction = views.prediction
     aux = complete(prediction, views.cameras, exact=True, network=None, fill="network", renderer=renderer).aux
-    targets = []
-    for camera, target, hole in zip(views.cameras, views.rgb, views.mask, strict=True):
+    colors, inverse_depths = views.rgb.clone(), known_inverse_depth(views.depth, views.mask)
+    for index, camera in enumerate(views.cameras):
+        if bool(views.mask[index].any()):
+            drawn = renderer.render([prediction.gaussians, aux], camera)
+            rgb, inverse_depth = drawn.rgb, known_inverse_depth(drawn.depth, hole_mask(drawn.alpha))
+            if 0 < int(inverse_depth.count_nonzero()) < inverse_depth.numel():
+                inverse_depth, mixed = far_fill(inverse_depth, rgb.permute(2, 0, 1), inverse_depth > 0)
+                rgb = mixed.permute(1, 2, 0)
+            colors[index], inverse_depths[index] = rgb, inverse_depth
+    return colors, inverse_depths
+
+
+@torch.no_grad()
+def paint_in_turn(inpainter: Inpainter, views: ViewStack, renderer: Renderer) -> Tensor:
+    """The views with their holes painted one after the other, the farthest from the photo first, so that all agree.
+
+    What the views before show is reprojected into a view's holes, and the inpainter paints the rest of them. Where the
+    surfaces lie in the holes, one completed scene says.
+    """
+    inverse_depths, targets = render_completed(views, renderer)[1], views.rgb.clone()
+    painted: list[int] = []
+    for index in farthest_first(views.cameras, views.prediction.camera):
+        camera, hole, target = views.cameras[index], views.mask[index].clone(), targets[index]
+        for other in painted:
+            row, column = hole.nonzero(as_tuple=True)
+            pixels = camera.pixel_centers().to(target)[row, column]
+            points = camera.unproject(pixels, 1 / inverse_depths[index][row, column].clamp_min(LEAST))
+            colors, seen = looked_up(points, views.cameras[other], targets[other], inverse_depths[other])
+            target[row[seen], column[seen]] = colors[seen]
+            hole[row[seen], column[seen]] = False
         if bool(hole.any()):
-            colors = _covered(renderer.render([prediction.gaussians, aux], camera))
-            target = torch.where(hole[..., None], colors, target)
-        targets.append(target)
-    return torch.stack(targets)
+            known = torch.where(hole, 0, inverse_depths[index])
+            targets[index] = inpainter.paint(target[None], hole[None], known[None])[0]
+        if bool(views.mask[index].any()):
+            painted.append(index)
+    return targets
 
 
-def _covered(drawn: Rendering) -> Tensor:
-    """The colours [H, W, 3] of a view; the few pixels that are still uncovered get those of pixels around."""
-    hole = hole_mask(drawn.alpha)
-    inverse_depth = known_inverse_depth(drawn.depth, hole)
-    known = inverse_depth > 0
-    if not bool(hole.any()) or not bool(known.any()):
-        return drawn.rgb
-    return far_fill(inverse_depth, drawn.rgb.permute(2, 0, 1), known)[1].permute(1, 2, 0)
+def looked_up(points: Tensor, camera: Camera, rgb: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Colours [n, 3] of points [n, 3] in a view [H, W, 3] with inverse depth [H, W]; [n] bool: whether it sees them."""
+    uv, z = camera.project(points)
+    place = 2 * uv / uv.new_tensor([camera.width, camera.height]) - 1
+    images = torch.cat([rgb, inverse_depth[..., None]], -1).permute(2, 0, 1)
+    values = grid_sample(images[None], place[None, None], align_corners=False, padding_mode="border")[0, :, 0].T
+    same = (values[:, 3] * z - 1).abs() < SAME_SURFACE
+    return values[:, :3], same & (z > 0) & (place.abs() <= 1).all(-1)
 
 
-def paint(inpainter: Inpainter, views: ViewStack) -> Tensor:
+def paint_video(inpainter: Inpainter, views: ViewStack) -> Tensor:
     """The views with their holes painted, given as a flight along the path meets them.
 
     The first view, the photo's, stands where the detour is least.

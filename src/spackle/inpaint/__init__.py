@@ -47,6 +47,7 @@ class Inpainter(Protocol):
     name: str
     version: str  # another version may give other pixels
     network: ClassVar[bool]  # takes weights and a side, and uses a GPU
+    video: ClassVar[bool]  # makes the views agree with each other; else it paints each by itself
     notice: ClassVar[str]  # a line that people read before it is used, such as its licence; empty where there is none
     files: Mapping[str, Path]  # its weights, by the names that a manifest gives them
 

@@ -40,6 +40,7 @@ class LamaInpainter:
 
     name = "lama"
     network: ClassVar[bool] = True
+    video: ClassVar[bool] = False
     notice: ClassVar[str] = ""
 
     def __init__(self, options: InpainterOptions) -> None:

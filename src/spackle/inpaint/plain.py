@@ -21,6 +21,7 @@ class PlainInpainter:
     """What inpainters without a network have in common."""
 
     network: ClassVar[bool] = False
+    video: ClassVar[bool] = False
     notice: ClassVar[str] = ""
     files: Mapping[str, Path] = {}
 

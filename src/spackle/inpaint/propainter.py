@@ -36,6 +36,7 @@ class PropainterInpainter:
 
     name = "propainter"
     network: ClassVar[bool] = True
+    video: ClassVar[bool] = True
     notice: ClassVar[str] = (
         "ProPainter and its weights are S-Lab's, for non-commercial use only: "
         "https://github.com/sczhou/ProPainter/blob/main/LICENSE"

@@ -32,10 +32,10 @@ from spackle.gaussians import Gaussians
 from spackle.network_file import read_tensors
 from spackle.progress import Reporter
 from spackle.render import Renderer, device_of
-from spackle.training.recipe import DataRecipe, Recipe
+from spackle.training.recipe import Recipe
 from spackle.training.residual import PICTURE_SIDE, PICTURED, ViewBatch, ViewTask
 from spackle.training.samples import short_digest
-from spackle.training.sources import open_pseudo
+from spackle.training.sources import divided_photos, open_pseudo
 from spackle.weights import check_undamaged, installed, weights_digest
 
 VIEWS_AT_ONCE = 4  # of a photo in a step: they share a pass through the encoder, which costs more than all the rest
@@ -131,7 +131,8 @@ class DirectFt(ViewTask):
             )
         self.owner = _find_owner(checkpoint)
         self.files = open_pseudo(data.pseudo)
-        self.learned, self.validation = _divided(self.files, data, self.owner.sha256)
+        _check_base(self.files, self.owner.sha256)
+        self.learned, self.validation = divided_photos(self.files, data)
         self.digest = short_digest((self.files.manifest.digest, self.learned, self.validation))
         self.items, self.validation_items = len(self.learned), len(self.validation)
         self.items_a_step = recipe.optim.batch // VIEWS_AT_ONCE
@@ -182,28 +183,19 @@ def drawn_views(seed: Sequence[int], views: int) -> list[int]:
     return [0, *sorted(others.tolist())]
 
 
-def _divided(files: DatasetFiles, data: DataRecipe, weights_sha256: str) -> tuple[list[int], list[int]]:
-    """The places of photos to learn from and of those for validation, in a random order of `data.seed`.
-
-    InputError for a dataset of another base or of other weights than those that learn, or of a single photo.
-    """
+def _check_base(files: DatasetFiles, weights_sha256: str) -> None:
+    """InputError for a dataset of another base or of other weights than those that learn."""
     base = files.manifest.config.get("base", {})
     if base.get("name") != "sharp":
         raise InputError(
-            f"{data.pseudo}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
+            f"{files.location}: built with --base {base.get('name')}, so its holes are not SHARP's, which is to learn: "
             "build one with --base sharp"
         )
     if base.get("weights") != weights_sha256:
         raise InputError(
-            f"{data.pseudo}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
+            f"{files.location}: built with other weights of SHARP (SHA-256 {base.get('weights')}): "
             "give them with -c, or build a dataset with these"
         )
-    photos, per_photo = len(files), len(files.samples[0][1].holes)
-    if photos < 2:
-        raise InputError(f"{data.pseudo}: a single photo, but one must learn and another judge: build it with more")
-    order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
-    held = min(max(1, data.validation_views // per_photo), photos // 2)
-    return order[held:][: max(1, data.views // per_photo)], order[:held]
 
 
 def _find_owner(checkpoint: Path | None) -> Owner:

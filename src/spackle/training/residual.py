@@ -201,8 +201,8 @@ class ResidualTask(ViewTask):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.run.seed)
             self.network = first_network(recipe.network, recipe.init).requires_grad_()
-        self.sources = find_sources(recipe.data, self.renderer)
-        self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources), recipe.optim.batch
+        self.sources = [find_sources(recipe.data, self.renderer, validation=which) for which in (False, True)]
+        self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources[0]), recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
         """Make the samples that are missing."""
@@ -217,12 +217,12 @@ class ResidualTask(ViewTask):
         make_folder(folder)
         reporter.log(f"samples of {data.views + data.validation_views} views in {folder}")
         with reporter.stage("samples") as step:
-            # Other seeds, other views: no view is in both.
+            # Other seeds, other views, and of a dataset other photos: no view is in both.
             self.validation, self.learned = (
-                make_samples(data, self.sources, folder / self.digest / name, seed, views, step, skip)
-                for name, seed, views in (
-                    ("validation", 2 * data.seed + 1, data.validation_views),
-                    ("train", 2 * data.seed, data.views),
+                make_samples(data, sources, folder / self.digest / name, seed, views, step, skip)
+                for name, sources, seed, views in (
+                    ("validation", self.sources[True], 2 * data.seed + 1, data.validation_views),
+                    ("train", self.sources[False], 2 * data.seed, data.views),
                 )
             )
         if skipped:

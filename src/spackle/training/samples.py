@@ -40,7 +40,7 @@ REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
 EXACT = ("camera.K", "camera.world_to_camera", "base.means", "seeds.uv", "seeds.inverse_depth")
 PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
-SAMPLES_VERSION = 5  # goes up whenever the same recipe would make other samples
+SAMPLES_VERSION = 6  # goes up whenever the same recipe would make other samples
 P = TypeVar("P")
 
 
@@ -180,8 +180,9 @@ class Source(NamedTuple):
     """A kind of views with holes and truth, of which a share of the samples is made."""
 
     share: float  # among all sources, which need not add up to 1
-    view: Callable[[np.random.Generator], Sample]  # one of its views; InputError for a file that cannot be used
+    view: Callable[[np.random.Generator, int], Sample]  # the view of a number; InputError for a file that is no use
     names: Sequence[str]  # of the source and of its files, relative to their folder
+    views: int | None = None  # how many it has, numbered from 0; None: drawn, without end
 
 
 def digest_of_samples(data: DataRecipe, sources: Sequence[Source]) -> str:
@@ -211,19 +212,29 @@ def make_samples(
 ) -> list[Path]:
     """The files of all samples of a folder's first views, in order; what is missing is made, by each process a part.
 
-    Many recipes may share the folder. `seed` decides the views; `progress` is called with the views of this process
-    that are there, of how many, and `warn` with the reason for each view that gives no sample. InputError where nothing
-    can be written, or no view has a hole to learn from.
+    Many recipes may share the folder. `seed` decides the views, of which there are fewer where the only source has no
+    more; `progress` is called with the views of this process that are there, of how many, and `warn` with the reason
+    for each view that gives no sample. InputError where nothing can be written, or no view has a hole to learn from.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    if len(sources) == 1 and sources[0].views is not None:
+        views = min(views, sources[0].views)
     shares = np.array([source.share for source in sources])
-    mine = range(rank(), views, rank_count())
+
+    def drawn(index: int) -> tuple[int, np.random.Generator]:
+        """Which source a view is of, and what else is drawn for it."""
+        rng = np.random.default_rng([seed, index])
+        return int(rng.choice(len(sources), p=shares / shares.sum())), rng
+
+    choices = [drawn(index)[0] for index in range(views)]
+    mine = range(*(views * part // rank_count() for part in (rank(), rank() + 1)))  # one process reads a photo's views
     for done, index in enumerate(mine, 1):
         if _crop_files(folder, index) is None:
-            rng = np.random.default_rng([seed, index])
-            source, crops = sources[rng.choice(len(sources), p=shares / shares.sum())], list[Sample]()
+            (choice, rng), crops = drawn(index), list[Sample]()
+            source, number = sources[choice], choices[:index].count(choice)  # of the source's views
             try:
-                crops = random_crops(source.view(rng), rng, data.crops, data.cells)
+                view = source.view(rng, number if source.views is None else number % source.views)
+                crops = random_crops(view, rng, data.crops, data.cells)
             except (InputError, ValueError) as error:
                 warn(str(error))
             for number, crop in enumerate(crops):

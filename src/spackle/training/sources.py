@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
+from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import DatasetFiles
 from spackle.errors import InputError, reading
 from spackle.files import files_in
@@ -36,19 +37,25 @@ from spackle.training.samples import Sample, Source
 TOLERANCE = 0.02  # how far behind what the virtual camera sees a Gaussian may lie and still count as seen, relative
 CORNER = 0.25  # pixels; centres of pixels are half of one from their corners
 FRAMES = 24  # of a path, one of which is the virtual camera
-UNCOMPLETED = "none"  # the inpainter that leaves its holes open
+NO_TARGETS = {  # inpainters whose pictures teach nothing
+    "none": "leaves the holes open",
+    "geometry": "draws what the untrained residual draws",
+}
 
 Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # a photo [H, W, 3] sRGB with depth
 
 
-def find_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
-    """Look for a recipe's files; InputError for a folder that is missing or without such files, or no data."""
+def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
+    """Look for a recipe's files, to learn from or for `validation`: of a dataset these are other photos.
+
+    InputError for a folder that is missing or without such files, or no data.
+    """
     shares, sources = data.shares, list[Source]()
 
     def add(name: str, share: float, folder: Path, files: Sequence[Path], view: Callable[..., Sample]) -> None:
         if share > 0:
             names = [file.relative_to(folder).as_posix() for file in files]
-            sources.append(Source(share, view, [name, *names]))
+            sources.append(Source(share, lambda rng, index: view(rng), [name, *names]))
 
     def reverse(draw: Draw) -> Callable[[np.random.Generator], Sample]:
         return partial(random_reverse_view, draw=draw, disparity=data.disparity, renderer=renderer)
@@ -69,8 +76,11 @@ def find_sources(data: DataRecipe, renderer: Renderer) -> list[Source]:
         add("pairs", shares.pairs, data.stereo, scenes, view)
     if data.pseudo is not None and shares.pseudo > 0:
         dataset = open_pseudo(data.pseudo)
-        view = partial(pseudo_view, files=dataset, places=views_with_holes(dataset))
-        sources.append(Source(shares.pseudo, view, ["pseudo", dataset.manifest.digest]))
+        split = divided_photos(dataset, data)
+        places = [(photo, view) for photo in split[validation] for view in views_with_holes(dataset, photo)]
+        one = partial(pseudo_view, group=lru_cache(1)(dataset.group), places=places)  # its views follow on each other
+        names = ["pseudo", dataset.manifest.digest, *map(str, split[True])]
+        sources.append(Source(shares.pseudo, one, names, views=len(places)))
     if not sources:
         raise InputError(
             "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
@@ -162,23 +172,41 @@ def right_view(rng: np.random.Generator, folders: Sequence[Path], renderer: Rend
 def open_pseudo(location: str | os.PathLike[str]) -> DatasetFiles:
     """A pseudo-supervised dataset (appendix, "Dataset"); InputError for one that is not finished or teaches nothing."""
     files = DatasetFiles(location)
-    if files.manifest.config.get("inpainter", {}).get("name") == UNCOMPLETED:
-        raise InputError(f"{location}: built with --inpainter none, so its targets teach nothing: build another")
-    if not views_with_holes(files):
+    name = files.manifest.config.get("inpainter", {}).get("name")
+    if name in NO_TARGETS:
+        raise InputError(
+            f"{location}: built with --inpainter {name}, which {NO_TARGETS[name]}, so its targets teach nothing: "
+            "build another with --inpainter propainter, exemplar or lama"
+        )
+    if not any(views_with_holes(files, photo) for photo in range(len(files))):
         raise InputError(f"{location}: no view in it has a hole: build it with a wider --disparity")
     return files
 
 
-def views_with_holes(files: DatasetFiles) -> list[tuple[int, int]]:
-    """Photo and view of each view that has a hole."""
-    samples = (sample for _, sample in files.samples)
-    return [(photo, view) for photo, sample in enumerate(samples) for view, hole in enumerate(sample.holes) if hole > 0]
+def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], list[int]]:
+    """The places of a dataset's photos to learn from and of those for validation, in an order of `data.seed`.
+
+    A photo is in one of the two with all of its views. InputError for a single photo.
+    """
+    photos, per_photo = len(files), len(files.samples[0][1].holes)
+    if photos < 2:
+        raise InputError(f"{data.pseudo}: a single photo, but one must learn and another judge: build it with more")
+    order = [int(place) for place in np.random.default_rng(data.seed).permutation(photos)]
+    held = min(max(1, data.validation_views // per_photo), photos // 2)
+    return order[held:][: max(1, data.views // per_photo)], order[:held]
 
 
-def pseudo_view(rng: np.random.Generator, files: DatasetFiles, places: Sequence[tuple[int, int]]) -> Sample:
-    """One of a dataset's views as it is stored, rendering and all; InputError for a file that cannot be used."""
-    photo, index = places[int(rng.integers(len(places)))]
-    view = files.group(photo).view(index, with_base=True)
+def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
+    """Those of a photo's views that have a hole."""
+    return [view for view, hole in enumerate(files.samples[photo][1].holes) if hole > 0]
+
+
+def pseudo_view(
+    rng: np.random.Generator, index: int, group: Callable[[int], PhotoGroup], places: Sequence[tuple[int, int]]
+) -> Sample:
+    """The dataset's view at `places[index]` as it is stored, rendering and all; InputError for a damaged file."""
+    photo, number = places[index]
+    view = group(photo).view(number, with_base=True)
     assert view.base is not None
     return Sample.of(view.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
 
