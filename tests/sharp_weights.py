@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,11 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from spackle.bases.sharp.base import expected_shapes
-from spackle.bases.sharp.encoder import LAYERS, STRIDE, TINY, SharpConfig
+from spackle.bases.sharp.encoder import LAYERS, MICRO, STRIDE, TINY, SharpConfig
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.cli.weights import deterministic_weights
 
 DATA = Path(__file__).parent / "data"
-# A ninth of the tiny network's pixels: quick, and of no checkpoint's size.
-MICRO = dataclasses.replace(TINY, window=128)
 
 
 def tiny_weights() -> dict[str, Tensor]:

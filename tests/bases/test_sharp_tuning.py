@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from torch import Tensor
 
 from spackle.bases.sharp import SharpBase
 from spackle.bases.sharp.base import NOTE, Owner, decoder_bytes, expected_shapes, link_owner
-from spackle.bases.sharp.encoder import CONFIGS
 from spackle.camera import Camera
 from spackle.cli.weights import deterministic_weights
 from spackle.errors import InputError
@@ -35,13 +33,11 @@ NUDGE = 3e-4  # how far weights are moved to see what becomes of it
 
 
 @pytest.fixture(scope="module")
-def owner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Owner]:
-    """A checkpoint of SHARP from 512² pixels, whose width does not tell it from the tiny one."""
+def owner(tmp_path_factory: pytest.TempPathFactory) -> Owner:
+    """A checkpoint of SHARP from 512² pixels."""
     path = tmp_path_factory.mktemp("tuning") / "sharp.safetensors"
     save_file(deterministic_weights(expected_shapes(MICRO)), path)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(CONFIGS, "tiny", MICRO)
-        yield Owner(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    return Owner(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,12 +13,11 @@ from command import Run, names_in, refuses, report_of, run
 from photos import picture, read_ply, write_photo
 from PIL import Image
 from safetensors.torch import save_file
-from sharp_weights import MICRO
 from torch import Tensor
 from training_runs import losses_of, one_thread, run_two, state
 
 from spackle.bases.sharp.base import PARTS, expected_shapes
-from spackle.bases.sharp.encoder import CONFIGS
+from spackle.bases.sharp.encoder import MICRO
 from spackle.cli.weights import deterministic_weights
 from spackle.dataset import DatasetFiles
 from spackle.dataset.shards import load_manifest
@@ -38,19 +36,6 @@ loss: {features: none}
 optim: {steps: 4, batch: 4, warmup: 0, lr: 1.0e-3, ema: 0.5, precision: fp32}
 run: {validate_every: 4, save_every: 2, log_every: 1}
 """
-SMALL = """
-from spackle.bases.sharp import encoder
-import dataclasses
-encoder.CONFIGS["tiny"] = dataclasses.replace(encoder.TINY, window=128)
-"""  # for other processes, as the fixture `small` does it in this one
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small() -> Iterator[None]:
-    """SHARP from 512² pixels, which a checkpoint's width cannot tell from the tiny one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(CONFIGS, "tiny", MICRO)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +132,7 @@ def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, wh
 def test_two_processes_find_the_gradient_of_one(place: Path, tmp_path: Path) -> None:
     """Two photos each: gradients are added up within a process, and then put together."""
     options = ["optim.steps=1", "optim.batch=16", "run.validate_every=1"]
-    run_two(arguments(place, tmp_path / "two", *options), SMALL)
+    run_two(arguments(place, tmp_path / "two", *options))
     assert train(place, tmp_path / "one", *options).code == 0
     one, two = (state(tmp_path / name).optimizer["state"] for name in ("one", "two"))
     assert one.keys() == two.keys()

@@ -86,7 +86,8 @@ def _fetch(entry: PublishedWeights, url: str, path: Path, reporter: Reporter) ->
 def weights_make(
     output: Annotated[Path, typer.Argument(metavar="FILE", help="A name that ends in .pt or .safetensors.")],
     size: Annotated[
-        Literal["full", "tiny", "lama"], typer.Option(help="SHARP's published size, one for tests, or LaMa's.")
+        Literal["full", "tiny", "micro", "lama"],
+        typer.Option(help="SHARP's published size, two for tests, or LaMa's."),
     ] = "full",
 ) -> None:
     """Make random weights of SHARP's or LaMa's shape, the same each time, to try everything without theirs."""

@@ -180,9 +180,9 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     tensors: Mapping[str, Tensor] = read_tensors(path, ADVICE)
     if (owner := owner_of(path)) is not None:
         tensors = _with_owner(tensors, path, owner)
-    token = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.cls_token")
-    width = token.shape[-1] if token is not None and token.ndim else None
-    config = next((config for config in CONFIGS.values() if config.embed == width), CONFIGS["full"])
+    places = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.pos_embed")
+    sizes = {(1, 1 + config.grid**2, config.embed): config for config in CONFIGS.values()}
+    config = CONFIGS["full"] if places is None else sizes.get(tuple(places.shape), CONFIGS["full"])
     with torch.device("meta"):
         network = SharpNetwork(config)
     advice = ["try --precision bf16"] if dtype == torch.float32 else []  # it takes half as much

@@ -47,7 +47,8 @@ class SharpConfig:
 
 FULL = SharpConfig()
 TINY = SharpConfig(48, 4, 3, 8, (0, 1), (16, 24, 32, 32), depth_width=16, gaussian_width=16, feature_width=16)
-CONFIGS = {"full": FULL, "tiny": TINY}
+MICRO = dataclasses.replace(TINY, window=128)  # a ninth of the pixels
+CONFIGS = {"full": FULL, "tiny": TINY, "micro": MICRO}
 
 _HEAVY = (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, nn.GroupNorm)
 
