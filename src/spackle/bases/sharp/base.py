@@ -181,6 +181,7 @@ def load_network(path: str | os.PathLike[str], dtype: torch.dtype, device: torch
     if (owner := owner_of(path)) is not None:
         tensors = _with_owner(tensors, path, owner)
     places = tensors.get("monodepth_model.monodepth_predictor.encoder.patch_encoder.pos_embed")
+    sizes: dict[tuple[int, ...], SharpConfig]
     sizes = {(1, 1 + config.grid**2, config.embed): config for config in CONFIGS.values()}
     config = CONFIGS["full"] if places is None else sizes.get(tuple(places.shape), CONFIGS["full"])
     with torch.device("meta"):
