@@ -80,6 +80,7 @@ app.command(context_settings=evaluate.EXTRA_WORDS, short_help="Measure on a data
     evaluate.evaluate
 )
 app.command(short_help="Several evaluations in the same tables")(evaluate.tables)
+app.command(short_help="The paper's figures, from several evaluations")(evaluate.figures)
 app.command(context_settings=evaluate.EXTRA_WORDS, short_help="What Spackle costs, in Gaussians and in time")(
     evaluate.bench
 )

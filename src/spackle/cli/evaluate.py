@@ -1,4 +1,4 @@
-"""`spackle evaluate`, `spackle tables` and `spackle bench`."""
+"""`spackle evaluate`, `spackle tables`, `spackle figures` and `spackle bench`."""
 
 from __future__ import annotations
 
@@ -143,6 +143,20 @@ def tables(
     from spackle.progress import Reporter
 
     merge_tables(results, output, Reporter(), html)
+
+
+def figures(
+    results: Annotated[
+        list[Path], typer.Argument(metavar="OUT...", help="Folders that `spackle evaluate --disparity 0.6` wrote.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="F", help="A folder for the files.")],
+    rows: Annotated[int, typer.Option(min=1, max=100, help="Images in a figure, and at least one of each folder.")] = 6,
+) -> None:
+    """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
+    from spackle.evaluation.figures import make_figures
+    from spackle.progress import Reporter
+
+    make_figures(results, rows, output, Reporter())
 
 
 def bench(

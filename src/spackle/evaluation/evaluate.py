@@ -15,16 +15,16 @@ from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows
 from spackle.evaluation.methods import make_method
 from spackle.evaluation.metrics import NOTICE, definitions
+from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
 from spackle.evaluation.plots import check_matplotlib
-from spackle.evaluation.protocols import Alignment, align, large_views, measure_views, to_base
-from spackle.evaluation.report import BEST, REPORT, WORST, make_report, save_picture, strip, write_sheets
+from spackle.evaluation.protocols import INPUT, Alignment, align, large_views, measure_views, to_base
+from spackle.evaluation.report import REPORT, make_report
 from spackle.evaluation.rows import NOTE, REMARK, Row
 from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.table import NOT_RUN
 from spackle.evaluation.tables import FILES, make_tables, write_tables
 from spackle.files import write_whole
 from spackle.folders import results_folder
-from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.machine import hardware, versions
 from spackle.progress import Reporter, counted
@@ -53,9 +53,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
             files = [image_file(output, index, case.name, f".{name}.webp") for name in pictures]
             for file, picture in zip(files, pictures.values(), strict=True):
                 save_picture(picture, file)
-            joined = image_file(output, index, case.name, ".png")
-            save_png(strip(pictures), joined)
-            return rows, [*files, joined]
+            return rows, files
 
         run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
         if run is None:
@@ -125,7 +123,7 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     for lack in loaded.lacks:
         remark = f"without one of its second photos: {from_root(lack, options.root)}"
         known.append(image._replace(metric=REMARK, value=remark))
-    return [*known, *rows], pictures
+    return [*known, *rows], pictures | {INPUT: loaded.photo.rgb}
 
 
 @torch.no_grad()
@@ -148,6 +146,6 @@ def merge_tables(folders: Sequence[Path], output: Path, reporter: Reporter, html
     with results_folder(output, files, alone=True):
         write_tables(tables, output)
         if html:
-            write_whole(output / REPORT, make_report(list(zip(runs, folders, strict=True))).encode())
+            write_whole(output / REPORT, make_report(list(zip(runs, folders, strict=True)), whole=True).encode())
     names = ", ".join(f"{run.title} ({run.config['protocol']}, {run.base})" for run in runs)
     reporter.log(f"{names} -> {', '.join(str(output / name) for name in files)}")

@@ -27,7 +27,7 @@ from spackle.training.losses import FeatureNet, hole_distance
 MIN_PIXELS = 8  # fewer give no scale
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
 BOUNDS_QUANTILES = (0.001, 0.999)  # what LLFF's near and far are, of the points in a view
-TRUTH, HOLE = "truth", "hole"  # among the pictures of a view
+TRUTH, INPUT, HOLE = "truth", "input", "hole"  # among the pictures of an image
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,4 @@
-"""An evaluation in pictures: contact sheets, and one page for a browser with tables, plots and pictures.
-
-The page (report.html is its template) fetches nothing from anywhere.
-"""
+"""An evaluation on one page for a browser: tables, plots and pictures; it fetches nothing (template: report.html)."""
 
 from __future__ import annotations
 
@@ -11,39 +8,24 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import torch
 from jinja2 import Environment
 from markupsafe import Markup, escape
-from PIL import Image, ImageDraw
-from torch import Tensor
-from torch.nn.functional import pad
+from PIL import Image
 
-from spackle.color import to_bytes
-from spackle.evaluation.folder import image_file
 from spackle.evaluation.methods import METHODS
 from spackle.evaluation.metrics import METRICS
-from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of, ranked
+from spackle.evaluation.pictures import LARGE_SIDE, Ranking, column_title, encode, kept_pictures, rank
+from spackle.evaluation.plots import UNPRINTABLE, evenly, plots_of
 from spackle.evaluation.protocols import TRUTH
 from spackle.evaluation.rows import IMAGES, NEAR, REMARK, Run, mean
 from spackle.evaluation.table import EMPTY, TEXTS, Table, groups
 from spackle.evaluation.tables import make_tables, method_name
-from spackle.files import atomic_path
-from spackle.formats.png import thumbnail
 
-REPORT, WORST, BEST = "report.html", "worst.png", "best.png"
-SIDE = 320  # pixels of a thumbnail's longer side
-GAP, LINE = 6, 22  # pixels between pictures, and of a line of text
-FONT = 14
-CASES = 6
-# A sheet is ordered by the first of these that was measured for the method in question.
-ORDER = {"near-view": ("distance", "lpips", "psnr_hole"), "large-view": ("clipiqa", "musiq", "har", "har_before")}
-NAMES = {"psnr_hole": "PSNR in the hole ↑", "har": "HAR ↓", "har_before": "the base's HAR ↓"}
-LARGE_SIDE = 960  # pixels of a picture's longer side at most
+REPORT = "report.html"
 SMALLER = (720, 540, 400)  # where they would be too many bytes
 BUDGET = 7_500_000  # characters of all pictures of a page
-QUALITY = 85  # of WebP
 MOST = 8  # images of a page
 LEAST = 2  # of each evaluation, however many there are
 # A slider has the first of these that there are: all methods of all images would make a page too large.
@@ -64,80 +46,10 @@ COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
 Source = tuple[Run, Path]  # an evaluation, and the folder with its pictures
 
 
-class Ranking(NamedTuple):
-    """Images from best to worst."""
-
-    names: list[str]
-    criterion: str  # what they were ordered by
-    values: dict[str, float]
-
-
-def strip(pictures: Mapping[str, Tensor]) -> Tensor:
-    """Thumbnails of one view by each method, and the truth, in a row with gaps: [h, n · (w + GAP), 3]."""
-    return torch.cat([pad(thumbnail(p, SIDE), (0, 0, 0, GAP), value=1.0) for p in pictures.values()], dim=1)
-
-
-def columns(run: Run) -> list[str]:
-    """What a strip shows: the methods, and the truth where there is one."""
-    return [*run.methods, *([TRUTH] if run.near else [])]
-
-
-def column_title(run: Run, name: str) -> str:
-    """What a picture is called."""
-    return TRUTH if name == TRUTH else f"base ({run.base})" if name == "base" else METHODS[name].title
-
-
-def rank(run: Run) -> Ranking | None:
-    """By the method that matters: Spackle if it was run, else the last one. None where nothing was measured."""
-    method = "spackle" if "spackle" in run.methods else run.methods[-1]
-    for metric in ORDER[str(run.config["protocol"])]:
-        if values := run.by_image(metric, method):
-            title = METRICS[metric].title if metric in METRICS else NAMES[metric]
-            return Ranking(ranked(values, metric), f"{title} of {METHODS[method].title}", values)
-    return None
-
-
-def write_sheets(run: Run, folder: Path) -> None:
-    """best.png and worst.png of the strips in a folder; none where nothing was measured."""
-    if ranking := rank(run):
-        strips = {name: image_file(folder, k, name, ".png") for k, name in enumerate(run.images)}
-        for name, order in ((BEST, ranking.names), (WORST, ranking.names[::-1])):
-            with atomic_path(folder / name) as temporary:
-                sheet(run, ranking, order[:CASES], strips).save(temporary)
-
-
-def sheet(run: Run, ranking: Ranking, names: Sequence[str], strips: Mapping[str, Path]) -> Image.Image:
-    """A row for each image, captioned; a column for each method, and the truth where there is one."""
-    pictures = {name: Image.open(strips[name]).convert("RGB") for name in names}
-    titles = [column_title(run, name) for name in columns(run)]
-    width = max(max(picture.width for picture in pictures.values()), SIDE * 2)
-    height = sum(picture.height + LINE + GAP for picture in pictures.values()) + LINE
-    canvas = Image.new("RGB", (width, height), "white")
-    draw = ImageDraw.Draw(canvas)
-    title = f"{run.title}, {run.config['protocol']}, by {ranking.criterion}"
-    title = title.replace("↑", "(higher is better)").replace("↓", "(lower is better)")  # the font has no arrows
-    draw.text((4, 3), title, "black", font_size=FONT)
-    y = LINE
-    for name in names:
-        text = f"{name}, {' '.join(run.largest_hole(name))}: {ranking.values[name]:.4g}"
-        draw.text((4, y + 3), text, "black", font_size=FONT)
-        canvas.paste(pictures[name], (0, y + LINE))
-        for index, title in enumerate(titles):
-            at = index * pictures[name].width // len(titles) + 5, y + LINE + 4
-            left, top, right, bottom = draw.textbbox(at, title, font_size=FONT)
-            draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill="black")
-            draw.text(at, title, "white", font_size=FONT)
-        y += pictures[name].height + LINE + GAP
-    return canvas
-
-
-# --- the page
-
-
-def make_report(sources: Sequence[Source]) -> str:
+def make_report(sources: Sequence[Source], *, whole: bool = False) -> str:
     """A report as HTML: one file that needs nothing else, the same bytes for the same results.
 
-    `sources` are one or more evaluations and benchmarks whose tables go together.
+    `sources` are one or more evaluations and benchmarks whose tables go together; `whole`: see `make_tables`.
     """
     runs = [run for run, _ in sources]
     text = resources.files("spackle.evaluation").joinpath(REPORT).read_text(encoding="utf-8")
@@ -146,7 +58,7 @@ def make_report(sources: Sequence[Source]) -> str:
     page = environment.from_string(text).render(
         title=f"Spackle: evaluation on {', '.join(dict.fromkeys(run.title for run in runs))}",
         parts=_parts([(run, folder) for run, folder in sources if not run.timed]),
-        tables=make_tables(runs),
+        tables=make_tables(runs, whole=whole),
         runs=runs,
         most=MOST,
         least=LEAST,
@@ -216,12 +128,12 @@ def _pick(run: Run, folder: Path, ranking: Ranking | None, count: int) -> list[t
 
     Those without pictures are left out.
     """
-    names, images = ranking.names[::-1] if ranking else run.measured, run.images
+    names = ranking.names[::-1] if ranking else run.measured
     cases = []
     for place in evenly(len(names), count):
         name, last = names[place], len(names) - 1
-        files = {m: image_file(folder, images.index(name), name, f".{m}.webp") for m in columns(run)}
-        wanted = [method for method in SHOWN if method in files and files[method].is_file()][:MOST_SHOWN]
+        files = kept_pictures(run, folder, name)
+        wanted = [method for method in SHOWN if method in files][:MOST_SHOWN]
         position = {0: "worst", last: "best"}.get(place, f"{place + 1} of {len(names)}") if ranking and last else ""
         if wanted:
             cases.append((name, position, {method: files[method].read_bytes() for method in wanted}))
@@ -258,19 +170,6 @@ def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dic
         "height": height,
         "table": Table("", "", "", [("", head) for head in heads], [rows]),
     }
-
-
-def save_picture(picture: Tensor, path: Path) -> None:
-    """[H, W, 3] sRGB 0..1 as WebP, smaller where it is large."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode(Image.fromarray(to_bytes(thumbnail(picture, LARGE_SIDE)).numpy())))
-
-
-def encode(image: Image.Image) -> bytes:
-    """As WebP; the same picture gives the same bytes."""
-    file = io.BytesIO()
-    image.save(file, format="WEBP", quality=QUALITY, method=4)
-    return file.getvalue()
 
 
 def fitting(cases: Sequence[Mapping[str, bytes]]) -> list[dict[str, bytes]]:

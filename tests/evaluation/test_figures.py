@@ -1,0 +1,96 @@
+"""`spackle figures` from an evaluation's pictures, and LaTeX that compiles."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import names_in, refuses, run
+from evaluation_data import write_boxes
+from PIL import Image
+from sharp_weights import write_tiny
+
+from spackle.evaluation.figures import hole_boxes
+
+DOCUMENT = r"""\documentclass{{article}}
+\usepackage[T1]{{fontenc}}
+\usepackage[utf8]{{inputenc}}
+\usepackage{{booktabs,graphicx,amsmath}}
+\begin{{document}}
+{}
+\end{{document}}
+"""
+
+
+def check_latex(folder: Path, *files: str) -> None:
+    """Braces and environments are closed, labels are unique, and pdfLaTeX takes it where there is one."""
+    text = "\n".join((folder / file).read_text(encoding="utf-8") for file in files)
+    bare = re.sub(r"\\[\\{}%]", "", text)
+    depths = np.cumsum([(sign == "{") - (sign == "}") for sign in bare])
+    assert depths.min() >= 0
+    assert depths[-1] == 0
+    begun, ended = (sorted(re.findall(rf"\\{word}\{{(.*?)\}}", text)) for word in ("begin", "end"))
+    assert begun == ended
+    labels = re.findall(r"\\label\{(.*?)\}", text)
+    assert len(labels) == len(set(labels)) > 0
+    assert max(map(len, re.findall(r"\\caption\{(.*)\}", text))) < 500
+    for rows in re.findall(r"\\begin\{tabular\}\{(\w+)\}(.*?)\\end\{tabular\}", text, re.DOTALL):
+        lines = [line for line in rows[1].splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+        assert {len(re.findall(r"(?<!\\)&", line)) for line in lines} == {len(rows[0]) - 1}
+    if shutil.which("pdflatex"):
+        (folder / "paper.tex").write_text(DOCUMENT.format(text), encoding="utf-8")
+        words = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stdout[-2000:]
+        assert "multiply defined" not in done.stdout
+
+
+def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
+    data, large, near, bench = (tmp_path / name for name in ("data", "large", "near", "bench"))
+    for seed, name in enumerate(("Ball_1", "Chair")):
+        write_boxes(data / name, seed)
+    tiny, words = write_tiny(tmp_path / "sharp.safetensors"), (data, "--dataset", "middlebury")
+    sharp = ("--base", "sharp", "-c", tiny, "--precision", "fp32", "--metrics", "none")
+    choices = ("--methods", "base,paper,direct-ft", "--direct-ft", tiny, "--disparity", "0.6")
+    done = run("evaluate", *words, *sharp, *choices, "-o", large)
+    assert done.code == 0, done.err
+    assert (
+        run("evaluate", *words, "--base", "rgbd", "--protocol", "near-view", "--metrics", "psnr", "-o", near).code == 0
+    )
+    assert run("bench", *words, "--base", "rgbd", "--runs", 1, "--disparity", "0.6", "-o", bench).code == 0
+    done = run("figures", large, near, "-o", tmp_path / "figures")
+    assert done.code == 0, done.err
+    kinds = {f"{name}.{end}" for name in ("comparison", "direct_ft") for end in ("pdf", "png")}
+    assert names_in(tmp_path / "figures") == {*kinds, "figures.tex"}
+    assert (tmp_path / "figures" / "comparison.pdf").read_bytes().startswith(b"%PDF")
+    sizes = []
+    for name in ("comparison", "direct_ft"):
+        with Image.open(tmp_path / "figures" / f"{name}.png") as picture:
+            sizes.append(picture.size)
+    assert sizes[0][0] == pytest.approx(sizes[1][0], rel=0.03)  # three columns and five of one width
+    assert sizes[0][1] > sizes[1][1]
+    check_latex(tmp_path / "figures", "figures.tex")
+    done = run("tables", large, near, bench, "-o", tmp_path / "tables")
+    assert done.code == 0, done.err
+    for folder, file in ((tmp_path / "tables", "tables.tex"), (large, "tables.tex"), (bench, "bench.tex")):
+        check_latex(folder, file)
+    refuses(run("figures", near, "-o", tmp_path / "none"), "nothing to draw", "--disparity 0.6")
+    assert not (tmp_path / "none").exists()
+
+
+def test_boxes_hold_holes_beside_what_is_seen() -> None:
+    mask = np.zeros((120, 160), np.uint8)
+    mask[:, 130:] = 255  # beyond the photo's border
+    mask[40:80, 30:45] = 255
+    boxes = hole_boxes(Image.fromarray(mask))
+    assert len(boxes) == 2
+    for left, top, right, bottom in boxes:
+        assert 0 <= left < right <= 1
+        assert 0 <= top < bottom <= 1
+        part = mask[round(top * 120) : round(bottom * 120), round(left * 160) : round(right * 160)] > 0
+        assert 0.2 < part.mean() < 0.8
+    assert hole_boxes(Image.fromarray(0 * mask)) == []
