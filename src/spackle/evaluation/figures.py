@@ -124,7 +124,7 @@ def hole_boxes(hole: Image.Image) -> Boxes:
     height, width = mask.shape
     side = min(round(BOX * max(mask.shape)), *mask.shape)
     share = avg_pool2d(mask[None], side, stride=1)[0]  # by the upper left corners of squares
-    score, boxes = share * (1 - share), []
+    score, boxes = share * (1 - share), list[tuple[float, float, float, float]]()
     while len(boxes) < MOST_BOXES and float(score.max()) > LEAST_SCORE:
         y, x = divmod(int(score.argmax()), score.shape[1])
         boxes.append((x / width, y / height, (x + side) / width, (y + side) / height))
