@@ -70,8 +70,8 @@ def results(title: str, near: bool, figures: Callable[[int], Figures], count: in
         "second_views": "all" if near else None,
         "side": 1280,
         "residual": {"weights": "shipped", "sha256": "0123456789", "precision": "bfloat16"},
-        "metrics": {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"},
     }
+    states = {"niqe": "pyiqa 9.9", "clipiqa": "not run: pyiqa is not installed", "dists": "pyiqa 9.9"}
     rows = []
     for image in range(count):
         known = Row(title, name.format(image), "", "", "", "base_gaussians", 50000)
@@ -80,7 +80,9 @@ def results(title: str, near: bool, figures: Callable[[int], Figures], count: in
             for method, measured in figures(image).items():
                 for view in ("left", "right"):
                     rows += [Row(title, known.image, setting, view, method, *one) for one in measured.items()]
-    return Run(config, [*rows, Row(title, "gone", "", "", "", "problem", "gone.png: <b>damaged</b>")])
+    return Run(
+        config, [*rows, Row(title, "gone", "", "", "", "problem", "gone.png: <b>damaged</b>")], {"metrics": states}
+    )
 
 
 def fake_pyiqa(patch: pytest.MonkeyPatch, create: Callable[..., object]) -> None:

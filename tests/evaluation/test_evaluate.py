@@ -299,6 +299,36 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     assert all(word in text for word in ("(6 NaN)", "3/23", "PolyForm Noncommercial"))
 
 
+def test_metrics_are_added_to_a_finished_run_as_if_it_had_had_them(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def create(name: str, **options: Any) -> Any:
+        return lambda image, truth: asked.append(name) or (image - truth).abs().mean()
+
+    words = ("--protocol", "near-view", "--methods", "base,seeds", "--limit", 2)
+    once, later = tmp_path / "once", tmp_path / "later"
+    monkeypatch.setitem(sys.modules, "pyiqa", None)
+    assert evaluate(scenes, later, *words, "--metrics", "ssim,dists").code == 0
+    assert "DISTS not run: pyiqa is not installed" in (later / "tables.md").read_text()
+    fake_pyiqa(monkeypatch, create)
+    assert evaluate(scenes, once, *words, "--metrics", "psnr,ssim,dists").code == 0
+    for metrics, counted in (("psnr", []), ("dists", ["dists"] * 4), ("dists", []), ("none", [])):
+        asked.clear()
+        done = evaluate(scenes, later, *words, "--metrics", metrics)
+        assert (done.code, asked) == (0, counted), done.err
+    for name in ("rows.jsonl", *TABLES):
+        assert (once / name).read_bytes() == (later / name).read_bytes(), name
+    sys.modules["pyiqa"].__version__ = "10"
+    (later / "images" / "00001-Door.json").unlink()  # of another version than the other image
+    assert evaluate(scenes, later, *words, "--metrics", "none").code == 0
+    text = (later / "tables.md").read_text()
+    assert "DISTS not run: not by one version on all images" in text
+    assert evaluate(scenes, later, *words, "--metrics", "psnr,ssim,dists").code == 0
+    assert (once / "rows.jsonl").read_bytes() == (later / "rows.jsonl").read_bytes()
+
+
 def test_near_views_against_the_true_photo(scenes: Path, tmp_path: Path) -> None:
     methods = f"base,{FLAT}spackle,dense"
     words = ("--protocol", "near-view", "--methods", methods, "--metrics", "psnr,ssim")

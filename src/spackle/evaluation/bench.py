@@ -79,7 +79,7 @@ def bench(options: EvaluateOptions, runs: int, base_runs: int | None, output: Pa
     about = {"parameters": count_parameters(evaluation.network)}
     timed: list[str] = []  # an image of this process, after which it is warm
 
-    def time_next(index: int, case: Case) -> tuple[list[Row], list[Path]]:
+    def time_next(index: int, case: Case, metrics: Sequence[str]) -> tuple[list[Row], list[Path]]:
         rows = time_case(case, evaluation, config, bool(timed))
         timed.append(case.name)
         return rows, []

@@ -14,7 +14,7 @@ from spackle.errors import InputError
 from spackle.evaluation.case import Case, LoadedCase, load_case
 from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows
 from spackle.evaluation.methods import make_method
-from spackle.evaluation.metrics import NOTICE, definitions
+from spackle.evaluation.metrics import NOTICE
 from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
 from spackle.evaluation.plots import check_matplotlib
 from spackle.evaluation.protocols import INPUT, Alignment, align, large_views, measure_views, to_base
@@ -42,12 +42,11 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         check_matplotlib("--html")
     evaluation = open_evaluation(options)
     _log_missing(evaluation, reporter)
-    defined = definitions(options.wanted)
-    about = {"versions": versions(), "machine": hardware(options.device), "definitions": defined}
+    about = {"versions": versions(), "machine": hardware(options.device)}
     with results_folder(output, (ROWS, WORST, BEST, *FILES, *([REPORT] if html else [])), alone=True):
 
-        def measure(index: int, case: Case) -> tuple[list[Row], list[Path]]:
-            rows, pictures = measure_case(case, evaluation)
+        def measure(index: int, case: Case, metrics: Sequence[str]) -> tuple[list[Row], list[Path]]:
+            rows, pictures = measure_case(case, evaluation, metrics)
             for remark in (row.value for row in rows if row.metric == REMARK):
                 reporter.log(f"{case.name}: {remark}")
             files = [image_file(output, index, case.name, f".{name}.webp") for name in pictures]
@@ -55,7 +54,8 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
                 save_picture(picture, file)
             return rows, files
 
-        run = measure_images(evaluation.cases, measure, output, evaluation.config, about, options.root, reporter)
+        shared = evaluation.config, about, options.root, reporter, evaluation.metrics
+        run = measure_images(evaluation.cases, measure, output, *shared)
         if run is None:
             return "stopped"
         write_tables(make_tables([run]), output, suffix=run.label_suffix)
@@ -73,7 +73,7 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
 def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
     """Log why metrics are not run, and pyiqa's terms where it measures."""
     reasons: dict[str, list[str]] = {}
-    for name, state in evaluation.config["metrics"].items():
+    for name, state in evaluation.metrics.items():
         if state.startswith(NOT_RUN):
             reasons.setdefault(state, []).append(name)
     for state, names in reasons.items():
@@ -82,8 +82,10 @@ def _log_missing(evaluation: Evaluation, reporter: Reporter) -> None:
         reporter.log(NOTICE)
 
 
-def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[str, Tensor]]:
-    """All figures of an image, and what is shown of it: one view by each method, and the truth, [H, W, 3] each.
+def measure_case(
+    case: Case, evaluation: Evaluation, metrics: Sequence[str] = ()
+) -> tuple[list[Row], dict[str, Tensor]]:
+    """An image's figures, those of `metrics` among them, and pictures [H, W, 3]: the photo, a view by each method.
 
     InputError for a file that cannot be used or is missing; BaseError where no image can be worked on.
     """
@@ -110,7 +112,8 @@ def measure_case(case: Case, evaluation: Evaluation) -> tuple[list[Row], dict[st
     context = evaluation.context(prediction)
     methods = {name: make_method(name, context, evaluation.inpainter, direct_ft) for name in options.methods}
     image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
-    rows, pictures = measure_views(image, context, views, methods, evaluation.gauges)
+    gauges = dataclasses.replace(evaluation.gauges, metrics=metrics)
+    rows, pictures = measure_views(image, context, views, methods, gauges)
     facts = {
         "width": loaded.photo.width,
         "height": loaded.photo.height,

@@ -1,6 +1,7 @@
 """A folder of results: config.json, images/ with a file for each finished image, and at last rows.jsonl.
 
-config.json is what decides the figures; rows.jsonl vouches that all images are done. A killed run goes on.
+config.json is what decides the renders; rows.jsonl vouches that all images are done. A killed run goes on. Metrics may
+be added to a finished one: then they alone are measured.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from typing import Any
 from spackle.bases.open import BaseError
 from spackle.errors import InputError, reading
 from spackle.evaluation.case import Case
-from spackle.evaluation.rows import PROBLEM, Row, Run
+from spackle.evaluation.metrics import METRICS, metric_name
+from spackle.evaluation.rows import PROBLEM, REMARK, Row, Run
+from spackle.evaluation.table import NOT_RUN
 from spackle.files import fingerprint, write_json, write_whole
 from spackle.folders import as_recorded, differences, digest_of, file_records, make_folder, remove_half_written
 from spackle.progress import Reporter, asked_to_stop
@@ -25,7 +28,8 @@ CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
 FORMAT = 2
 KINDS = {"evaluate": "an evaluation", "bench": "a benchmark"}  # of a configuration: the command, and what it makes
 DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
-Measure = Callable[[int, Case], tuple[list[Row], list[Path]]]  # place, image to its rows and the files that it wrote
+# Place, image, and metrics to measure, to the image's rows and the files that it wrote.
+Measure = Callable[[int, Case, Sequence[str]], tuple[list[Row], list[Path]]]
 
 
 def write_rows(rows: Iterable[Row], path: Path) -> None:
@@ -84,19 +88,23 @@ def measure_images(
     about: Mapping[str, Any],
     root: Path,
     reporter: Reporter,
+    metrics: Mapping[str, str] | None = None,
 ) -> Run | None:
     """Measure the images that no earlier run in the folder has finished: all results; None where Ctrl-C came.
 
-    An image that cannot be used gives one row, its problem, and is tried again by the next run.
+    Of finished images only what is new of `metrics` is measured: of each who measures it, or that it is "not run", in
+    which case figures of an earlier run stay. An image that cannot be used gives one row, its problem, and is tried
+    again by the next run.
 
     Raises:
         BaseError: no image can be worked on.
         InputError: not one image gave figures, or another configuration's results are in the folder.
     """
     open_folder(output, config, about)
+    measurable = {name: state for name, state in (metrics or {}).items() if not state.startswith(NOT_RUN)}
     rows: list[Row] = []
-    run, begun = Run(config, rows, about), False
-    digest = functools.cache(_photo_digest)  # a photo may be the second one of many
+    measured: list[dict[str, str]] = []  # of each image that gave figures, by whom
+    begun, digest = False, functools.cache(_photo_digest)  # a photo may be the second one of many
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
@@ -104,37 +112,69 @@ def measure_images(
                 return None
             part = image_file(output, index, case.name, ".json")
             inputs = digest_of([digest(photo) for photo in (case.photo, *(second.photo for second in case.seconds))])
-            rows_of_case = _load_part(part, inputs)
-            if rows_of_case is None:
+            done = _load_part(part, inputs)
+            rows_of_case, states = done or ([], {})
+            due = [name for name, state in measurable.items() if states.get(name) != state]
+            if done is None or due:
                 if index and not begun:
                     reporter.log(f"{output}: going on, {index} of {len(cases)} images are done")
                 begun, start = True, time.perf_counter()
                 try:
-                    rows_of_case, files = measure(index, case)
+                    new, files = measure(index, case, due)
                 except BaseError:  # no other image would fare better; too little memory is one, too
                     raise
                 except InputError as error:
                     problem = problem_of(case, error, root)
                     reporter.log(f"passed over: {problem}")
-                    rows_of_case = [Row(run.title, case.name, "", "", "", PROBLEM, problem)]
-                else:
-                    seconds = round(time.perf_counter() - start, 3)
-                    content = {"inputs": inputs, "seconds": seconds, "files": file_records(part.parent, files)}
-                    write_whole(part, (json.dumps({**content, "rows": rows_of_case}, allow_nan=False) + "\n").encode())
-                    reporter.detail(f"  {case.name}: {seconds:.1f} s")
+                    rows.append(Row(str(config["title"]), case.name, "", "", "", PROBLEM, problem))
+                    step(index + 1, len(cases))
+                    continue
+                rows_of_case = with_metrics(rows_of_case, new, due) if done else with_metrics(new, [], [])
+                states |= {name: measurable[name] for name in due}
+                seconds = round(time.perf_counter() - start, 3)
+                content = {"inputs": inputs, "seconds": seconds, "files": file_records(part.parent, files)}
+                content |= {"metrics": states, "rows": rows_of_case}
+                write_whole(part, (json.dumps(content, allow_nan=False) + "\n").encode())
+                reporter.detail(f"  {case.name}: {seconds:.1f} s")
             rows += rows_of_case
+            measured.append(states)
             step(index + 1, len(cases))
-    if not run.measured:
+    if not measured:
         raise InputError(f"{root}: none of {len(cases)} images gave figures (the lines above say why)")
-    return run
+    found = {name: {states.get(name, NOT_RUN) for states in measured} for states in measured for name in states}
+    agreed = {
+        name: by.pop() if len(by) == 1 else f"{NOT_RUN}: not by one version on all images" for name, by in found.items()
+    }
+    about = {**about, "metrics": {**(metrics or {}), **agreed}}
+    write_json({"format": FORMAT, **config, "about": about}, output / CONFIG)
+    partly = [name for name, state in agreed.items() if state.startswith(NOT_RUN)]
+    return Run(config, [row for row in rows if metric_name(row.metric) not in partly], about)
 
 
-def _load_part(path: Path, inputs: str) -> list[Row] | None:
-    """An image's rows by an earlier run; None where they are not whole, or the photos have changed since."""
+def with_metrics(old: Sequence[Row], new: Sequence[Row], names: Sequence[str]) -> list[Row]:
+    """An image's rows with new figures of some metrics, in the order that one run for all of them gives."""
+    order = [*METRICS]
+
+    def about(row: Row) -> str | None:
+        return str(row.value).partition(" ")[0] if row.metric == REMARK else metric_name(row.metric)
+
+    def rank(row: Row) -> tuple[bool, int, int]:
+        name = metric_name(row.metric)
+        return row.metric == REMARK, views[row[2:5]], order.index(name) + 1 if name else 0
+
+    rows = [*(row for row in old if about(row) not in names), *(row for row in new if about(row) in names)]
+    views = {view: place for place, view in enumerate(dict.fromkeys(row[2:5] for row in rows))}
+    return sorted(rows, key=rank)
+
+
+def _load_part(path: Path, inputs: str) -> tuple[list[Row], dict[str, str]] | None:
+    """An image's rows by an earlier run, and its metrics; None where they are not whole, or photos have changed."""
     try:
         content = json.loads(path.read_text("utf-8"))
         whole = not content["files"] or as_recorded(path.parent, path.name, content["files"])
-        return [Row(*row) for row in content["rows"]] if whole and content["inputs"] == inputs else None
+        if not whole or content["inputs"] != inputs:
+            return None
+        return [Row(*row) for row in content["rows"]], dict(content["metrics"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

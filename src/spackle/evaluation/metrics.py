@@ -56,6 +56,12 @@ DEFAULT_METRICS = {
 }
 
 
+def metric_name(figure: str) -> str | None:
+    """The metric that a figure of the image, the hole or its outside is of; None of counts and shares."""
+    name = figure.partition("_")[0]
+    return name if name in METRICS else None
+
+
 def definitions(names: tuple[str, ...]) -> list[str]:
     """A sentence for each metric."""
     return [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]

@@ -76,7 +76,7 @@ class Run:
 
     config: Mapping[str, Any]
     rows: Sequence[Row]
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # versions, machine, definitions
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # versions, machine, metrics
 
     @property
     def title(self) -> str:

@@ -145,7 +145,8 @@ class Evaluation:
     inpainter: Inpainter | None  # of the method inpaint2d
     renderer: Renderer
     gauges: Gauges
-    config: dict[str, Any]  # everything that decides the figures, ready for JSON; nothing of where files lie
+    config: dict[str, Any]  # everything that decides renders, ready for JSON; nothing of where files lie
+    metrics: dict[str, str]  # of each wanted metric who measures it, or why nobody
 
     def open(self, loaded: LoadedCase) -> OpenedBase:
         """The base of a case: the network, or the case's own depth or points; InputError where it lacks those."""
@@ -184,8 +185,10 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
     published = [name for name in wanted if name in DEFINITIONS]
     metrics, states = open_metrics(published, options.device.type, options.download)
     states = dict.fromkeys(wanted, OWN) | states
-    if "distance" in wanted and features is None:
+    if "distance" in wanted:
         states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
+        if options.features is not None:
+            states["distance"] = f"{OWN}, weights {weights_digest(options.features)[:16]}"
     renderer = get_renderer(base.device)
     precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
     config: dict[str, Any] = {
@@ -214,14 +217,14 @@ def open_evaluation(options: EvaluateOptions) -> Evaluation:
             "precision": None if fill.file is None else precision,
         },
         "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
-        "features": None if options.features is None else weights_digest(options.features),
-        "metrics": states,  # who measures each, or why nobody
     }
     if inpainter is not None:
         weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
         config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
     gauges = Gauges(wanted, metrics, features)
-    return Evaluation(options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config)
+    return Evaluation(
+        options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config, states
+    )
 
 
 def _check_cases(cases: Sequence[Case], options: EvaluateOptions) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from spackle.errors import InputError
 from spackle.evaluation.methods import METHODS, RESIDUAL
-from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, definitions, reduction
+from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, definitions, metric_name, reduction
 from spackle.evaluation.rows import (
     IMAGES,
     NEAR,
@@ -122,7 +122,7 @@ def _table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: S
 
 def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str]:
     """Views, bases, rows, whose weights the residual has, definitions, what is missing and why, terms of pyiqa."""
-    names = tuple(dict.fromkeys(name for name in (_metric(column[2]) for column in spec["columns"]) if name))
+    names = tuple(dict.fromkeys(name for name in (metric_name(column[2]) for column in spec["columns"]) if name))
     notes = [NOTES["swipe"].format(side=run.config["side"]) for run in runs if not run.near]
     for kind in dict.fromkeys(run.config["second_views"] for run in runs if run.near):
         titles = dict.fromkeys(run.title for run in runs if run.config["second_views"] == kind)
@@ -136,7 +136,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
         notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
     notes += definitions(names)
     for run in runs:
-        state = run.config.get("metrics", {})
+        state = run.about.get("metrics", {})
         idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]
         notes += [f"{run.title}: {METRICS[name].title[:-2]} {state[name]}." for name in idle]
         if passed := list(run.problems):
@@ -187,18 +187,12 @@ def _timed_notes(runs: Sequence[Run]) -> list[str]:
 # --- the pivots
 
 
-def _metric(figure: str) -> str | None:
-    """The metric that a figure of the image, the hole or its outside is of; None of counts and shares."""
-    name = figure.partition("_")[0]
-    return name if name in METRICS else None
-
-
 def _columns(spec: Mapping[str, Any], settings: Iterable[str], over: str = "") -> list[Column]:
     """A table's columns at each setting, whose name stands above them by the pattern `over`."""
     columns = []
     for setting in settings:
         for group, title, figure, *text in spec["columns"]:
-            name, group = _metric(figure), setting_title(setting, over) if over else group
+            name, group = metric_name(figure), setting_title(setting, over) if over else group
             best = METRICS[name].lower if name and spec.get("best") else None
             columns.append(
                 Column(group, title, setting, figure, TEXTS[text[0]] if text else METRICS[str(name)].text, best)
