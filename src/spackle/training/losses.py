@@ -1,4 +1,4 @@
-"""The four terms of eq. 6 as pure functions, and two reported numbers: how far a filled hole is from the truth.
+"""The four terms of eq. 12 as pure functions, and two reported numbers: how far a filled hole is from the truth.
 
 They compare a completed view `rgb` [B, H, W, 3] sRGB 0..1 and its `alpha` [B, H, W] with the `target` [B, H, W, 3] in
 the `hole` [B, H, W] bool, and with `base_rgb` [B, H, W, 3], the same view of the base alone, outside of it. Each is a
@@ -241,7 +241,7 @@ def total_loss(
     blur: float = 0.0,
     gram: float = 1.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum that is minimised, eq. 6.
+    """The weighted sum that is minimised, eq. 12.
 
     `features` None leaves the perceptual term out; `weights` has a number for each term, `blur` is as in `color_loss`,
     the rest as in `perceptual_loss`. Returns the loss [], and its terms by name, each [], unweighted and detached.

@@ -103,7 +103,7 @@ class DataRecipe(RecipePart):
 
 
 class LossRecipe(RecipePart):
-    """The four terms of eq. 6 and the perceptual one's network (paper, "Training Details and Loss Weights")."""
+    """The four terms of eq. 12 and the perceptual one's network (paper, "Training Details and Loss Weights")."""
 
     color: Share = 10.0
     alpha: Share = 0.5

@@ -1,6 +1,6 @@
 """The paper's own method: a residual network learns to complete cached samples, the base stays as it is.
 
-`ViewTask` is what it has in common with all that completes views: the loss of eq. 6, and what is measured.
+`ViewTask` is what it has in common with all that completes views: the loss of eq. 12, and what is measured.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ViewBatch:
 
 
 class ViewTask(Task):
-    """A task whose batches become completed views, with the loss of eq. 6."""
+    """A task whose batches become completed views, with the loss of eq. 12."""
 
     measures = ("loss", "color", "alpha", "preserve", "perceptual", "hole_psnr", "seen_psnr", "har_before", "har_after")
 
