@@ -37,17 +37,8 @@ from spackle.residual import ResidualNet
 from spackle.scene_fill import FillContext
 
 FILES = ("bench.md", "bench.tex")
-SHARED = (
-    "dataset",
-    "title",
-    "terms",
-    "images",
-    "side",
-    "disparities",
-    "base",
-    "residual",
-    "device",
-)  # of an evaluation's configuration
+# Of an evaluation's configuration.
+SHARED = ("dataset", "title", "terms", "images", "side", "disparities", "base", "residual", "device")
 TOTAL = "total"
 MS = 1000.0
 CPU = torch.device("cpu")

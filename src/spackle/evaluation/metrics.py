@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -124,17 +125,13 @@ def ssim_map(image: Tensor, truth: Tensor) -> Tensor:
 
 def _blur(image: Tensor) -> Tensor:
     """[3, H, W] under the window; pixels beyond the border are mirrored, the border's own among them."""
-    reach = WINDOW // 2
+    (_, height, width), reach = image.shape, WINDOW // 2
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=torch.float64) / SIGMA) ** 2)
-    weights /= weights.sum()
-    for axis in (1, 2):
-        size = image.shape[axis]
-        folded = torch.arange(-reach, size + reach) % (2 * size)  # d c b a | a b c d | d c b a
-        wide = image.index_select(axis, torch.where(folded < size, folded, 2 * size - 1 - folded))
-        image = torch.zeros_like(image)  # sums of slices: convolutions in float64 are slow
-        for start, weight in enumerate(weights.tolist()):
-            image.add_(wide.narrow(axis, start, size), alpha=weight)
-    return image
+    shares = (weights / weights.sum()).tolist()
+    wide = torch.from_numpy(np.pad(image.numpy(), ((0, 0), (reach, reach), (reach, reach)), "symmetric"))
+    # Sums of slices: convolutions in float64 are slow.
+    tall = sum((wide[:, k : k + height] * share for k, share in enumerate(shares)), torch.zeros(()))
+    return sum((tall[..., k : k + width] * share for k, share in enumerate(shares)), torch.zeros(()))
 
 
 def open_metrics(names: Sequence[str], device: str, download: bool) -> tuple[dict[str, Metric], dict[str, str]]:

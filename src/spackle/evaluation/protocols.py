@@ -216,8 +216,10 @@ def measure_views(
             before = context.renderer.render(context.base, view.camera)
             hole, truth = hole_mask(before.alpha), view.truth() if view.truth else None
             share = hole_area_ratio(before.alpha)
-            filled = {name: fill(view.camera, before) for name, fill in fills.items()}
-            for name, (rgb, alpha, aux) in filled.items():
+            shown = {HOLE: hole.cpu()[..., None].expand(-1, -1, 3).float()}
+            for name, fill in fills.items():
+                rgb, alpha, aux = fill(view.camera, before)
+                shown[name] = rgb = rgb.cpu()  # where the truth is
                 figures: list[tuple[str, float | str]] = [("har_before", share)]
                 if alpha is not None:  # of what is left open (paper, eq. 11 and 10)
                     open_share = hole_area_ratio(alpha)
@@ -233,7 +235,5 @@ def measure_views(
                     else:
                         rows.append(row._replace(metric=metric, value=value if math.isfinite(value) else None))
             if share > largest:
-                largest, shown = share, hole.cpu()[..., None].expand(-1, -1, 3).float()
-                pictures = {HOLE: shown, **{name: made.rgb for name, made in filled.items()}}
-                pictures |= {} if truth is None else {TRUTH: truth}
+                largest, pictures = share, shown | ({} if truth is None else {TRUTH: truth})
     return [*rows, *remarks], pictures

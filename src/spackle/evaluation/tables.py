@@ -128,9 +128,9 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
         titles = dict.fromkeys(run.title for run in runs if run.config["second_views"] == kind)
         notes.append(NOTES[kind].format(datasets=", ".join(titles)))
     notes += [f"Base {run.base}: {run.config['base']['says']}." for run in runs]
-    titles = {name: facts.title for name, facts in METHODS.items()} | spec.get("rows", {})
-    shown = dict.fromkeys(name for run in runs for name in run.methods if titles[name] in cells)
-    notes += [f"Rows: {'; '.join(f'{titles[name]}: {METHODS[name].says}' for name in shown)}."] if shown else []
+    called: dict[str, str] = {name: spec.get("rows", {}).get(name) or METHODS[name].title for name in METHODS}
+    shown = dict.fromkeys(name for run in runs for name in run.methods if called[name] in cells)
+    notes += [f"Rows: {'; '.join(f'{called[name]}: {METHODS[name].says}' for name in shown)}."] if shown else []
     for weights in dict.fromkeys(_weights(run) for run in runs):
         foreign = not weights.startswith("given")
         notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
@@ -246,12 +246,6 @@ def _grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
 
-def _papers(label: str, dataset: str, columns: Sequence[Column]) -> dict[str, list[str]]:
-    """The paper's rows for a dataset in a table, by their names."""
-    rows = [row for row in paper_rows(label) if row.dataset == dataset]
-    return {name: _cells(rows, columns, [name])[0] for name in dict.fromkeys(row.method for row in rows)}
-
-
 def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
     """The methods of a run that a table shows (all, those named by it, or those having a figure), and their names."""
     if "rows" in spec:
@@ -260,20 +254,29 @@ def _row_names(spec: Mapping[str, Any], run: Run) -> dict[str, str]:
     return {method: method_name(run, method) for method in run.methods if having is None or method in having}
 
 
+def _rows(
+    label: str, spec: Mapping[str, Any], runs: Sequence[Run], dataset: str, columns: Sequence[Column]
+) -> list[tuple[str, str, list[str]]]:
+    """Name, number of images and cells of our rows for a dataset, or that it was not run, and of the paper's."""
+    rows = []
+    for run in (run for run in runs if run.title == dataset):
+        names = _row_names(spec, run)
+        lines = _cells(run.rows, columns, names)
+        rows += [(name, images_text(run), cells) for name, cells in zip(names.values(), lines, strict=True)]
+    rows = rows or [(NOT_RUN, EMPTY, [EMPTY] * len(columns))]
+    papers = [row for row in paper_rows(label) if row.dataset == dataset]
+    for name in dict.fromkeys(row.method for row in papers):
+        cells = _cells(papers, columns, [name])[0]
+        rows += [(name, str(IMAGES[dataset]), cells)] if any(cells) else []
+    return rows
+
+
 def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """For each dataset a row for each method, and the paper's rows; the columns repeat for each disparity."""
     columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
-    bodies = []
-    for dataset in datasets(runs):
-        rows: list[Cells] = []
-        for run in (run for run in runs if run.title == dataset):
-            names = _row_names(spec, run)
-            for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
-                rows.append((name, images_text(run), *cells))
-        rows = rows or [(NOT_RUN, *[EMPTY] * (1 + len(columns)))]
-        rows += [(name, str(IMAGES[dataset]), *cells) for name, cells in _papers(label, dataset, columns).items()]
-        bodies.append(_grouped(dataset, rows))
-    return [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)], bodies
+    heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
+    of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in datasets(runs)}
+    return heads, [_grouped(dataset, [(name, n, *cells) for name, n, cells in rows]) for dataset, rows in of.items()]
 
 
 def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
@@ -281,13 +284,10 @@ def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settin
     columns, titles = _columns(spec, settings), datasets(runs)
     ours: dict[str, dict[str, list[str]]] = {}
     theirs: dict[str, dict[str, list[str]]] = {}
-    for run in runs:
-        names = _row_names(spec, run)
-        for name, cells in zip(names.values(), _cells(run.rows, columns, names), strict=True):
-            ours.setdefault(name, {})[run.title] = cells
     for title in titles:
-        for name, cells in _papers(label, title, columns).items():
-            theirs.setdefault(name, {})[title] = cells
+        for name, _, cells in _rows(label, spec, runs, title, columns):
+            if name != NOT_RUN:
+                (theirs if name.endswith(FROM_PAPER) else ours).setdefault(name, {})[title] = cells
     empty = [EMPTY] * len(columns)
     bodies: list[list[Cells]] = [
         [(name, *(cell for title in titles for cell in by.get(title, empty))) for name, by in group.items()]
@@ -296,42 +296,28 @@ def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settin
     return [("", "Method"), *((title, column.title) for title in titles for column in columns)], bodies
 
 
-def _adding(runs: Sequence[Run]) -> list[tuple[Run, str]]:
-    """The runs, and the methods of each that the tables of costs show."""
-    return [(run, method) for run in runs for method in run.methods if method in ("paper", "spackle")]
-
-
 def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
     """Added Gaussians of each dataset and on average, and medians of the datasets' median times."""
     counts = _columns(spec, settings, "{}: disparity {}")
+    of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in datasets(runs)}
+    bodies = [_grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]
     pools: dict[str, list[Row]] = {}  # of each row's name the figures of each dataset
-    bodies: list[list[Cells]] = []
-    for dataset in datasets(runs):
-        rows: list[Cells] = []
-        for run, method in _adding([run for run in runs if run.title == dataset]):
-            name = method_name(run, method)
-            rows.append((name, *_cells(run.rows, counts, [method])[0]))
-            for (setting, metric), values in pivot(_rows_of(run, method), "setting", "metric").items():
-                over = mean(values, statistics.median if metric in TIMES else statistics.fmean)
-                pools.setdefault(name, []).append(Row("", dataset, setting, "", name, metric, over.value))
-        rows = rows or [(NOT_RUN, *[EMPTY] * len(counts))]
-        rows += [(name, *cells) for name, cells in _papers(EXPANDED, dataset, counts).items()]
-        bodies.append(_grouped(dataset, rows))
+    for run in runs:
+        for method, name in _row_names(spec, run).items():
+            for (by, setting, metric), values in pivot(run.rows, "method", "setting", "metric").items():
+                if by == method:
+                    over = mean(values, statistics.median if metric in TIMES else statistics.fmean)
+                    pools.setdefault(name, []).append(Row("", run.title, setting, "", name, metric, over.value))
     for row in paper_rows(label):
         pools.setdefault(row.method, []).append(row)
-    averages = [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]
-    bodies.append(_grouped("Average", averages))
+    bodies.append(_grouped("Average", [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]))
     times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
     for column in spec["runtime"]:
         columns = _columns({"columns": [column]}, settings)
-        cells = {name: _cells(pool, columns, [name])[0] for name, pool in pools.items()}
-        spread = [(name, *(part for cell in row for part in (cell, EMPTY))) for name, row in cells.items()]
+        medians = {name: _cells(pool, columns, [name])[0] for name, pool in pools.items()}
+        spread = [(name, *(part for cell in cells for part in (cell, EMPTY))) for name, cells in medians.items()]
         times += _grouped(column[1], spread)
     return [("", "Dataset"), ("", "From"), *((column.group, column.title) for column in counts)], [*bodies, times]
-
-
-def _rows_of(run: Run, method: str) -> list[Row]:
-    return [row for row in run.rows if row.method == method]
 
 
 def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
@@ -340,13 +326,8 @@ def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
     for dataset in datasets(runs):
         rows: list[Cells] = []
         for setting in settings:
-            title, columns, before = setting_title(setting), _columns(spec, [setting]), len(rows)
-            for run, method in _adding([run for run in runs if run.title == dataset]):
-                name, cells = method_name(run, method), _cells(run.rows, columns, [method])[0]
-                rows.append((title, name, *cells, images_text(run)))
-            rows += [] if len(rows) > before else [(title, NOT_RUN, *[EMPTY] * (1 + len(columns)))]
-            for name, cells in _papers(label, dataset, columns).items():
-                rows += [(title, name, *cells, str(IMAGES[dataset]))] if setting in SETTINGS else []
+            lines = _rows(label, spec, runs, dataset, _columns(spec, [setting]))
+            rows += [(setting_title(setting), name, *cells, n) for name, n, cells in lines]
         bodies.append(_grouped(dataset, rows))
     return [("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")], bodies
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import hashlib
 import itertools
@@ -126,29 +127,17 @@ def spread(scenes: Sequence[str], frames: Callable[[str], Sequence[int]], count:
     groups: dict[str, list[str]] = {}
     for scene in sorted(scenes, key=_hash):
         groups.setdefault(scene.partition("/")[0] if "/" in scene else "", []).append(scene)
-    turns = [(turn, _hash(group), scene) for group, names in groups.items() for turn, scene in enumerate(names)]
-    held = {scene: frames(scene) for _, _, scene in sorted(turns)[:count]}
-    shares = _shares({scene: len(frames) for scene, frames in held.items()}, count)
+    order = [(turn, _hash(group), scene) for group, names in groups.items() for turn, scene in enumerate(names)]
+    held = {scene: frames(scene) for _, _, scene in sorted(order)[:count]}
+    rounds = range(max(map(len, held.values()), default=0))  # in each, every scene that has more gives one
+    turns = (scene for turn in rounds for scene in held if turn < len(held[scene]))
+    shares = collections.Counter(itertools.islice(turns, count))
     picked: dict[str, list[int]] = {}
     for scene in (scene for scene in scenes if scene in held):
         length, share = len(held[scene]), shares[scene]
         start = _hash(scene) % length / length if share else 0
         picked[scene] = [held[scene][int((place + start) * length / share)] for place in range(share)]
     return picked
-
-
-def _shares(sizes: dict[str, int], count: int) -> dict[str, int]:
-    """How many each gives: what is left is divided evenly until it is gone, or nobody has more."""
-    shares = dict.fromkeys(sizes, 0)
-    left = min(count, sum(sizes.values()))
-    while left:
-        open_ = [name for name in sizes if shares[name] < sizes[name]]
-        each = max(1, left // len(open_))
-        for name in open_[:left]:
-            more = min(each, sizes[name] - shares[name])
-            shares[name] += more
-            left -= more
-    return shares
 
 
 def _hash(name: str) -> int:
