@@ -17,7 +17,7 @@ from spackle.evaluation.methods import METHODS
 from spackle.evaluation.pictures import Boxes, Cell, draw_grid, kept_pictures
 from spackle.evaluation.plots import evenly
 from spackle.evaluation.protocols import HOLE, INPUT
-from spackle.evaluation.rows import Run
+from spackle.evaluation.rows import Run, load_data
 from spackle.evaluation.table import tex
 from spackle.files import atomic_path, write_whole
 from spackle.folders import results_folder
@@ -34,29 +34,12 @@ class PaperFigure(NamedTuple):
     """What the paper has a figure of."""
 
     name: str
-    columns: Sequence[str]  # pictures; those that no run has are left out, but for the needed one
+    columns: Sequence[str]  # pictures; methods that no run has are left out, but for the needed one
     needs: str
     caption: str
 
 
-FIGURES = (
-    PaperFigure(
-        "comparison",
-        (INPUT, "base", "paper", "spackle"),
-        "base",
-        "Qualitative comparison under large viewpoint changes ({views}). From left to right: the input image, the view "
-        "rendered from {bases} with holes in red boxes, and the view by {ours}. The tag is the number of "
-        "added Gaussians in percent of the base's. {weights}",
-    ),
-    PaperFigure(
-        "direct_ft",
-        (INPUT, "base", "paper", "spackle", "direct-ft", HOLE),
-        "direct-ft",
-        "Generated supervision applied directly to the base ({views}). From left to right: the input image, the view "
-        "rendered from {bases}, the view by {ours}, by the naive decoupled framework (direct FT), and the occluded "
-        "regions (white). {weights}",
-    ),
-)
+FIGURES = [PaperFigure(name, **facts) for name, facts in load_data("figures.json").items()]
 TITLES = {INPUT: "Input", HOLE: "Occluded regions", "direct-ft": "Direct FT"}
 
 
@@ -70,8 +53,11 @@ def make_figures(folders: Sequence[Path], rows: int, output: Path, reporter: Rep
     """
     runs = [(run, folder) for run, folder in ((load_run(folder), folder) for folder in folders) if not run.timed]
     runs = [(run, folder) for run, folder in runs if not run.near]
-    having = {figure: [(run, folder) for run, folder in runs if figure.needs in run.methods] for figure in FIGURES}
-    made = {figure.name: drawn for figure, sources in having.items() if (drawn := _draw(figure, sources, rows))}
+    made = {}
+    for figure in FIGURES:
+        having = [(run, folder) for run, folder in runs if figure.needs in run.methods]
+        if drawn := _draw(figure, having, rows):
+            made[figure.name] = drawn
     if not made:
         raise InputError(f"{folders[0]}: nothing to draw: give folders of `spackle evaluate` with --disparity 0.6")
     for figure in FIGURES:
