@@ -61,7 +61,7 @@ class Workers:
     count: int = 1
     threads: int = 2  # of each
     ray: str | None = None  # address of their cluster; this machine where None
-    gpu: bool = False  # each takes one, on a cluster that has any
+    gpu: bool = False  # each takes one, on a cluster that has any; on this machine they share what there is
 
     def check(self) -> None:
         """InputError for a number out of bounds."""
@@ -113,7 +113,11 @@ def at_work_here(
         return
     count = min(workers.count, len(jobs))
     spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
-    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=(workers.threads, open_worker))
+    numbers = spawn.SimpleQueue()  # each process takes one
+    for number in range(count):
+        numbers.put(number)
+    start = workers.threads, open_worker, numbers if workers.gpu else None
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_start, initargs=start)
     try:
         yield results_of((pool.submit(_make, job) for job in jobs), QUEUED * count, stop)
     finally:
@@ -138,8 +142,8 @@ def results_of(futures: Iterable[Future[R]], most: int = 1, stop: Callable[[], b
 _open_worker: Callable[[], PhotoWorker]  # of a worker process; its errors belong to a job's result
 
 
-def _start(threads: int, open_worker: Callable[[], PhotoWorker]) -> None:
-    """Begin as a worker, which leaves Ctrl-C to the main process and ends with it."""
+def _start(threads: int, open_worker: Callable[[], PhotoWorker], numbers: Any) -> None:
+    """Begin as a worker, which leaves Ctrl-C to the main process and ends with it; `numbers` deal out the GPUs."""
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -147,6 +151,8 @@ def _start(threads: int, open_worker: Callable[[], PhotoWorker]) -> None:
     assert parent is not None
     threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     torch.set_num_threads(threads)
+    if numbers is not None and torch.cuda.device_count() > 1:
+        torch.cuda.set_device(numbers.get() % torch.cuda.device_count())
 
 
 def _make(job: Any) -> Any:

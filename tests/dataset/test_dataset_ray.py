@@ -134,7 +134,7 @@ def test_a_node_that_is_not_like_the_others_is_a_line(
 
 def test_a_worker_takes_a_gpu_only_where_a_network_uses_one() -> None:
     def gpus(base: str, device: str = "auto", inpainter: str = "exemplar", **node: Any) -> int:
-        options = DatasetOptions(BaseSettings(base, device=device), inpainter=inpainter)
+        options = DatasetOptions(BaseSettings(base, device=device), inpainter=inpainter, ray="auto")
         without = {"Alive": True, "Resources": {"CPU": 4.0}}
         return on_ray.gpus_of(options.processes, [without, {"Alive": True, "Resources": {"GPU": 1.0}} | node])
 

@@ -25,10 +25,21 @@ from spackle.render.protocol import tile_mask
 from spackle.residual.complete import compose
 from spackle.residual.network import DELTA_CHANNELS
 from spackle.residual.view_features import CELL, ViewFeatures, cell_centers
-from spackle.training import sources
-from spackle.training.recipe import DataRecipe
+from spackle.training import samples, sources
+from spackle.training.recipe import DataRecipe, Recipe, load_recipe
 from spackle.training.residual import MIN_AUX, training_cells
-from spackle.training.samples import EXACT, HOLE_SHARE, PARTS, Sample, Source, load_sample, make_samples, save_sample
+from spackle.training.samples import (
+    EIGHT_BITS,
+    EXACT,
+    HOLE_SHARE,
+    PARTS,
+    Sample,
+    Source,
+    disk_needed,
+    load_sample,
+    make_samples,
+    save_sample,
+)
 from spackle.training.samples import random_crops as crops_of
 
 CPU = CpuRenderer()
@@ -147,12 +158,15 @@ def whole(request: pytest.FixtureRequest) -> Sample:
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (32, 48), (13, 27), (7, 20)])  # corners, and off the tiles' grid
-def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: int, column: int) -> None:
+def test_a_completed_crop_is_a_part_of_the_completed_view(
+    whole: Sample, row: int, column: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     side = 24  # cells
+    monkeypatch.setattr(samples, "GAUSSIANS_A_PIXEL", 9)
     crop = whole.crop(row, column, side, side)
     part = slice(CELL * row, CELL * (row + side)), slice(CELL * column, CELL * (column + side))
     cells = slice(row, row + side), slice(column, column + side)
-    for name in ("cues", "rim"):
+    for name in ("features", "rim"):
         for mine, yours in zip(tensors_of(getattr(crop, name)), tensors_of(getattr(whole, name)), strict=True):
             assert torch.equal(mine, yours[cells])
     assert torch.equal(crop.target, whole.target[part])
@@ -162,10 +176,10 @@ def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: in
     assert len(crop.base) < 0.7 * len(whole.base)
     inside = tile_mask(crop.tiles, CELL * side, CELL * side)
     drawn = CPU.render(crop.base, crop.camera, tiles=crop.tiles)
-    for name, tolerance in (("rgb", 1e-5), ("depth", 1e-4), ("alpha", 1e-5)):
+    for name, tolerance in (("rgb", 3e-5), ("depth", 1e-4), ("alpha", 1e-5)):
         assert (getattr(drawn, name) - getattr(whole.rendering, name)[part]).abs()[inside].max() < tolerance
-    chosen = training_cells(crop.cues)
-    masked = torch.zeros_like(whole.cues.mask)
+    chosen = training_cells(crop.features)
+    masked = torch.zeros_like(whole.features.mask)
     masked[cells] = chosen
     deltas = 0.5 * torch.randn(int(chosen.sum()), DELTA_CHANNELS, generator=torch.Generator().manual_seed(row))
     aux = compose(whole.seeds.select(masked), deltas, whole.camera)
@@ -175,7 +189,7 @@ def test_a_completed_crop_is_a_part_of_the_completed_view(whole: Sample, row: in
     found = CPU.render([crop.base, crop_aux], crop.camera, tiles=crop.tiles, onto=crop.rendering)
     assert crop.hole.any()
     assert (found.rgb - whole.rendering.rgb[part]).abs()[crop.hole].max() > 0.05  # aux does something
-    assert (found.rgb - expected.rgb[part]).abs()[inside].max() < 1e-5
+    assert (found.rgb - expected.rgb[part]).abs()[inside].max() < 3e-5
     assert (found.alpha - expected.alpha[part]).abs()[inside].max() < 1e-5
     assert torch.equal(found.rgb[~inside], whole.rendering.rgb[part][~inside])
 
@@ -252,10 +266,20 @@ def test_a_sample_comes_back_from_its_file_unless_damaged(tmp_path: Path) -> Non
     save_sample(sample, path)
     found, content = load_sample(path), path.read_bytes()
     assert torch.equal(found.target, sample.target)
+    (mine, yours), length = (torch.nn.functional.normalize(s.base.quats, dim=-1) for s in (found, sample)), 1 / 127
+    assert float((mine - yours).norm(dim=-1).max()) < length
     for part in PARTS:
         for name, value in vars(getattr(sample, part)).items():
-            tolerance = {"rtol": 0, "atol": 0} if f"{part}.{name}" in EXACT else {"rtol": 2**-11, "atol": 2**-25}
+            if name == "quats":
+                continue
+            tolerance = {"rtol": 2**-11, "atol": 2**-25}
+            if f"{part}.{name}" in (*EXACT, "seeds.uv"):
+                tolerance = {"rtol": 0, "atol": 0}
+            elif f"{part}.{name}" in EIGHT_BITS:  # of sRGB; the base's colours are linear, which spreads them
+                tolerance = {"rtol": 0, "atol": 0.5 / 255 * (2.3 if name == "colors" else 1.001)}
             torch.testing.assert_close(getattr(getattr(found, part), name), value, **tolerance)
+    assert torch.equal(found.hole, sample.hole)
+    assert torch.equal(found.features.mask, sample.features.mask)
     assert all(map(torch.equal, tensors_of(found.camera), tensors_of(sample.camera)))
     assert (found.camera.width, found.camera.height) == (64, 48)
     save_sample(found, path)
@@ -264,6 +288,25 @@ def test_a_sample_comes_back_from_its_file_unless_damaged(tmp_path: Path) -> Non
         path.write_bytes(content[:keep])
         with pytest.raises(InputError, match=r"0\.safetensors: no training sample, or damaged"):
             load_sample(path)
+
+
+def test_a_crop_is_as_small_as_promised_and_shows_the_same(tmp_path: Path) -> None:
+    """With two Gaussians a pixel in sight, about as many as SHARP has on COCO's photos."""
+    scene = box_before_wall(width=272, height=204, focal=226)
+    view, base = shifted(scene.camera.resized(192, 144), 0.4), scene.base()
+    sample = Sample.of(base, CPU.render(base, view), view, scene.camera, scene.rgb, CPU.render(base, view).rgb)
+    crop = sample.crop(4, 20, 64, 64)
+    save_sample(crop, tmp_path / "0.safetensors")
+    data = DataRecipe(crops=1, cells=64)
+    assert (tmp_path / "0.safetensors").stat().st_size <= disk_needed(data, [], tmp_path, 1)
+    crop = load_sample(tmp_path / "0.safetensors")
+    assert len(crop.base) < 0.5 * len(base)
+    drawn, inside = CPU.render(crop.base, crop.camera, tiles=crop.tiles), tile_mask(crop.tiles, 128, 128)
+    assert psnr(drawn.rgb[inside], crop.rendering.rgb[inside]) > 45
+    paper = load_recipe(Recipe, "paper", ["loss.features=none"]).data
+    bytes_a_crop = disk_needed(paper, [], tmp_path, 1)
+    assert bytes_a_crop <= 2e6
+    assert bytes_a_crop * (paper.views + paper.validation_views) < 60e9
 
 
 def fill(folder: Path, killed_at: int | None = None) -> tuple[list[str], list[float]]:

@@ -10,6 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
+import gsplat_stand_in
 import numpy as np
 import pytest
 import torch
@@ -20,6 +21,7 @@ from PIL import Image
 from scenes import box_before_wall, shifted, tensors_of
 from sharp_weights import write_tiny
 from training_runs import assert_same_weights, losses_of, one_thread, run_killed, run_two, state
+from two_gpus import TwoGpus
 
 from spackle.folders import hold
 from spackle.gaussians import Gaussians
@@ -40,6 +42,18 @@ loss: {features: none}
 optim: {steps: 6, batch: 2, warmup: 2, lr: 1.0e-3, ema: 0.9, precision: fp32}
 run: {validate_every: 6, save_every: 3, log_every: 1}
 """
+
+
+NOTING = """
+from spackle.training import train
+total = train.sum_of_ranks
+def noting(numbers, device):
+    totals = total(numbers, device)
+    if "gradient" in totals and train.rank() == 0:
+        open(%r, "a").write(repr(totals["loss"]) + chr(10))
+    return totals
+train.sum_of_ranks = noting
+"""  # the loss of each step, for other processes
 
 
 @pytest.fixture(scope="module")
@@ -196,13 +210,30 @@ def test_a_run_without_improvement_ends_and_needs_no_tensorboard(
     assert (report["ended"], report["best_step"], report["stale"]) == ("patience", 1, 2)
 
 
-def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path) -> None:
+def test_two_processes_learn_what_one_does(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = ["optim.steps=2", "optim.batch=4", "run.validate_every=2"]
-    run_two(arguments(place, tmp_path / "two", *options))
+    run_two(arguments(place, tmp_path / "two", *options), NOTING % str(tmp_path / "losses"))
+    losses, total = [], training.sum_of_ranks
+    monkeypatch.setattr(training, "sum_of_ranks", lambda *given: losses.append(total(*given)) or losses[-1])
     assert train(place, tmp_path / "one", *options).code == 0
+    noted = [float(line) / 2 for line in (tmp_path / "losses").read_text().splitlines()]  # a sum over two
+    assert noted == pytest.approx([numbers["loss"] for numbers in losses if "gradient" in numbers], rel=1e-5)
     assert_same_weights(tmp_path / "two", tmp_path / "one", 1e-5)
     one, two = (state(tmp_path / name).progress.history[0] for name in ("one", "two"))
     assert two == pytest.approx(one, rel=1e-4)  # blobs at nearly one depth may swap
+
+
+def test_the_second_process_puts_nothing_on_the_first_gpu(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("spackle.render.cuda.load_gsplat", lambda device: gsplat_stand_in)
+    monkeypatch.setattr("torch.distributed.init_process_group", lambda backend, **options: None)
+    for name, value in {"WORLD_SIZE": "2", "RANK": "1", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+    with TwoGpus(monkeypatch) as gpus:
+        options = ("run.device=cuda", f"data.cache={tmp_path}/cache", "optim.steps=2", "run.validate_every=2")
+        done = train(place, tmp_path / "out", *options)
+    assert (done.code, gpus.used) == (0, {1}), done.err
 
 
 @pytest.mark.parametrize(
@@ -229,26 +260,23 @@ def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, o
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 
-@pytest.mark.parametrize(("part", "said"), [("rendering", "(loss, "), ("seeds", "(gradient)")])
-def test_a_loss_that_is_no_number_keeps_what_made_it(
-    place: Path, whole: Path, tmp_path: Path, part: str, said: str
-) -> None:
+def test_a_gradient_that_is_no_number_keeps_what_made_it(place: Path, whole: Path, tmp_path: Path) -> None:
     cache = shutil.copytree(place / "cache", tmp_path / "cache")
     samples = list(cache.glob("*/train/*.safetensors"))
     for path in samples:
         sample = load_sample(path)
-        getattr(sample, part).rgb.fill_(math.nan)
+        sample.seeds.slope.fill_(math.nan)
         save_sample(sample, path)
     done = train(place, tmp_path / "out", f"data.cache={cache}")
     assert done.code == 2
-    assert f"out/bad_batch: step 0 gave numbers that are not finite {said}" in done.lines[-1]
+    assert "out/bad_batch: step 0 gave numbers that are not finite (gradient)" in done.lines[-1]
     assert sum(path.name in done.lines[-1] for path in samples) == 2
     assert state(tmp_path / "out" / "bad_batch").progress.step == 0
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize("name", ["unet", "sharp-decoder"])
-def test_gradients_reach_the_whole_network_and_neither_base_nor_cues(name: str) -> None:
+def test_gradients_reach_the_whole_network_and_neither_base_nor_features(name: str) -> None:
     scene = box_before_wall(width=96, height=80)
     base = Gaussians(*(t.clone().requires_grad_() for t in scene.base().tensors))
     view = shifted(scene.camera, 0.3)

@@ -60,8 +60,9 @@ class DatasetOptions:
 
     @property
     def processes(self) -> Workers:
-        network = self.base.network or self.inpaints_by_network
-        return Workers(self.workers, self.threads, self.ray, gpu=network and self.base.device != "cpu")
+        network = self.base.network or self.inpaints_by_network  # without one, a cluster's workers need no GPU
+        gpu = self.base.device != "cpu" and (network or self.ray is None)
+        return Workers(self.workers, self.threads, self.ray, gpu)
 
     def open_inpainter(self) -> Inpainter | None:
         """None where the targets are rendered or left open; InputError where a package or weights are missing."""

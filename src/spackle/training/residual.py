@@ -8,12 +8,14 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+import shutil
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from rich.filesize import decimal
 from safetensors.torch import save
 from torch import Tensor, nn
 
@@ -29,12 +31,12 @@ from spackle.render.protocol import Rendering
 from spackle.residual.architectures import NOTE, SharpDecoder, decoder_size, load_residual, open_residual
 from spackle.residual.complete import compose
 from spackle.residual.network import ResidualNet, network_input
-from spackle.residual.view_features import ViewFeatures, hole_area_ratio
+from spackle.residual.view_features import CELL, ViewFeatures, hole_area_ratio
 from spackle.training.losses import hole_psnr, load_features, total_loss
 from spackle.training.recipe import Recipe
-from spackle.training.samples import Sample, digest_of_samples, load_sample, make_samples
+from spackle.training.samples import Sample, digest_of_samples, disk_needed, load_sample, make_samples
 from spackle.training.sources import find_sources
-from spackle.training.train import Task
+from spackle.training.train import Task, rank
 
 MIN_AUX = 64  # aux Gaussians of a view, however small its holes (paper, "Training Details and Loss Weights")
 PICTURED = 6  # views in the picture
@@ -137,14 +139,14 @@ def complete_samples(
     What needs a look at numbers is done before samples travel to the renderer's device, which is waited for once.
     """
     device = device_of(renderer)
-    cells = [training_cells(sample.cues).flatten().nonzero()[:, 0] for sample in samples]
+    cells = [training_cells(sample.features).flatten().nonzero()[:, 0] for sample in samples]
     tiles = [sample.tiles for sample in samples]
     fields: Sequence[Tensor | None] = [None] * len(samples)
     if network is not None:
-        features = torch.cat([network_input(sample.cues, sample.seeds, sample.rim) for sample in samples])
-        features = features.to(next(network.parameters()).device)
-        with torch.autocast(features.device.type, precision, enabled=precision != torch.float32):
-            deltas = network(features.contiguous(memory_format=torch.channels_last))
+        inputs = torch.cat([network_input(sample.features, sample.seeds, sample.rim) for sample in samples])
+        inputs = inputs.to(next(network.parameters()).device)
+        with torch.autocast(inputs.device.type, precision, enabled=precision != torch.float32):
+            deltas = network(inputs.contiguous(memory_format=torch.channels_last))
         fields = list(deltas.float().to(device))
     samples = [sample.to(device) for sample in samples]
     scenes = []
@@ -159,15 +161,15 @@ def complete_samples(
     )
 
 
-def training_cells(cues: ViewFeatures, least: int = MIN_AUX) -> Tensor:
+def training_cells(features: ViewFeatures, least: int = MIN_AUX) -> Tensor:
     """[h, w] bool: the masked cells, and where they are fewer than `least` the most transparent others."""
-    missing = least - int(cues.mask.sum())
+    missing = least - int(features.mask.sum())
     if missing <= 0:
-        return cues.mask
-    rest = torch.where(cues.mask, torch.inf, cues.alpha).flatten()
-    cells = cues.mask.flatten().clone()
+        return features.mask
+    rest = torch.where(features.mask, torch.inf, features.alpha).flatten()
+    cells = features.mask.flatten().clone()
     cells[rest.topk(min(missing, int((~cells).sum())), largest=False).indices] = True
-    return cells.view_as(cues.mask)
+    return cells.view_as(features.mask)
 
 
 def first_network(name: str, init: Path | None = None) -> ResidualNet:
@@ -205,7 +207,7 @@ class ResidualTask(ViewTask):
         self.digest, self.items_a_step = digest_of_samples(recipe.data, self.sources[0]), recipe.optim.batch
 
     def prepare(self, output: Path, reporter: Reporter) -> dict[str, Any]:
-        """Make the samples that are missing."""
+        """Make the samples that are missing; InputError also where the disk is too full for them."""
         data, skipped = self.recipe.data, Counter[str]()
 
         def skip(reason: str) -> None:
@@ -215,21 +217,46 @@ class ResidualTask(ViewTask):
 
         folder = data.cache or output / CACHE
         make_folder(folder)
-        reporter.log(f"samples of {data.views + data.validation_views} views in {folder}")
+        # Other seeds, other views, and of a dataset other photos: no view is in both.
+        parts = (
+            ("validation", self.sources[True], 2 * data.seed + 1, data.validation_views),
+            ("train", self.sources[False], 2 * data.seed, data.views),
+        )
+        needed = sum(disk_needed(data, of, folder / self.digest / name, views) for name, of, _, views in parts)
+        free = shutil.disk_usage(folder).free
+        if needed > free:
+            raise InputError(
+                f"{folder}: the samples may take {decimal(needed)}, and {decimal(free)} are free: "
+                "give data.cache=FOLDER on another disk, or fewer data.views"
+            )
+        reporter.log(f"samples of {data.views + data.validation_views} views in {folder}, at most {decimal(needed)}")
         with reporter.stage("samples") as step:
-            # Other seeds, other views, and of a dataset other photos: no view is in both.
             self.validation, self.learned = (
-                make_samples(data, sources, folder / self.digest / name, seed, views, step, skip)
-                for name, sources, seed, views in (
-                    ("validation", self.sources[True], 2 * data.seed + 1, data.validation_views),
-                    ("train", self.sources[False], 2 * data.seed, data.views),
-                )
+                make_samples(data, of, folder / self.digest / name, seed, views, step, skip)
+                for name, of, seed, views in parts
             )
         if skipped:
             reporter.log(f"{skipped.total()} views were passed over, for {len(skipped)} reasons (above)")
         self.items, self.validation_items = len(self.learned), len(self.validation)
         reporter.log(f"{self.items} samples to learn from, {self.validation_items} to be judged by")
-        return self.facts(self.network)
+        limits = self.limits() if rank() == 0 else {}  # for run.json, which the first process writes
+        for name, decibels in limits.items():
+            reporter.log(f"{decibels:.2f} dB in the holes of the latter: {name}")
+        return {**self.facts(self.network), "hole_psnr": limits}
+
+    @torch.no_grad()
+    def limits(self) -> dict[str, float]:
+        """Mean hole_psnr in dB of the validation samples: what there is to learn lies between the two."""
+        found: dict[str, list[float]] = {"untrained": [], "colours of the targets": []}
+        for item in range(self.validation_items):
+            (sample,) = self.batch(None, [item])
+            height, width = sample.features.mask.shape
+            colors = sample.target.view(height, CELL, width, CELL, 3).mean((1, 3))
+            told = dataclasses.replace(sample, seeds=dataclasses.replace(sample.seeds, rgb=colors))
+            for decibels, known in zip(found.values(), (sample, told), strict=True):
+                views = self.complete(None, [known])
+                decibels.append(hole_psnr(views.rgb[0], views.target[0], views.hole[0]))
+        return {name: sum(decibels) / len(decibels) for name, decibels in found.items()}
 
     def batch(self, step: int | None, items: Sequence[int]) -> list[Sample]:
         """Samples; InputError where one cannot be read."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import os
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,13 +21,13 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.camera import Camera
+from spackle.color import linear_to_srgb, srgb_to_linear, to_bytes
 from spackle.errors import InputError, reading
 from spackle.files import write_whole
 from spackle.filters import greatest_around
 from spackle.gaussians import Gaussians
 from spackle.progress import Step
-from spackle.render.cpu import project, wanted_tiles
-from spackle.render.project import KernelCamera
+from spackle.render import CpuRenderer
 from spackle.render.protocol import TILE, Rendering
 from spackle.residual.base_values import Seeds, make_seeds
 from spackle.residual.network import Rim, find_rim
@@ -36,11 +36,17 @@ from spackle.training.recipe import DataRecipe
 from spackle.training.train import rank, rank_count, wait_for_ranks
 
 REACH_PX = 16  # aux Gaussians of a hole reach no farther than this beyond it
-# Half precision is enough for all but these, and halves what is read at every step.
-EXACT = ("camera.K", "camera.world_to_camera", "base.means", "seeds.uv", "seeds.inverse_depth")
-PARTS = ("base", "rendering", "cues", "rim", "seeds")  # of a sample, each a dataclass of tensors
+# Of a sample's file: half precision is enough for most of it, and eight bits are for sRGB of a pixel or a cell.
+EXACT = ("camera.K", "camera.world_to_camera", "base.means", "rendering.alpha", "seeds.inverse_depth")
+RIM_COLORS = ("rim.rgb", "rim.mirrored", "rim.exemplar", "rim.photo")
+EIGHT_BITS = ("target", "rendering.rgb", "seeds.rgb", "base.opacities", "base.colors", *RIM_COLORS)
+PARTS = ("base", "rendering", "rim", "seeds")  # of a sample, each a dataclass of tensors
+GAUSSIANS_A_PIXEL = 1.35  # of the base in a crop, at most
+# A crop's file has per pixel so many Gaussians of 26 bytes, 8-bit colours of rendering and target, alpha in float32 and
+# depth in float16; per cell 8-bit colours of seed and rim, 5 times 3 of them, and 13 bytes of their other fields.
+PIXEL_BYTES, CELL_BYTES, HEADER_BYTES = 26 * GAUSSIANS_A_PIXEL + 2 * 3 + 4 + 2, 5 * 3 + 13, 4096
 HOLE_SHARE = (0.02, 0.85)  # of a crop's pixels, for the crop to teach something
-SAMPLES_VERSION = 6  # goes up whenever the same recipe would make other samples
+SAMPLES_VERSION = 7  # goes up whenever the same recipe would make other samples
 P = TypeVar("P")
 
 
@@ -52,7 +58,6 @@ class Sample:
     base: Gaussians  # those that touch the tiles around the holes
     rendering: Rendering  # of the whole base
     seeds: Seeds  # a grid, one for each 2×2 pixels
-    cues: ViewFeatures  # likewise
     rim: Rim  # likewise
     target: Tensor  # [H, W, 3] sRGB
 
@@ -64,10 +69,15 @@ class Sample:
 
         `photo_camera` is that of the base's `photo` [h, w, 3] sRGB.
         """
-        rendering, cues = rendering.detach(), ViewFeatures.of(rendering)
-        seeds = make_seeds(cues, camera, photo_camera)
-        rim, _ = find_rim(cues, seeds, camera, photo_camera, photo)
-        return Sample(camera, base.detach(), rendering, seeds, cues, rim, target)
+        rendering, features = rendering.detach(), ViewFeatures.of(rendering)
+        seeds = make_seeds(features, camera, photo_camera)
+        rim, _ = find_rim(features, seeds, camera, photo_camera, photo)
+        return Sample(camera, base.detach(), rendering, seeds, rim, target)
+
+    @functools.cached_property
+    def features(self) -> ViewFeatures:
+        """What the view shows, in cells; of a sample on the processor."""
+        return ViewFeatures.of(self.rendering)
 
     @property
     def hole(self) -> Tensor:
@@ -82,7 +92,7 @@ class Sample:
 
     def to(self, device: torch.device) -> Sample:
         """The same on another device, except for the camera, whose numbers are read by the host."""
-        move = partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
+        move = functools.partial(Tensor.to, device=device, non_blocking=device.type != "cpu")
         parts = {name: _mapped(getattr(self, name), move) for name in PARTS}
         return dataclasses.replace(self, **parts, target=move(self.target))
 
@@ -101,17 +111,24 @@ class Sample:
             base=self.base,
             rendering=_mapped(self.rendering, lambda t: t[pixels].clone()),
             seeds=dataclasses.replace(_mapped(self.seeds, cut), uv=cell_centers(camera)),
-            cues=_mapped(self.cues, cut),
             rim=_mapped(self.rim, cut),
             target=self.target[pixels].clone(),
-        )._with_near_base()
+        )._with_visible_base()
 
-    def _with_near_base(self) -> Sample:
-        """Without the base Gaussians that touch no tile of interest: no renderer draws anything of them there."""
-        view = KernelCamera.of(self.camera, 0.0)
-        splats, spans = project([self.base], view, wanted_tiles(view, self.tiles))
-        near = np.concatenate([splats.ids[:0], *(splats.ids[start : start + count] for start, count in spans)])
-        return dataclasses.replace(self, base=self.base.select(torch.from_numpy(near).long()))
+    def _with_visible_base(self) -> Sample:
+        """With the base Gaussians that show in tiles of interest: of all others no renderer draws anything there.
+
+        Where they are more than `GAUSSIANS_A_PIXEL`, those that show most.
+        """
+        with torch.enable_grad():  # the gradient of grey Gaussians' brightness says how much of each shows
+            grey = torch.full_like(self.base.colors, 0.5).requires_grad_()
+            scene = dataclasses.replace(self.base, colors=grey)
+            drawn = CpuRenderer().render(scene, self.camera, tiles=self.tiles)
+            (shown,) = torch.autograd.grad(drawn.rgb.sum(), grey)
+        room = int(GAUSSIANS_A_PIXEL * self.camera.width * self.camera.height)
+        kept = torch.zeros(len(grey), dtype=torch.bool)
+        kept[shown[:, 0].topk(min(len(grey), room)).indices] = True
+        return dataclasses.replace(self, base=self.base.select(kept & (shown[:, 0] > 0)))
 
 
 def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: int) -> list[Sample]:
@@ -119,7 +136,7 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
     rows, columns = sample.camera.height // CELL, sample.camera.width // CELL  # whole cells only
     if min(rows, columns) < cells:
         return []
-    where = sample.cues.mask[:rows, :columns].nonzero()
+    where = sample.features.mask[:rows, :columns].nonzero()
     crops: list[Sample] = []
     for _ in range(2 * count):  # a second chance for each
         if not len(where) or len(crops) == count:
@@ -135,17 +152,22 @@ def random_crops(sample: Sample, rng: np.random.Generator, count: int, cells: in
 
 
 def save_sample(sample: Sample, path: Path) -> None:
-    """Write a sample, whole or not at all; colours of the truth with 8 bits."""
+    """Write a sample, whole or not at all; `disk_needed` knows how large it can be."""
     camera = sample.camera
     tensors = {
         "camera.K": camera.K,
         "camera.world_to_camera": camera.world_to_camera,
         "camera.size": torch.tensor([camera.width, camera.height]),
-        "target": (sample.target * 255).round().to(torch.uint8),
+        "target": sample.target,
     }
     for part in PARTS:
         tensors |= {f"{part}.{name}": value for name, value in vars(getattr(sample, part)).items()}
     tensors["seeds.unit"] = torch.tensor(sample.seeds.unit, dtype=torch.float64)
+    del tensors["seeds.uv"]  # the camera's
+    tensors["base.colors"] = linear_to_srgb(sample.base.colors)
+    tensors |= {name: to_bytes(tensors[name]) for name in EIGHT_BITS}
+    quats = sample.base.quats  # of any length: the largest component becomes 127
+    tensors["base.quats"] = (127 * quats / quats.abs().amax(-1, keepdim=True)).round().to(torch.int8)
     halved = [name for name, tensor in tensors.items() if tensor.dtype == torch.float32 and name not in EXACT]
     tensors |= {name: tensors[name].half() for name in halved}
     write_whole(path, save({name: tensor.contiguous() for name, tensor in tensors.items()}))
@@ -157,16 +179,17 @@ def load_sample(path: str | os.PathLike[str]) -> Sample:
         parts: dict[str, dict[str, Any]] = {}
         for name, tensor in load_file(path).items():
             part, _, field = name.partition(".")
-            parts.setdefault(part, {})[field] = tensor.float() if tensor.dtype == torch.float16 else tensor
+            value = tensor.float() / 255 if name in EIGHT_BITS else tensor
+            parts.setdefault(part, {})[field] = value.float() if value.dtype in (torch.float16, torch.int8) else value
         lens, unit = parts["camera"], float(parts["seeds"].pop("unit"))
+        camera = Camera(lens["K"], lens["world_to_camera"], *lens["size"].tolist())
         return Sample(
-            camera=Camera(lens["K"], lens["world_to_camera"], *lens["size"].tolist()),
-            base=Gaussians(**parts["base"]),
+            camera=camera,
+            base=Gaussians(**{**parts["base"], "colors": srgb_to_linear(parts["base"]["colors"])}),
             rendering=Rendering(**parts["rendering"]),
-            seeds=Seeds(**parts["seeds"], unit=unit),
-            cues=ViewFeatures(**parts["cues"]),
+            seeds=Seeds(cell_centers(camera), **parts["seeds"], unit=unit),
             rim=Rim(**parts["rim"]),
-            target=parts["target"][""].float() / 255,
+            target=parts["target"][""],
         )
 
 
@@ -217,8 +240,7 @@ def make_samples(
     for each view that gives no sample. InputError where nothing can be written, or no view has a hole to learn from.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if len(sources) == 1 and sources[0].views is not None:
-        views = min(views, sources[0].views)
+    views = _at_most(views, sources)
     shares = np.array([source.share for source in sources])
 
     def drawn(index: int) -> tuple[int, np.random.Generator]:
@@ -249,6 +271,18 @@ def make_samples(
             f"{2 * data.cells} pixels each way, and seen from aside (data.disparity)"
         )
     return files
+
+
+def disk_needed(data: DataRecipe, sources: Sequence[Source], folder: Path, views: int) -> int:
+    """Bytes at most that the samples of a folder's first views will take, beyond those that are there."""
+    missing = sum(_crop_files(folder, index) is None for index in range(_at_most(views, sources)))
+    return missing * data.crops * (data.cells**2 * int(CELL**2 * PIXEL_BYTES + CELL_BYTES) + HEADER_BYTES)
+
+
+def _at_most(views: int, sources: Sequence[Source]) -> int:
+    """So many views, or as many as the only source has."""
+    alone = sources[0].views if len(sources) == 1 else None
+    return views if alone is None else min(views, alone)
 
 
 def _crop_files(folder: Path, index: int) -> list[Path] | None:
