@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import math
-import re
 import shutil
 import socket
 import statistics
@@ -408,13 +407,10 @@ def test_a_run_goes_on_to_the_same_bytes_and_runs_share_their_tables(scenes: Pat
     assert len(load_run(two).images) == 1
     done = run("tables", one, two, "-o", both)
     assert done.code == 0, done.err
-    text = "".join((folder / "tables.tex").read_text() for folder in (one, two, both))
-    labels = re.findall(r"\\label\{(.*?)\}", text)
-    assert len(set(labels)) == len(labels) >= 6 + 6
     refuses(run("tables", one, one, "-o", both), "two results")
     refuses(run("tables", scenes, "-o", both), "rows.jsonl is missing")
-    for file, content in (("rows.jsonl", "[1]\n"), ("config.json", "{}"), ("config.json", "x")):
-        damaged = shutil.copytree(one, tmp_path / f"damaged {content.strip()}")
+    for file, content in (("rows.jsonl", "[1]\n"), ("config.json", '{"format": 2}'), ("config.json", "x")):
+        damaged = shutil.copytree(one, tmp_path / f"damaged {content.strip()[:3]}")
         (damaged / file).write_text(content)
         refuses(run("tables", damaged, "-o", both), file, "run it again")
 

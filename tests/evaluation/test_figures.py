@@ -26,9 +26,9 @@ DOCUMENT = r"""\documentclass{{article}}
 """
 
 
-def check_latex(folder: Path, *files: str) -> None:
+def check_latex(folder: Path, *files: Path) -> None:
     """Braces and environments are closed, labels are unique, and pdfLaTeX takes it where there is one."""
-    text = "\n".join((folder / file).read_text(encoding="utf-8") for file in files)
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
     bare = re.sub(r"\\[\\{}%]", "", text)
     depths = np.cumsum([(sign == "{") - (sign == "}") for sign in bare])
     assert depths.min() >= 0
@@ -73,11 +73,11 @@ def test_both_figures_and_all_tables_are_latex(tmp_path: Path) -> None:
             sizes.append(picture.size)
     assert sizes[0][0] == pytest.approx(sizes[1][0], rel=0.03)  # three columns and five of one width
     assert sizes[0][1] > sizes[1][1]
-    check_latex(tmp_path / "figures", "figures.tex")
     done = run("tables", large, near, bench, "-o", tmp_path / "tables")
     assert done.code == 0, done.err
-    for folder, file in ((tmp_path / "tables", "tables.tex"), (large, "tables.tex"), (bench, "bench.tex")):
-        check_latex(folder, file)
+    folders = large, near, tmp_path / "tables"
+    files = [bench / "bench.tex", *(folder / "tables.tex" for folder in folders), tmp_path / "figures" / "figures.tex"]
+    check_latex(tmp_path / "figures", *files)  # one document takes them all in
     refuses(run("figures", near, "-o", tmp_path / "none"), "nothing to draw", "--disparity 0.6")
     assert not (tmp_path / "none").exists()
 

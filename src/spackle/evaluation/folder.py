@@ -25,7 +25,7 @@ from spackle.folders import as_recorded, differences, digest_of, file_records, m
 from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
-FORMAT = 2
+FORMAT = 3
 KINDS = {"evaluate": "an evaluation", "bench": "a benchmark"}  # of a configuration: the command, and what it makes
 DAMAGED = "not of `spackle evaluate` or `spackle bench` ({reason}): run it again"
 # Place, image, and metrics to measure, to the image's rows and the files that it wrote.
@@ -49,7 +49,8 @@ def load_run(folder: Path) -> Run:
             raise ValueError("a name that is no text")
     with reading(folder / CONFIG, DAMAGED):
         config = json.loads((folder / CONFIG).read_text("utf-8"))
-        del config["format"]
+        if config.pop("format") != FORMAT:
+            raise ValueError("of another version")
         run = Run(config, rows, config.pop("about"))
         _ = (run.title, run.base, run.timed, run.methods, run.settings)  # all are there
     return run
