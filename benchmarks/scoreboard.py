@@ -344,7 +344,7 @@ def sheet(folder: Path, runs: Sequence[str]) -> Image.Image:
         pictures = []
         for run in runs:
             with switched_off(run, LIFT, FILL):
-                scene = spackle.predict(file, base=base, fill="exemplar")
+                scene = spackle.predict(file, base=base, disparity=0.15, fill="exemplar")
             sets = ([scene.base], [scene.base, scene.aux]) if run == DEFAULT else ([scene.base, scene.aux],)
             ends = extremes(scene.camera.even(), scene.disparity or 0.0, DepthRange.of(scene.base))
             pictures.append([[RENDERER.render(part, end).rgb for part in sets] for end in ends])

@@ -149,6 +149,7 @@ def shared_report(
     """What the reports of a photo and of a clip both hold, ready for JSON."""
     path, weights = pipeline.options.path, pipeline.options.fill.weights
     given = path.cameras or path.path
+    reach = "photo" if "usual_disparity" in prediction.notes else f"default of {choice.base}"
     report: dict[str, Any] = {
         "spackle": spackle.__version__,
         "focal_px": round(prediction.camera.focal[0], 3),
@@ -156,7 +157,7 @@ def shared_report(
         "base": {"name": choice.base, "chosen": choice.why, "gaussians": len(prediction.gaussians)},
         "residual": {"weights": weights},
         "views": given.name if given else path.trajectory,
-        "disparity_source": None if given else pipeline.disparity_source(choice),
+        "disparity_source": None if given else "--disparity" if path.disparity is not None else reach,
         "seconds": {**reporter.seconds, "total": round(sum(reporter.seconds.values()), 3)},
     }
     if choice.failures:

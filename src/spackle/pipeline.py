@@ -34,7 +34,7 @@ from spackle.residual.network import ResidualNet
 from spackle.scene import Scene
 from spackle.scene_fill.fill import FillContext, fill_scene, fill_view
 from spackle.scene_fill.texture import Texture, exemplar_texture, painted_texture
-from spackle.views import PathOptions, PlannedViews, plan_views
+from spackle.views import PathOptions, PlannedViews, choose_move, plan_views
 from spackle.weights import installed
 
 LOG = logging.getLogger("spackle")
@@ -149,19 +149,23 @@ class Pipeline:
         return done if scene.by_view is None else _with_farthest_view(done)
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
-        """The photo's Gaussians, and the base that made them; says which one, the focal length and the disparity."""
+        """The photo's Gaussians, and the base that made them; says which one, the focal length and the move."""
         name = photo.path.name
         if photo.frame is not None:
             reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")
         prediction, choice = self.base.predict(photo, log=reporter.warn, stage=reporter.stage)
         if choice.note:
             reporter.log(f"{name}: {choice.note}")
-        disparity = self._disparity(prediction)
+        given = self._disparity(prediction) is None or self.options.path.disparity is not None
+        if not given:
+            with reporter.stage("move"):
+                prediction = choose_move(prediction, self.renderer, photo.path)
         reporter.log(
             f"{name}: {len(prediction.gaussians):,} Gaussians from {choice.base}, "
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
-            + ("" if disparity is None else f", disparity {disparity:g} ({self.disparity_source(choice)})")
         )
+        if not given:
+            reporter.log(f"{name}: {_move_in_words(prediction)}")
         if missing := float(prediction.notes.get("depth_filled", 0)):
             reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
         if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
@@ -184,14 +188,17 @@ class Pipeline:
         )
         return fill_views(context, cameras if fill.texture != "none" else (), fill.mode, exact, progress)
 
-    def disparity_source(self, choice: ResolvedBase) -> str:
-        """Who says how far the camera goes."""
-        return f"default of {choice.base}" if self.options.path.disparity is None else "--disparity"
-
     def _disparity(self, prediction: BasePrediction) -> float | None:
         """How far the camera goes; None where views or keyframes say it."""
         given = self.given_views is not None or self.keyframes is not None
         return None if given else self.options.path.reach(prediction.disparity)
+
+
+def _move_in_words(prediction: BasePrediction) -> str:
+    """How far the camera goes, as `choose_move` found it."""
+    reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
+    of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` for more") if reach != usual else ("", "")
+    return f"moves {reach:g}{of}: {invented:.1%} of the widest view is invented{more}"
 
 
 def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
@@ -250,8 +257,8 @@ def predict(
             downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
             what could not be used. A network is then loaded for this photo alone: for many, load a base once.
         kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as the base has it: 0.15 for
-            lite, else 0.3.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as the photo bears it
+            (see `choose_move`), at most 0.15 for lite, else 0.3.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.

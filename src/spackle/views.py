@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, cast
 
@@ -28,7 +29,9 @@ from spackle.errors import InputError
 from spackle.formats.camera_files import load_cameras, load_path
 from spackle.formats.video import FORMATS, check_video
 from spackle.gaussians import Gaussians
-from spackle.render.protocol import Rendering
+from spackle.image import working_size
+from spackle.render.protocol import Renderer, Rendering
+from spackle.residual.view_features import hole_area_ratio
 from spackle.stereo import Stereo, StereoLayout, default_ipd
 
 VideoFormat = Literal["mp4", "webm", "gif", "webp"]
@@ -313,6 +316,55 @@ class PlannedViews:
         return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker)
 
 
+COARSE_PX = 240  # long side of the pictures that show what a move uncovers
+MOVE_STEP = 0.01  # of the disparities that a photo may choose
+LEAST_MOVE = 0.04  # less is no parallax
+LOOKS = 3  # at moves between none and the base's usual one
+
+
+@contextlib.contextmanager
+def _possible_path(source: Path) -> Iterator[None]:
+    """InputError, naming the photo, where its depths and focal length allow no camera path."""
+    try:
+        yield
+    except PathError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{source}: no camera path: {error}: check the depth map and the focal length") from error
+
+
+@torch.no_grad()
+def choose_move(prediction: BasePrediction, renderer: Renderer, source: Path) -> BasePrediction:
+    """With the farthest move, up to the base's usual one, that uncovers no more of the widest views than it allows.
+
+    The notes say the base's usual disparity, and which share of the two widest views is holes (eq. 10, 11), by coarse
+    renders. InputError, naming `source`, the photo, where its depths and focal length allow no path.
+    """
+    gaussians, usual, allowed = prediction.gaussians, prediction.disparity, prediction.uncovered
+    with _possible_path(source):
+        depths = DepthRange.of(gaussians)
+    camera = prediction.camera.resized(*working_size(prediction.camera.width, prediction.camera.height, COARSE_PX))
+
+    def uncovered(disparity: float) -> float:
+        ends = extremes(camera, disparity, depths)
+        return sum(hole_area_ratio(renderer.render(gaussians, end).alpha) for end in ends) / len(ends)
+
+    near, far = (0.0, 0.0), (usual, uncovered(usual))  # disparity and holes: within what is allowed, and beyond it
+    if far[1] <= allowed:
+        near = far
+    for _ in range(LOOKS if near[0] < usual else 0):
+        between = near[0] + (allowed - near[1]) / (far[1] - near[1]) * (far[0] - near[0])
+        disparity = round(MOVE_STEP * math.floor(between / MOVE_STEP + 1e-6), 4)
+        if disparity <= max(near[0], LEAST_MOVE):
+            break
+        found = (disparity, uncovered(disparity))
+        near, far = (found, far) if found[1] <= allowed else (near, found)
+    if near[0] < LEAST_MOVE:
+        near = (least := min(LEAST_MOVE, usual), uncovered(least))
+    notes = prediction.notes | {"usual_disparity": usual, "uncovered": round(near[1], 4)}
+    return dataclasses.replace(prediction, disparity=near[0], notes=notes)
+
+
 def plan_views(
     prediction: BasePrediction,
     path: PathOptions,
@@ -328,12 +380,11 @@ def plan_views(
     if given:
         return PlannedViews.of(given, {}, FrameMaker.of(path.video, gaussians, given, source), stills=True)
     try:
-        cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
-        others = _measured(path.reach(prediction.disparity), camera.even(), DepthRange.of(gaussians), keyframes)
+        with _possible_path(source):
+            cameras = path.fly(gaussians, camera, keyframes, prediction.disparity)
+            others = _measured(path.reach(prediction.disparity), camera.even(), DepthRange.of(gaussians), keyframes)
     except PathError as error:
         raise InputError(f"{path.path}: {error}") from error
-    except ValueError as error:
-        raise InputError(f"{source}: no camera path: {error}: check the depth map and the focal length") from error
     return PlannedViews.of(cameras, others, FrameMaker.of(path.video, gaussians, cameras, source), stills=False)
 
 

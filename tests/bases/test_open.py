@@ -206,7 +206,7 @@ def test_broken_depth_in_the_photo_fails(
         pick(photo, name="rgbd")
     with caplog.at_level(logging.INFO, "spackle"):  # in Python
         spackle.predict(photo, network=None)
-    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO", "INFO"]
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO", "INFO", "INFO"]
     assert all(record.getMessage().startswith("photo.jpg: ") for record in caplog.records)
     depth = torch.full((WIDTH, HEIGHT), 2.0)
     wrong = DepthMap(depth, depth > 0, None, None, "depth", photo)

@@ -49,7 +49,8 @@ def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Pa
     first = [frames[0].to_ndarray(format="rgb24").astype(float) for frames in (ours, predicted)]
     assert np.abs(first[0] - first[1]).mean() < 1  # the path starts at the photo's place
     far = rendered(scene, tmp_path / "far.mp4", "--trajectory", "swipe", "--disparity", 1.5, "--json", *SHORT)
-    assert "the scene was completed for --disparity 0.3" in far.err
+    beyond = "--disparity 1.5 goes beyond the 0.07 that it was completed for: `spackle predict --disparity 1.5`"
+    assert beyond in far.lines[0]
     assert json.loads(far.out)["open"] > 0.01
 
 

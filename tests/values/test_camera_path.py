@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +26,12 @@ from spackle.camera_path import (
     max_offset,
     trajectory,
 )
+from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.views import PathOptions
+from spackle.render import CpuRenderer
+from spackle.render.protocol import Rendering
+from spackle.residual import hole_area_ratio
+from spackle.views import PathOptions, choose_move
 
 PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
 RANGE = DepthRange(near=2.0, focus=4.0)
@@ -158,3 +166,45 @@ def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]])
 def test_impossible_paths_are_refused(kind: str, disparity: float, frames: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         trajectory(kind, PHOTO, disparity, RANGE, frames)  # type: ignore[arg-type]
+
+
+class CountingRenderer(CpuRenderer):
+    """Counts its renders."""
+
+    count = 0
+
+    def render(self, *given: Any, **options: Any) -> Rendering:
+        self.count += 1
+        return super().render(*given, **options)
+
+
+@pytest.fixture(scope="module")
+def uncovered() -> Callable[[float], float]:
+    """Which share of the two widest views of a box before a wall is holes at a disparity, at the photo's size."""
+    scene = box_before_wall(width=288, height=216, focal=240)
+    gaussians = scene.base()
+
+    @functools.cache
+    def share(disparity: float) -> float:
+        ends = extremes(scene.camera, disparity, DepthRange.of(gaussians))
+        return sum(hole_area_ratio(CpuRenderer().render(gaussians, end).alpha) for end in ends) / 2
+
+    return share
+
+
+@pytest.mark.parametrize(("usual", "allowed"), [(0.3, 0.5), (0.3, 0.06), (0.15, 0.03), (0.3, 0.001), (0.02, 0.001)])
+def test_a_photo_chooses_its_move(usual: float, allowed: float, uncovered: Callable[[float], float]) -> None:
+    """As trying every hundredth finds it, in a few coarse renders."""
+    prediction = box_before_wall(width=288, height=216, focal=240).lift()
+    prediction = dataclasses.replace(prediction, disparity=usual, uncovered=allowed)
+    renderer = CountingRenderer()
+    chosen = choose_move(prediction, renderer, Path("photo.png"))
+    steps = [usual, *(k / 100 for k in range(4, round(100 * usual)))]
+    within = [step for step in steps if uncovered(step) <= allowed]
+    assert chosen.disparity == pytest.approx(max(within, default=min(usual, 0.04)), abs=0.0101)
+    assert chosen.notes["uncovered"] == pytest.approx(uncovered(chosen.disparity), abs=0.01)
+    assert chosen.notes["usual_disparity"] == usual
+    assert renderer.count <= 10
+    nowhere = dataclasses.replace(prediction, gaussians=prediction.gaussians.select(slice(0, 0)))
+    with pytest.raises(InputError, match=r"^photo\.png: no camera path: no Gaussian stands in front"):
+        choose_move(nowhere, renderer, Path("photo.png"))

@@ -14,6 +14,7 @@ from spackle.image import Photo, film_to_pixels
 
 Progress = Callable[[int, int], None]  # (steps done, of how many)
 USUAL_DISPARITY = 0.3  # how far a camera goes where neither a person nor the base says; the paper's S1
+UNCOVERED = 0.125  # of the widest views, where nobody says how far a camera goes; more, and the fill meets the eye
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +25,8 @@ class BasePrediction:
     camera: Camera  # the photo's, at its working size
     notes: dict[str, float | int | str]  # for the report: what was measured, filled or assumed
     lens_source: str = ""  # who gave the camera's lens, where it is not the photo's file or a person
-    disparity: float = USUAL_DISPARITY  # how far a camera goes where nobody says: as far as this geometry looks right
+    disparity: float = USUAL_DISPARITY  # how far a camera goes at most where nobody says: so far this geometry is right
+    uncovered: float = UNCOVERED  # share of the widest views that may be holes, where nobody says how far it goes
 
 
 class Base(Protocol):

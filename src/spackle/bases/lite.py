@@ -197,6 +197,7 @@ def _unpacked(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 SHIPPED = Path(__file__).parents[1] / "weights" / "lite.safetensors"
 DISPARITY = 0.15  # farther, what stands leans and poles bend: docs/lab/lite.md
+UNCOVERED = 0.075  # of the widest views: beyond, the eye meets what is made up before anything else
 FARTHEST = 60.0  # what is farther than the nearest things by this ratio is sky to it
 
 
@@ -254,7 +255,7 @@ class LiteBase:
         if progress:
             progress(2, 2)
         notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}
-        return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY)
+        return dataclasses.replace(prediction, notes=notes, disparity=DISPARITY, uncovered=UNCOVERED)
 
     def inverse_depth(self, rgb: Tensor) -> Tensor:
         """What the networks say of a photo [H, W, 3], sRGB in 0..1, at all `INPUT_SCALES`: the mean logarithm.

@@ -182,7 +182,8 @@ def view(
     disparity: Annotated[
         float | None,
         typer.Option(
-            help="How far photos are completed: 0 to 2; 0.3 is large.", show_default="0.15 with lite, else 0.3"
+            help="How far photos are completed: 0 to 2; 0.3 is large.",
+            show_default="what the photo bears, up to 0.15 with lite, else 0.3",
         ),
     ] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels.")] = None,

@@ -95,7 +95,7 @@ def path_options(
         float | None,
         typer.Option(
             help="How far the camera moves: 0 to 2; 0.3 is large.",
-            show_default="as the scene has it, else 0.15 with lite, 0.3 with others",
+            show_default="as the scene has it; predict: what the photo bears, up to 0.15 with lite, else 0.3",
         ),
     ] = None,
     path: Annotated[

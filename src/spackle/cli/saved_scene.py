@@ -67,6 +67,12 @@ def render_scene(
                 raise InputError(f"{path.path}: {error}") from error
             except ValueError as error:
                 raise InputError(f"{scene}: no camera path: {error}: give views with --cameras") from error
+            if reach is not None and (path.disparity or 0) > reach:
+                far = f"--disparity {path.disparity:g}"
+                reporter.log(
+                    f"{scene.name}: {far} goes beyond the {reach:g} that it was completed for: "
+                    f"`spackle predict {far}` completes a photo so far"
+                )
             if loaded.camera is None and focal_px is None:
                 reporter.log(
                     f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
@@ -104,8 +110,7 @@ def render_scene(
     result = {"gaussians": len(gaussians), "frames": len(cameras), "seconds": seconds, "open": round(max(holes), 5)}
     if max(holes) > TOLERATED:
         mean = sum(holes) / len(holes)
-        far = "" if reach is None else f": the scene was completed for --disparity {reach:g}"
-        reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average{far}")
+        reporter.log(f"{scene.name}: holes take up to {max(holes):.1%} of a frame, {mean:.1%} on average")
     if problem:
         reporter.log(f"{path.cameras}: {problem}: pictures only, no video")
         reporter.result({"folder": output, **result})
