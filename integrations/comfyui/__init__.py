@@ -10,12 +10,14 @@ import functools
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from spackle import DepthMap, Photo, Scene, get_renderer, hole_mask
+from spackle import Photo, Scene, get_renderer, hole_mask
 from spackle import complete as complete_scene
 from spackle.bases import BasePrediction
+from spackle.bases.depth_map import FAR_M, NEAR_M, RELATIVE, relative_depth
 from spackle.bases.open import OpenedBase, open_base
 from spackle.bases.settings import AUTO, AUTO_NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, trajectory_kind
@@ -25,7 +27,6 @@ from spackle.views import PATH_FRAMES
 
 FILLS = ("auto", "network", "exemplar", "lama", "none")
 FORMATS = (".ply", ".spz", ".sog", ".glb", ".splat", ".html")
-FARTHEST = 0.01  # inverse depths below this share of the nearest count as this
 DISPARITY = ("FLOAT", {"default": 0.2, "min": 0.0, "max": MAX_DISPARITY, "step": 0.01})
 TRAJECTORY = (list(TRAJECTORIES), {"default": "rotate-forward"})
 
@@ -55,16 +56,26 @@ class PredictScene:
 
     @classmethod
     def INPUT_TYPES(cls) -> dict[str, Any]:
-        """`fov` 0 is a 30 mm lens; `depth` is inverse depth, white at `nearest_m` metres, and replaces the base."""
+        """`fov` 0 is a 30 mm lens; `depth` is a relative map, from `near` to `far` metres, and replaces the base."""
+        metres = {"min": 0.01, "max": 1000.0, "step": 0.1}
         optional = {
             "depth": ("IMAGE",),
-            "nearest_m": ("FLOAT", {"default": 1.5, "min": 0.01, "max": 1000.0}),
+            "depth_kind": (list(RELATIVE),),
+            "near": ("FLOAT", {"default": NEAR_M, **metres}),
+            "far": ("FLOAT", {"default": FAR_M, **metres}),
             "fov": ("FLOAT", {"default": 0.0, "min": 0.0, "max": 170.0}),
         }
         return {"required": {"image": ("IMAGE",), "base": ("SPACKLE_BASE",)}, "optional": optional}
 
     def predict(
-        self, image: Tensor, base: OpenedBase, depth: Tensor | None = None, nearest_m: float = 1.5, fov: float = 0.0
+        self,
+        image: Tensor,
+        base: OpenedBase,
+        depth: Tensor | None = None,
+        depth_kind: Any = RELATIVE[0],
+        near: float = NEAR_M,
+        far: float = FAR_M,
+        fov: float = 0.0,
     ) -> tuple[Scene]:
         """InputError for an image that the base cannot use."""
         rgb = image[0, ..., :3].detach().float().cpu().clamp(0, 1)
@@ -72,10 +83,9 @@ class PredictScene:
         lens = focal_length("image", width, height, {}, focal_px=None, focal_mm=None, fov=fov or None)
         photo = Photo(rgb, *lens, Path("image"))
         if depth is not None:
-            inverse = depth[0].detach().float().cpu().mean(dim=-1).clamp(min=FARTHEST)
-            valid = torch.ones_like(inverse, dtype=torch.bool)
-            step = 1 / (255 * nearest_m)  # of an 8-bit picture
-            given = DepthMap(nearest_m / inverse, valid, None, step, "disparity", Path("depth"))
+            greys = depth[0].detach().float().cpu().mean(dim=-1).numpy()
+            eighth = 1 / 255 if np.allclose(255 * greys, np.round(255 * greys), atol=0.01) else None  # of 8 bits
+            given = relative_depth(greys, depth_kind, "depth", near, far, eighth)
             base = open_base(BaseSettings(depth=given))
         prediction, _ = base.predict(photo)
         return (Scene(prediction.gaussians, Gaussians.empty(), prediction.camera),)

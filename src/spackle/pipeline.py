@@ -17,7 +17,7 @@ from typing import Literal
 from torch import Tensor
 
 from spackle.bases import Base, BasePrediction
-from spackle.bases.depth_map import DepthMap
+from spackle.bases.depth_map import DepthKind, DepthMap
 from spackle.bases.open import OpenedBase, ResolvedBase, open_base, open_loaded
 from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
@@ -166,6 +166,8 @@ class Pipeline:
         )
         if not given:
             reporter.log(f"{name}: {_move_in_words(prediction)}")
+        if depth_range := prediction.notes.get("depth_range"):
+            reporter.log(f"{name}: its depth is {depth_range}")
         if missing := float(prediction.notes.get("depth_filled", 0)):
             reporter.log(f"{name}: {missing:.1%} of the depth was missing and has been filled")
         if self.options.base.depth is not None and (size := prediction.notes.get("depth_resampled_from")):
@@ -238,6 +240,7 @@ def predict(
     base: Base | None = None,
     kind: TrajectoryKind = "rotate-forward",
     disparity: float | None = None,
+    depth_kind: DepthKind = "auto",
     network: ResidualNet | Shipped | None = "shipped",
     fill: Fill = "auto",
     renderer: Renderer | None = None,
@@ -259,6 +262,7 @@ def predict(
         kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
         disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as the photo bears it
             (see `choose_move`), at most 0.15 for lite, else 0.3.
+        depth_kind: what the numbers of a depth map's file are, see `spackle.load_depth`.
         network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
         fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
@@ -278,7 +282,9 @@ def predict(
     if isinstance(base, str):
         raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
     source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
-    options = Options(BaseSettings(depth=source), PathOptions(kind, disparity), FillOptions(fill=fill))
+    options = Options(
+        BaseSettings(depth=source, depth_kind=depth_kind), PathOptions(kind, disparity), FillOptions(fill=fill)
+    )
     if isinstance(photo, Photo):
         if (focal_px, focal_mm, fov) != (None, None, None):
             raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from portraits import png
 
-from spackle.bases.depth_map import DepthMap, load_depth
+from spackle.bases.depth_map import RELATIVE, DepthKind, DepthMap, load_depth
 from spackle.errors import InputError
 
 CALIB = "cam0=[1000.5 0 30.25; 0 1000.5 20.5; 0 0 1]\ncam1=[1000.5 0 40.25; 0 1000.5 20.5; 0 0 1]\n doffs= 10.0\n"
@@ -142,6 +142,79 @@ def test_bad_calibrations(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match="calib") as caught:
         load_depth(tmp_path / "d.pfm", calib=tmp_path / "calib.txt")
     assert "\n" not in str(caught.value)
+
+
+def greys(values: NDArray[Any], mode: str) -> bytes:
+    """Numbers 0..1 as a picture, as other programs write depth."""
+    if mode == "I;16":
+        return png((values * 65535).round().astype(np.uint16))
+    buffer = io.BytesIO()
+    picture = Image.fromarray((values * 255).round().astype(np.uint8)).convert(mode)
+    picture.save(buffer, "JPEG" if mode == "RGB" else "PNG", quality=95)
+    return buffer.getvalue()
+
+
+SLOPE = np.tile(np.linspace(0, 1, 100), (60, 1))
+
+
+@pytest.mark.parametrize(
+    ("content", "step"),
+    [
+        (greys(SLOPE, "L"), 1 / 255),
+        (greys(SLOPE, "I;16"), 1 / 65535),
+        (greys(SLOPE, "RGBA"), 1 / 255),  # as ComfyUI
+        (greys(SLOPE, "RGB"), 1 / 255),
+        (as_bytes(SLOPE), None),
+        (as_bytes(np.float32(70 * SLOPE - 3)), None),  # as MiDaS says it
+        (pfm(np.float32(0.01 * SLOPE + 5)), None),
+    ],
+)
+@pytest.mark.parametrize("kind", RELATIVE)
+def test_relative_maps(tmp_path: Path, content: bytes, step: float | None, kind: DepthKind) -> None:
+    (tmp_path / "map").write_bytes(content)
+    for ends in ({}, {"near": 0.5, "far": 4.0}):
+        near, far = ends.get("near", 1.5), ends.get("far", 15.0)
+        found = load_depth(tmp_path / "map", kind=kind, **ends)
+        assert bool(found.valid.all())
+        start, middle, end = (float(found.depth[:, k].median()) for k in (1, 50, 98))
+        half = (near + far) / 2 if kind == "near-black" else 2 / (1 / near + 1 / far)
+        first, last = (near, far) if kind == "near-black" else (far, near)
+        assert (start, middle, end) == pytest.approx((first, half, last), rel=0.04)
+        assert (found.K, found.quantity) == (None, "depth" if kind == "near-black" else "disparity")
+        span = far - near if kind == "near-black" else 1 / near - 1 / far
+        assert found.quantum == (step and pytest.approx(step * span / 0.98, rel=0.02))
+        assert f"{min(start, end):.2g}"[:2] in found.range_in_words
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "says"),
+    [
+        (greys(SLOPE, "L"), {}, "an 8-bit PNG holds no metres: give --depth-kind near-white"),
+        (greys(SLOPE, "L"), {"kind": "metric"}, "give 16 bits in millimetres"),
+        (greys(SLOPE, "I;16"), {}, "fill the range of 16 bits, .*: give --depth-kind near-white"),
+        (greys(SLOPE, "RGBA"), {}, "mode RGBA holds no millimetres: give --depth-kind near-white"),
+        (greys(SLOPE, "L"), {"kind": "disparity"}, "no calibration lies beside it: give --calib"),
+        (as_bytes(SLOPE), {"kind": "near-white", "near": 3.0, "far": 2.0}, "--near 3, --far 2: give two distances"),
+        (as_bytes(SLOPE), {"kind": "near-white", "near": 0.0}, "--near 0, --far 15: give two distances"),
+        (as_bytes(np.ones((9, 9))), {"kind": "near-black"}, "the same depth nearly everywhere"),
+        (as_bytes(np.full((9, 9), np.nan)), {"kind": "near-black"}, "the same depth nearly everywhere"),
+        (png(np.zeros((4, 4, 3), np.uint8) + np.uint8([200, 9, 9])), {"kind": "near-white"}, "in colours"),
+        (b"hello there, I am text", {"kind": "near-white"}, "not an image"),
+    ],
+)
+def test_maps_of_another_kind_are_refused(tmp_path: Path, content: bytes, options: Any, says: str) -> None:
+    (tmp_path / "map").write_bytes(content)
+    with pytest.raises(InputError, match=rf"{says}.*"):
+        load_depth(tmp_path / "map", **options)
+
+
+def test_millimetres_far_away_are_no_relative_map(tmp_path: Path) -> None:
+    stored = np.tile(np.linspace(800, 60_000, 100).astype(np.uint16), (9, 1))
+    stored[0] = 65535  # unknown
+    (tmp_path / "map").write_bytes(png(stored))
+    assert float(load_depth(tmp_path / "map").depth.max()) == 60
+    (tmp_path / "map").write_bytes(greys(SLOPE, "I;16"))
+    assert float(load_depth(tmp_path / "map", kind="metric").depth.max()) > 60
 
 
 def npy_claiming(shape: str, descr: str = "<f4") -> bytes:

@@ -65,7 +65,7 @@ def test_a_workflow_from_an_image_to_views_and_a_file(
     inverse = (2 / torch.from_numpy(metres())).clamp(0, 1)[None, ..., None].expand(-1, -1, -1, 3)
     (base,) = execute(nodes["SpackleLoadBase"], name="lite")
     (alone,) = execute(nodes["SpacklePredictScene"], image=image, base=base)
-    (scene,) = execute(nodes["SpacklePredictScene"], image=image, base=base, depth=inverse, nearest_m=2.0, fov=60.0)
+    (scene,) = execute(nodes["SpacklePredictScene"], image=image, base=base, depth=inverse, near=2.0, far=6.0, fov=60.0)
     assert scene.camera.focal[0] == pytest.approx(32 / torch.tensor(30.0).deg2rad().tan().item())
     assert scene.base.means[:, 2].median() == pytest.approx(6, rel=0.05)  # the wall
     assert alone.camera.focal[0] != scene.camera.focal[0]

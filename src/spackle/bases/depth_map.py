@@ -1,4 +1,4 @@
-"""Depth maps that people have: NumPy, 16-bit PNG, PFM, and Middlebury's disparities."""
+"""Depth maps that people have: metres in NumPy, PNG and PFM, Middlebury's disparities, and pictures in greys."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import re
 import zipfile
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -24,6 +24,10 @@ from spackle.image import MAX_PIXELS, check_pixels, read_image
 Array = NDArray[Any]
 StrPath = str | os.PathLike[str]
 Quantity = Literal["depth", "disparity"]
+# What the numbers of a file are. near-white: inverse depth, near-black: depth, both up to scale and shift.
+DepthKind = Literal["auto", "metric", "disparity", "near-white", "near-black"]
+DEPTH_KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
+RELATIVE: tuple[DepthKind, ...] = ("near-white", "near-black")
 
 SUFFIXES = (".npy", ".npz", ".png", ".pfm")
 MAX_TEXT_BYTES = 1 << 16  # a calibration is a few lines
@@ -32,6 +36,12 @@ LARGEST = 1e9  # in a calibration: single precision holds its square
 ASPECT_TOLERANCE = 0.01
 CALIBRATED_SIZE_TOLERANCE = 0.02
 MIN_DISTINCT = 16  # fewer values may share a divisor by chance
+NEAR_M, FAR_M = 1.5, 15.0  # where the nearest and the farthest of a relative map are put
+EXTREMES = (0.01, 0.99)  # quantiles that count as these
+STRETCH = 4.0  # what lies beyond goes on in the same way, up to this factor nearer or farther
+FILLED = 0.05  # a PNG whose values come this close to both ends of the 16 bits is a relative map, not millimetres
+GREY = 8  # of 255: the channels of a picture in greys differ by less, whatever compressed it
+WHICH = "give --depth-kind near-white (as MiDaS, Depth Anything and ComfyUI write it), near-black or metric"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +55,12 @@ class DepthMap:
     quantity: Quantity  # what was stored, hence the unit of `quantum`
     path: Path
     note: str = ""  # for the report: what a photo's own depth map was
+
+    @property
+    def range_in_words(self) -> str:
+        """How near and how far it is, in metres."""
+        near, middle, far = np.quantile(self.depth[self.valid].numpy(), [EXTREMES[0], 0.5, EXTREMES[1]])
+        return f"{near:.3g} m near, {middle:.3g} m median, {far:.3g} m far"
 
     def check_shape(self, height: int, width: int, photo: StrPath) -> None:
         """InputError unless a height×width photo has this map's aspect ratio within 1 %."""
@@ -79,8 +95,16 @@ def find_depth(depth: Path, photo: Path) -> Path:
     raise InputError(f"{photo}: no depth map in {depth}: looked for {names}")
 
 
-def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath | None = None) -> DepthMap:
-    """Read a depth map, or a disparity map with its calibration.
+def load_depth(
+    path: StrPath,
+    *,
+    focal_px: float | None = None,
+    calib: StrPath | None = None,
+    kind: DepthKind = "auto",
+    near: float = NEAR_M,
+    far: float = FAR_M,
+) -> DepthMap:
+    """Read a depth map, a disparity map with its calibration, or a relative map.
 
     Depth: `.npy`, `.npz` (one array, or the key `depth`) and `.pfm` in metres, with 0, NaN and inf for
     unknown; 16-bit `.png` in millimetres, with 0 and 65535 for unknown. The content decides the format.
@@ -89,21 +113,34 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     where `calib` is given, where a `scene.json` in the same folder names the file as its `disparity`,
     or where the file's name starts with "disp" and a Middlebury `calib.txt` lies beside it.
 
+    Relative: the same formats, and any picture in greys; see `relative_depth`.
+
     Args:
         path: the file.
         focal_px: replaces the calibration's focal length, in pixels of the map.
         calib: a Middlebury `calib.txt` or a `scene.json`.
+        kind: what the numbers are; auto: metric, or disparity as above, and no relative map.
+        near: metres at which a relative map begins.
+        far: metres at which it ends.
 
     Raises:
-        InputError: a missing, broken, too large, misshapen, negative or entirely unknown map.
+        InputError: a missing, broken, too large, misshapen, negative or entirely unknown map; with the kind auto one
+            that looks relative.
     """
     check_file(path, "depth map")
-    lens = _find_calibration(Path(path), calib)
+    if kind in RELATIVE:
+        stored, _ = read_array(path, grey=True)
+        return relative_depth(stored, kind, path, near, far)
+    lens = None if kind == "metric" else _find_calibration(Path(path), calib)
+    if kind == "disparity" and lens is None:
+        raise InputError(f"{path}: no calibration lies beside it: give --calib FILE, or --depth-kind near-white")
     if focal_px is not None:
         if not (math.isfinite(focal_px) and focal_px > 0):
             raise InputError(f"--focal-px must be a positive number, got {focal_px}")
         lens = lens and dataclasses.replace(lens, focal_px=focal_px)
     stored, is_png = read_array(path)
+    if kind == "auto" and lens is None and is_png:
+        _check_metric(stored, path)
     values = np.where(np.isfinite(stored), stored, 0)
     if negative := int((values < 0).sum()):
         raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
@@ -118,6 +155,43 @@ def load_depth(path: StrPath, *, focal_px: float | None = None, calib: StrPath |
     step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
     return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, Path(path))
+
+
+def relative_depth(
+    stored: Array, kind: DepthKind, path: StrPath, near: float = NEAR_M, far: float = FAR_M, step: float | None = None
+) -> DepthMap:
+    """Numbers [H, W] that are inverse depth (near-white) or depth (near-black), up to scale and shift, as metres.
+
+    Their 1 % and 99 % quantiles are put at `near` and `far`; NaN and inf are unknown. `step` is that of numbers which
+    were whole once. InputError, naming `path`, for one depth everywhere, or a senseless range.
+    """
+    if not 0 < near < far < LARGEST:
+        raise InputError(f"--near {near:g}, --far {far:g}: give two distances in metres, the nearer one first")
+    values, known = stored.astype(np.float64), np.isfinite(stored)
+    low, high = np.quantile(values[known], EXTREMES) if known.any() else (0.0, 0.0)
+    if not high > low:
+        raise InputError(f"{path}: shows the same depth nearly everywhere: give another depth map")
+    share = (np.where(known, values, low) - low) / (high - low)
+    if kind == "near-white":
+        unit = (1 / near - 1 / far) / (high - low)
+        depth = 1 / np.clip(1 / far + share * (1 / near - 1 / far), 1 / (STRETCH * far), STRETCH / near)
+    else:
+        unit = (far - near) / (high - low)
+        depth = np.clip(near + share * (far - near), near / STRETCH, STRETCH * far)
+    if step is None and stored.dtype.kind in "iu":
+        step = grid_step(values[known])
+    quantity: Quantity = "disparity" if kind == "near-white" else "depth"
+    metres, valid = torch.from_numpy(depth.astype(np.float32)), torch.from_numpy(known)
+    return DepthMap(metres.where(valid, 0.0), valid, None, step and step * unit, quantity, Path(path))
+
+
+def _check_metric(stored: Array, path: StrPath) -> None:
+    """InputError for a PNG that holds no millimetres."""
+    if stored.dtype == np.uint8:
+        raise InputError(f"{path}: an 8-bit PNG holds no metres: {WHICH}")
+    known = stored[(stored > 0) & (stored < 65535)]
+    if known.size and known.min() < FILLED * 65535 and known.max() > (1 - FILLED) * 65535:
+        raise InputError(f"{path}: its values fill the range of 16 bits, as those of a relative map do: {WHICH}")
 
 
 def is_depth(metres: Tensor) -> Tensor:
@@ -215,7 +289,7 @@ def _as_depth(stored: Array, is_png: bool, path: StrPath) -> tuple[Array, Array,
     """Depth in metres, validity and the unit of the stored values in metres."""
     if is_png:
         if stored.dtype == np.uint8:
-            raise InputError(f"{path}: an 8-bit PNG is not a depth map: give 16 bits in millimetres")
+            raise InputError(f"{path}: an 8-bit PNG holds no metres: give 16 bits in millimetres")
         return stored * PNG_UNIT_M, stored != 65535, PNG_UNIT_M
     if stored.dtype.kind in "iu" and np.median(stored) > 500:
         raise InputError(f"{path}: whole numbers around {np.median(stored):.0f} are hardly metres: divide by 1000")
@@ -244,17 +318,22 @@ def grid_step(values: Array) -> float | None:
     return float(np.gcd.reduce(np.diff(distinct))) if len(distinct) >= MIN_DISTINCT else 1.0
 
 
-def read_array(path: StrPath) -> tuple[Array, bool]:
-    """The stored numbers [H, W] of any format, and whether they come from a PNG; InputError where it is none."""
+def read_array(path: StrPath, *, grey: bool = False) -> tuple[Array, bool]:
+    """The stored numbers [H, W] of any format, and whether they come from a PNG; InputError where it is none.
+
+    With `grey` any other picture is read, too, and three equal channels count as one.
+    """
     readers = {b"\x93NUMPY": _read_npy, b"PK\x03\x04": _read_npz, b"Pf": _read_pfm, b"PF": _read_pfm}
     with reading(path, "cannot be decoded ({reason}): the file is damaged or cut off"), open(path, "rb") as file:
         start = file.read(8)
         file.seek(0)
         if start.startswith(b"\x89PNG"):
-            return read_image(path, lambda image: _png_values(image, path)), True
+            return read_image(path, lambda image: _png_values(image, path, grey)), True
         for magic, read in readers.items():
             if start.startswith(magic):
                 return read(file, path), False
+    if grey:
+        return read_image(path, lambda image: _png_values(image, path, grey)), False
     raise InputError(f"{path}: not a depth map: give .npy, .npz or .pfm in metres, or a 16-bit .png in millimetres")
 
 
@@ -266,10 +345,15 @@ def _check_size(shape: tuple[int, ...], path: StrPath) -> None:
     check_pixels(shape[1], shape[0], os.path.getsize(path), path)
 
 
-def _png_values(image: Image.Image, path: StrPath) -> Array:
-    if image.mode != "L" and not image.mode.startswith("I"):
-        raise InputError(f"{path}: a PNG with mode {image.mode} is not a depth map: give one channel of 16 bits")
+def _png_values(image: Image.Image, path: StrPath, grey: bool) -> Array:
     _check_size((image.height, image.width), path)
+    if grey and image.mode != "L" and not image.mode.startswith("I"):
+        channels = np.asarray(image.convert("RGB")).astype(np.int16)
+        if np.ptp(channels, axis=-1).max() >= GREY:
+            raise InputError(f"{path}: a map in colours does not say which is near: give it in greys")
+        return channels[..., 1].astype(np.uint8)
+    if image.mode != "L" and not image.mode.startswith("I"):
+        raise InputError(f"{path}: a PNG with mode {image.mode} holds no millimetres: {WHICH}")
     values = np.asarray(image)
     return values if image.mode == "L" else values.astype(np.uint16)
 

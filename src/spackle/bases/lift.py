@@ -50,7 +50,11 @@ class RgbdBase:
         photo = resize_photo(photo)
         camera = photo.camera if own is None else own.resized(photo.width, photo.height)
         prediction = lift(photo.rgb, depth, camera)
-        notes = prediction.notes | ({"depth": depth.note} if depth.note else {})
+        notes = (
+            prediction.notes
+            | {"depth_range": self.depth.range_in_words}
+            | ({"depth": depth.note} if depth.note else {})
+        )
         return dataclasses.replace(prediction, notes=notes, lens_source="" if own is None else self.lens_source)
 
 

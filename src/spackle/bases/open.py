@@ -98,7 +98,9 @@ def _lift(settings: BaseSettings, photo: Photo, depth: Depth) -> Base | None:
     if isinstance(source, DepthMap):
         found, read = source, None
     else:
-        read = functools.partial(load_depth, find_depth(source, photo.path), calib=settings.calib)
+        ends = {name: end for name, end in (("near", settings.near), ("far", settings.far)) if end is not None}
+        file = find_depth(source, photo.path)
+        read = functools.partial(load_depth, file, calib=settings.calib, kind=settings.depth_kind, **ends)
         found = read()
     width, height = photo.framed_size
     found.check_shape(height, width, photo.path)

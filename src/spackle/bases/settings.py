@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.filesize import decimal
 
 from spackle.bases import lite
-from spackle.bases.depth_map import DepthMap
+from spackle.bases.depth_map import DEPTH_KINDS, RELATIVE, DepthKind, DepthMap
 from spackle.bases.sharp.base import check_windows
 from spackle.device import PRECISIONS, Precision
 from spackle.errors import InputError, check_name
@@ -19,15 +19,16 @@ AUTO, RGBD = "auto", "rgbd"
 HF = "hf:"  # a folder, or owner/name of the hub, follows
 AUTO_NETWORKS = ("sharp", "moge", "depth", "lite")  # in the order that `auto` tries them
 NETWORKS = (*AUTO_NETWORKS, "hf:NAME_OR_FOLDER")
+READING = ("--depth-kind", "--near", "--far")  # of a depth map
 NOT_SHARP = "lifted; not SHARP, so not the paper's base"
 KINDS = {  # the description below tables, and the options that only some bases take
-    RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib")),
+    RGBD: (f"the dataset's own depth, map or points, {NOT_SHARP}", ("--depth", "--calib", *READING)),
     "sharp": ("Apple's network, from the photo alone", ("-c", "--precision", "--sharp")),
     "moge": (f"MoGe-2, from the photo alone, {NOT_SHARP}", ("-c", "--precision")),
     "depth": (f"Depth-Anything-V2-Small of an earlier download, from the photo alone, {NOT_SHARP}", ("--precision",)),
     "lite": (f"Spackle's own small depth networks, from the photo alone, {NOT_SHARP}", ("-c",)),
     "hf": (f"a depth model of transformers, from the photo alone, {NOT_SHARP}", ("--precision",)),
-    AUTO: ("", ("--calib", "--precision", "--sharp")),  # for the base that it chooses
+    AUTO: ("", ("--calib", *READING, "--precision", "--sharp")),  # for the base that it chooses
 }
 HF_FILES: tuple[str, ...] = ("config.json", "preprocessor_config.json", "processor_config.json")
 HF_FILES += ("model.safetensors", "model-*.safetensors", "model.safetensors.index.json")
@@ -65,6 +66,9 @@ class BaseSettings:
     name: str = AUTO  # or one of `KINDS`, or `hf:…`
     depth: Depth = None
     calib: Path | None = None  # calibration of a disparity map
+    depth_kind: DepthKind = "auto"  # what the numbers of a depth map are
+    near: float | None = None  # metres at which a relative depth map begins; as `load_depth` has it where None
+    far: float | None = None  # and at which it ends
     checkpoint: Path | None = None  # weights of SHARP, MoGe or lite
     precision: Precision = "auto"  # of the network
     windows: int | None = None  # that SHARP computes at once; 1 takes the least memory
@@ -124,6 +128,9 @@ class BaseSettings:
         options = {
             "--depth": self.depth.path if isinstance(self.depth, DepthMap) else self.depth,
             "--calib": self.calib,
+            "--depth-kind": None if self.depth_kind == "auto" else self.depth_kind,
+            "--near": self.near,
+            "--far": self.far,
             "-c": self.checkpoint,
             "--precision": None if self.precision == "auto" else self.precision,
             "--sharp": "compile=yes" if self.compiled else self.windows and f"windows={self.windows}",
@@ -133,7 +140,11 @@ class BaseSettings:
             if value is not None and option not in KINDS[kind][1]:
                 raise InputError(f"{option} {value}: the {kind} base has no use for it: leave the option out")
         check_windows("--sharp windows", self.windows)
-        if self.calib is not None and self.depth is None:
-            raise InputError(f"--calib {self.calib}: is for a disparity map: give that with --depth")
+        check_name("--depth-kind", self.depth_kind, DEPTH_KINDS)
+        for option in ("--calib", *READING):
+            if (value := options[option]) is not None and self.depth is None:
+                raise InputError(f"{option} {value}: says how to read a depth map: give that with --depth")
+            if value is not None and option in ("--near", "--far") and self.depth_kind not in RELATIVE:
+                raise InputError(f"{option} {value}: is for a relative map: add --depth-kind {' or '.join(RELATIVE)}")
         if self.named in MISSING and not self.files:
             raise InputError(f"--base {self.named}: {MISSING[self.named]}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spackle.bases import BasePrediction
+from spackle.bases.depth_map import RELATIVE
 from spackle.bases.open import ResolvedBase
 from spackle.cli.photo import PredictOptions
 from spackle.clips.complete import FIGURES, ClipCompleter, CompletedView
@@ -77,7 +78,7 @@ def predict_clip(
             len(clip),
             pipeline.renderer,
             OpenCV("a clip").flow,
-            align=options.base.depth is None,  # measured depth stays as it is
+            align=options.base.depth is None or options.base.depth_kind in RELATIVE,  # measured depth stays as it is
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,

@@ -12,6 +12,7 @@ import typer
 from spackle.cli.options import (
     INTERRUPTED,
     CheckpointOption,
+    DepthKindOption,
     DeviceOption,
     FovOption,
     InputOption,
@@ -53,8 +54,18 @@ def predict(
         Path | None,
         typer.Option(
             metavar="PATH_OR_FOLDER",
-            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), or Middlebury disparity.",
+            help="Depth of the photo: .npy, .npz, .pfm (metres), 16-bit .png (mm), Middlebury disparity, or a picture "
+            "in greys with --depth-kind.",
         ),
+    ] = None,
+    depth_kind: DepthKindOption = "auto",
+    near: Annotated[
+        float | None,
+        typer.Option(hidden=True, metavar="METRES", help="Where a relative --depth begins.", show_default="1.5"),
+    ] = None,
+    far: Annotated[
+        float | None,
+        typer.Option(hidden=True, metavar="METRES", help="Where a relative --depth ends.", show_default="15"),
     ] = None,
     calib: Annotated[
         Path | None, typer.Option(hidden=True, metavar="FILE", help="calib.txt of a disparity map that lies elsewhere.")
@@ -121,7 +132,8 @@ def predict(
     from spackle.pipeline import FillOptions, Options
     from spackle.progress import Reporter
 
-    settings = BaseSettings(base, depth, calib, checkpoint, precision, device=device, **sharp_speed(sharp))
+    reading, speed = (calib, depth_kind, near, far), sharp_speed(sharp)
+    settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
     options = PredictOptions(scene, lens, render, keep_frame, overwrite, workers, threads, ray)
@@ -178,6 +190,7 @@ def view(
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
     ] = "auto",
     depth: Annotated[Path | None, typer.Option(metavar="FILE", help="Depth of the photo.")] = None,
+    depth_kind: DepthKindOption = "auto",
     checkpoint: CheckpointOption = None,
     disparity: Annotated[
         float | None,
@@ -208,7 +221,7 @@ def view(
     from spackle.progress import Reporter
 
     reporter = Reporter(verbose, as_json=as_json)
-    settings = BaseSettings(base, depth, checkpoint=checkpoint, device=device)
+    settings = BaseSettings(base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device)
     uploads = Uploads(settings, disparity, keep_frame, reporter)
     if view_page(target, uploads, {"focal_px": focal_px, "fov": fov}, host, port, token, browser):
         raise typer.Exit(INTERRUPTED)

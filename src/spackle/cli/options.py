@@ -20,12 +20,22 @@ INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 # As `TrajectoryKind` has it; names are normalised, so that rotate_forward is taken, too.
 TrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
+DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 InputOption = Annotated[Path | None, typer.Option("-i", "--input", hidden=True)]  # as the argument was given once
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
 KeepFrameOption = Annotated[
     bool, typer.Option("--keep-frame", help="Leave a scan's margin or letterbox bars around a photo on it.")
+]
+DepthKindOption = Annotated[
+    DepthKindName,
+    typer.Option(
+        hidden=True,
+        help="What the numbers of --depth are. metric: metres, in a 16-bit PNG millimetres; disparity: of a calibrated "
+        "pair; near-white: relative, as MiDaS, Depth Anything and ComfyUI write it; near-black: the other way round. "
+        "auto: metric, or a disparity with its calibration beside it.",
+    ),
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="For scripts: print each result, and an error, as a line of JSON.")
