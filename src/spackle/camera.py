@@ -75,6 +75,12 @@ class Camera:
         """The same view with an even width and height: an odd side grows by one."""
         return self.resized(self.width + self.width % 2, self.height + self.height % 2)
 
+    def zoomed(self, factor: float) -> Camera:
+        """The same view through a lens that is longer by a factor."""
+        K = self.K.clone()
+        K[:2, :2] *= factor
+        return dataclasses.replace(self, K=K)
+
     def looking(self, eye: Tensor, target: Tensor) -> Camera:
         """The same lens at `eye` [3], turned to `target` [3], with the world's y axis pointing down; see `look_at`."""
         return dataclasses.replace(self, world_to_camera=look_at(eye, target).to(self.world_to_camera))

@@ -24,6 +24,7 @@ NEAR_QUANTILE = 0.001  # z_near: sets how far the eye may go
 FOCUS_QUANTILE = 0.1  # depth that the camera keeps looking at
 MIN_FOCUS_M = 2.0  # a nearer focus would turn the camera too much
 MAX_DISPARITY = 2.0  # wider moves leave nothing of the photo in view
+OVERSCAN = 0.05  # a completed scene is drawn by a lens that much longer: what lies beyond the photo is mostly outside
 MAX_ZOOM = 0.15  # forward motion of rotate-forward, in units of z_near
 
 MIN_FOV, MAX_FOV = 1.0, 170.0  # degrees; beyond, a picture of a plane is no use
@@ -225,9 +226,8 @@ class KeyframePath:
                 pose = _look_at(row[:3] * length, row[3:6] * length, row[6:9])
             except PathError as error:
                 raise PathError(f"at {time:.3g} s, between two keyframes, {error}: add a keyframe there") from None
-            K = camera.K.clone()
-            K[:2, :2] *= math.exp(row[9]) / fx
-            views.append(dataclasses.replace(camera, K=K, world_to_camera=pose.to(camera.world_to_camera)))
+            moved = dataclasses.replace(camera, world_to_camera=pose.to(camera.world_to_camera))
+            views.append(moved.zoomed(math.exp(row[9]) / fx))
         return views
 
 

@@ -12,7 +12,7 @@ import torch
 
 from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
-from spackle.camera_path import DepthRange, KeyframePath, TrajectoryKind
+from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.files import write_whole
 from spackle.formats.ply import PlyFile, save_ply
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of
@@ -145,11 +145,16 @@ class Scene:
         frames: int = PATH_FRAMES,
         fps: float = 30,
         loop: int | None = None,
+        overscan: float = OVERSCAN,
     ) -> None:
-        """Write a video of a camera path: .mp4, .webm, .gif or .webp; `loop` as in `spackle.formats.VideoWriter`."""
+        """Write a video of a camera path: .mp4, .webm, .gif or .webp; `loop` as in `spackle.formats.VideoWriter`.
+
+        The lens is longer than the photo's by the share `overscan`: most of what lies beyond the photo stays outside.
+        """
         plays = check_video(path, fps, loop).loop if loop is None else loop
         cameras = scene_path(self.base, self.camera, kind, self._reach(disparity), frames, looped=plays != 1)
-        save_video((view.rgb for view in self.frames(cameras)), path, fps, loop)
+        views = self.frames(camera.zoomed(1 + overscan) for camera in cameras)
+        save_video((view.rgb for view in views), path, fps, loop)
 
 
 @dataclasses.dataclass(frozen=True)

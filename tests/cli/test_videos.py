@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import get_args
 
 import av
 import numpy as np
@@ -20,8 +21,8 @@ import spackle
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, TrajectoryKind
 from spackle.render import CpuRenderer
-from spackle.stereo import Stereo
-from spackle.views import PathOptions, VideoOptions, cover
+from spackle.video_frames import Fit, Stereo, VideoOptions, cover
+from spackle.views import PathOptions
 
 CPU = CpuRenderer()
 
@@ -54,16 +55,32 @@ def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Pa
     assert json.loads(far.out)["open"] > 0.01
 
 
-@pytest.mark.parametrize("size", [(128, 96), (128, 64), (31, 31)])
-def test_render_at_another_size_squeezes_nothing(tmp_path: Path, scene: Path, size: tuple[int, int]) -> None:
+@pytest.mark.parametrize("size", [(128, 96), (128, 64), (31, 31), (32, 128)])
+@pytest.mark.parametrize("fit", get_args(Fit))
+@pytest.mark.parametrize("overscan", [0, 0.25])
+def test_render_at_another_size_squeezes_nothing(
+    tmp_path: Path, scene: Path, size: tuple[int, int], fit: Fit, overscan: float
+) -> None:
     width, height = size
-    rendered(scene, tmp_path / "a.mp4", "--size", f"{width}x{height}", "--disparity", 0, "--frames", 1)
+    words = ("--size", f"{width}x{height}", "--fit", fit, "--overscan", overscan, "--disparity", 0, "--frames", 1)
+    rendered(scene, tmp_path / "a.mp4", *words)
     (frame,) = frames_of(tmp_path / "a.mp4")
     assert frame.shape == (height + height % 2, width + width % 2, 3)
-    red = frame[:height, :width, 0] > frame[:height, :width, 2]
-    scale = max(width / WIDTH, height / HEIGHT)
+    red = frame[..., 0] > frame[..., 2]
+    scales = (width / WIDTH, height / HEIGHT)
+    scale = (max if fit == "crop" else min)(scales)
+    margins = [(side - scale * own) / 2 for side, own in ((height, HEIGHT), (width, WIDTH))]  # above and beside
+    if fit != "crop":
+        rows, columns = (round(margin) + 2 if margin > 1 else 0 for margin in margins)  # colours leak by a pixel or two
+        assert float(frame[rows : height - rows, columns : width - columns].amax(-1).min()) > 0.2
+        red[:rows] = red[height - rows :] = False
+        red[:, :columns] = red[:, width - columns :] = False
     for axis in (0, 1):
-        assert int(red.any(dim=axis).sum()) == pytest.approx(scale * box().any(axis=axis).sum(), abs=5)
+        seen = scale * (1 + overscan) * box().any(axis=axis).sum()
+        assert int(red.any(dim=axis).sum()) == pytest.approx(min(seen, size[axis]), abs=6)
+    if max(margins) > 8:
+        corner = float(frame[:2, :2].max())
+        assert corner == pytest.approx(0, abs=0.1) if fit == "pad" else 0.1 < corner < 0.6
 
 
 def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> None:

@@ -21,6 +21,7 @@ from spackle.camera_path import (
     Keyframe,
     KeyframePath,
     PathError,
+    TrajectoryKind,
     extremes,
     interpolate,
     max_offset,
@@ -31,7 +32,7 @@ from spackle.gaussians import Gaussians
 from spackle.render import CpuRenderer
 from spackle.render.protocol import Rendering
 from spackle.residual import hole_area_ratio
-from spackle.views import PathOptions, choose_move
+from spackle.views import PathOptions, choose_move, plan_views
 
 PHOTO = Camera.from_focal(500, 400, 300)  # the diagonal of W/f and H/f is exactly one
 RANGE = DepthRange(near=2.0, focus=4.0)
@@ -166,6 +167,21 @@ def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]])
 def test_impossible_paths_are_refused(kind: str, disparity: float, frames: int, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         trajectory(kind, PHOTO, disparity, RANGE, frames)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("kind", "more"), [("swipe", 0), ("rotate-forward", 0), ("shake", 2), ("rotate", 2)])
+def test_a_longer_lens_shows_the_middle_and_what_it_leaves_out_is_filled(kind: TrajectoryKind, more: int) -> None:
+    prediction = box_before_wall().lift()
+    paths = [PathOptions(kind, frames=8, overscan=overscan) for overscan in (0, 0.2)]
+    plans = [plan_views(prediction, path, Path("photo.png")) for path in paths]
+    for exact, longer in zip(*(plan.cameras[:8] for plan in plans), strict=True):
+        assert torch.equal(exact.world_to_camera, longer.world_to_camera)
+        K = exact.K.clone()
+        K[:2, :2] *= 1.2
+        assert torch.equal(longer.K, K)
+    assert all(torch.equal(one.K, other.K) for one, other in zip(*(plan.cameras[8:] for plan in plans), strict=True))
+    assert [len(plan.cameras) for plan in plans] == [8 + more + 2] * 2
+    assert plans[1].measured == {"-0.3": 8 + more, "+0.3": 9 + more}
 
 
 class CountingRenderer(CpuRenderer):

@@ -15,8 +15,8 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange
 from spackle.color import INFERNO, UNKNOWN_GREY, DepthColors, linear_to_srgb, srgb_to_linear
 from spackle.render import CpuRenderer
-from spackle.stereo import LAYOUTS, Stereo, anaglyph, default_ipd
-from spackle.views import FrameMaker, VideoOptions, scene_path
+from spackle.video_frames import LAYOUTS, FrameMaker, Stereo, VideoOptions, anaglyph, default_ipd
+from spackle.views import scene_path
 
 CAMERA = Camera.from_focal(60, 64, 48)
 

@@ -24,7 +24,7 @@ from scenes import box_before_wall, psnr
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
+from spackle.camera_path import OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
 from spackle.color import linear_to_srgb
 from spackle.formats import save_png
 from spackle.gaussians import Gaussians
@@ -214,7 +214,7 @@ def camera_of(page: Any, width: int, height: int) -> Camera:
     """Ours, where the page's eye is."""
     eye = torch.tensor(page.evaluate("spackle.pose().eye"))
     focus = torch.tensor([0.0, 0.0, DepthRange.of(box().base).focus])
-    return box().camera.resized(width, height).looking(eye, focus)
+    return box().camera.resized(width, height).zoomed(1 + OVERSCAN).looking(eye, focus)
 
 
 def hole_and_rest(page: Any, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -116,13 +116,13 @@ def test_a_photo_is_completed_as_predict_completes_it(
 
     result = visit(browse, photo, *given)
     assert result.code == 130, result.err
-    assert {event["stage"] for event in told[0] if "stage" in event} <= {"prepare", "base", "complete", "page"}
+    assert {event["stage"] for event in told[0] if "stage" in event} <= {"prepare", "base", "move", "complete", "page"}
     assert counts(seen[0]) == {"base": report["base"]["gaussians"], "aux": report["aux"]["gaussians"]}
     assert any("focal length" in event.get("line", "") for event in told[0])
     assert "ready" in told[1][-1], told
     assert [description["name"] for description in seen] == ["photo.png", "my other.jpg", "rough.png"]
     assert [description["note"] for description in seen] == ["", "", ROUGH]  # by lite, which stays near
-    assert seen[2]["orbit"]["free"] == 0.15
+    assert seen[2]["orbit"]["free"] <= 0.15
     first, other = ([line for line in result.lines if line.startswith(f"{each['name']}: ")] for each in seen[:2])
     assert any("Gaussians from rgbd" in line for line in first)
     assert any("--fov" in line for line in first)

@@ -22,7 +22,7 @@ from spackle.photo_results import shared_report
 from spackle.pipeline import Options, Pipeline
 from spackle.progress import Reporter, timed
 from spackle.residual import hole_area_ratio
-from spackle.views import VideoOptions
+from spackle.video_frames import VideoOptions
 
 FILES = ("video.mp4", "report.json")
 # Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
@@ -82,6 +82,7 @@ def predict_clip(
             fill=options.fill.texture != "none",
             network=pipeline.network,
             precision=options.base.precision,
+            overscan=options.path.overscan,
         )
         focal = focal_length(path, clip.width, clip.height, {}, **lens)
         if clip.hdr:

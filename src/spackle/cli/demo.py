@@ -41,7 +41,7 @@ def run_demo(output: Path, reporter: Reporter) -> None:
     InputError where scikit-image is missing, or `output` cannot be written to.
     """
     pair = load_motorcycle()
-    pipeline = Pipeline.open(Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY)))
+    pipeline = Pipeline.open(Options(BaseSettings("rgbd", pair.depth), PathOptions(disparity=DISPARITY, overscan=0)))
     renderer = pipeline.renderer
     with results_folder(output, FILES, alone=True), compiled_ahead(renderer, reporter.log):
         start = time.perf_counter()

@@ -134,9 +134,25 @@ def path_options(
             show_default="0 for gif and webp, else 1",
         ),
     ] = None,
-    size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the video (of one eye's view), e.g. 1280x720.")
+    overscan: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            hidden=True,
+            help="Draw with a lens longer by this share, so that most of what lies beyond the photo stays outside.",
+            show_default="0.05; 0 with --path and --cameras",
+        ),
     ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Size of the video (of one eye's view): 1280x720, or 16:9, 9:16 or 1:1."),
+    ] = None,
+    fit: Annotated[
+        Literal["pad", "blur", "crop"],
+        typer.Option(
+            hidden=True, help="A view of another aspect ratio than --size: with black or blurred margins, or cut off."
+        ),
+    ] = "pad",
     show: Annotated[
         Literal["color", "depth"],
         typer.Option(hidden=True, help="The scene's colours, or its depth as colours (near is bright)."),
@@ -166,9 +182,11 @@ def path_options(
     Raises:
         InputError: --path or --cameras gives other views, to which an option would mean nothing.
     """
-    from spackle.views import PathOptions, VideoOptions, parse_size
+    from spackle.camera_path import OVERSCAN
+    from spackle.video_frames import VideoOptions, parse_size
+    from spackle.views import PathOptions
 
-    useless: dict[str, object] = {"--trajectory": trajectory, "--disparity": disparity}
+    useless: dict[str, object] = {"--trajectory": trajectory, "--disparity": disparity, "--overscan": overscan}
     if path is not None:
         reason = f"--path {path}: is a camera path of its own"
     elif cameras is not None:
@@ -179,8 +197,9 @@ def path_options(
         if value is not None:
             raise InputError(f"{reason}: leave {option} {value} out")
     pixels = None if size is None else parse_size(size)
-    video = VideoOptions(video_format, fps, loop, pixels, show, stereo, ipd, convergence)
-    return PathOptions(trajectory or "rotate-forward", disparity, cameras, path, frames, video)
+    video = VideoOptions(video_format, fps, loop, pixels, fit, show, stereo, ipd, convergence)
+    kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
+    return PathOptions(kind, disparity, cameras, path, frames, video, zoom)
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:

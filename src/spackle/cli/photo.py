@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from spackle.errors import InputError
 from spackle.pipeline import Options, Pipeline
-from spackle.views import video_problem
+from spackle.video_frames import video_problem
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,7 +30,8 @@ from spackle.progress import Reporter
 from spackle.render import get_renderer
 from spackle.residual import hole_area_ratio
 from spackle.scene import DEFAULT_SIZE, Scene
-from spackle.views import FrameMaker, PathOptions, cover, video_problem
+from spackle.video_frames import FrameMaker, video_problem
+from spackle.views import PathOptions
 from spackle.web import PageScene, single_html
 
 TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
@@ -61,6 +62,8 @@ def render_scene(
             cameras = given
         else:
             camera = _photo_camera(loaded, path.video.size, focal_px)
+            if focal_px is not None or reach is None:  # the lens is given, or nothing is known of the scene
+                path = dataclasses.replace(path, overscan=0)
             try:
                 cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
             except PathError as error:
@@ -78,11 +81,10 @@ def render_scene(
                     f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
                     f"{camera.width}×{camera.height} (--focal-px, --size)"
                 )
-        # A path has the video's size already.
-        maker = FrameMaker.of(dataclasses.replace(path.video, size=None), gaussians, cameras, scene)
+        maker = FrameMaker.of(path.video, gaussians, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
     names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
-    problem = video_problem(cameras)
+    problem = video_problem([maker.sized(camera) for camera in cameras])
     if problem and not names:
         hint = "give a folder with -o for pictures only" if given else "give --size"
         raise InputError(f"{path.cameras or scene}: {problem}, so they make no video: {hint}")
@@ -93,7 +95,7 @@ def render_scene(
             """The frames of the video, each also saved as a picture, where these are wanted."""
             for index, camera in enumerate(cameras):
                 with torch.no_grad():
-                    views = [renderer.render([gaussians], eye) for eye in maker.eyes(camera)]
+                    views = [renderer.render([gaussians], maker.sized(eye)) for eye in maker.eyes(camera)]
                     frame = maker.frame(views)
                 holes.append(max(hole_area_ratio(view.alpha) for view in views))
                 if names:
@@ -121,11 +123,11 @@ def render_scene(
 
 
 def _photo_camera(file: SceneFile, size: tuple[int, int] | None, focal_px: float | None) -> Camera:
-    """The stored camera, changed as the options say; else a lens of 30 mm."""
+    """The stored camera; another lens where one is given, and one of 30 mm where none is stored."""
     stored = file.camera
-    width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
     if stored is not None and focal_px is None:
-        return cover(stored, width, height)
+        return stored
+    width, height = size or ((stored.width, stored.height) if stored else DEFAULT_SIZE)
     focal, _ = focal_length(file.path, width, height, {}, focal_px=focal_px, focal_mm=None, fov=None)
     return Camera.from_focal(focal, width, height)
 

@@ -80,6 +80,7 @@ class ClipCompleter:
     fill: bool = True  # fill holes
     network: ResidualNet | None = None
     precision: Precision = "auto"
+    overscan: float = 0.0  # by which share the lens is longer than the photo's
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # spent on each stage
     _past: _Past | None = None
     _count: int = 0
@@ -95,6 +96,7 @@ class ClipCompleter:
         even = prediction.camera.even()
         disparity = prediction.disparity if self.disparity is None else self.disparity
         camera = view_at(self.trajectory, even, disparity, now.depths, self._count, self.frames)
+        camera = camera.zoomed(1 + self.overscan)
         with timed("complete", self.seconds):
             before, aux = self.renderer.render(base, camera), Gaussians.empty()
             alone = before

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+from spackle.camera_path import OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats.scene_files import smallest_three
@@ -73,10 +73,11 @@ def page_scene(
         file = f"{layer}.splats"
         files[file], low, step = encode_layer(gaussians)
         layers.append({"name": layer, "file": file, "count": len(gaussians), "scaleLow": low, "scaleStep": step})
+    drawn = camera if disparity is None else camera.zoomed(1 + OVERSCAN)
     description: dict[str, object] = {
         "name": name,
         "note": note,
-        "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height},
+        "camera": {"K": drawn.K.tolist(), "width": camera.width, "height": camera.height},
         "focus": depths.focus,
         "zNear": depths.near,
         "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": BEYOND * free},

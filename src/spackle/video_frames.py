@@ -1,0 +1,325 @@
+"""The frames of a video: their size and format, one eye or two, in colours or as depth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, cast, get_args
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.nn.functional import interpolate
+
+from spackle.camera import Camera
+from spackle.camera_path import DepthRange
+from spackle.color import DepthColors, linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError
+from spackle.formats.video import FORMATS, check_video
+from spackle.gaussians import Gaussians
+from spackle.render.protocol import Rendering
+
+VideoFormat = Literal["mp4", "webm", "gif", "webp"]
+Show = Literal["color", "depth"]
+StereoLayout = Literal["sbs", "sbs-half", "ou", "ou-half", "anaglyph"]
+LAYOUTS: tuple[StereoLayout, ...] = get_args(StereoLayout)
+PARALLAX = 0.03  # of the picture's width, between the nearest thing and infinity: comfortable on a desk or a wall
+Fit = Literal["pad", "blur", "crop"]
+PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}  # of --size
+ALIKE = 0.01  # an aspect ratio that differs by less is cropped to, without stripes
+BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # pixels that a margin's picture is blurred to, and how bright it is
+MAX_VIDEO_SIDE = 8192
+MAX_IPD = 1e6
+DEFAULT_FPS = 30
+COVERED = 0.5  # less opaque pixels have no depth that a person would call one
+
+# E. Dubois, "A projection method to generate anaglyph stereo images", ICASSP 2001: least squares over the spectra
+# of a display and of red-cyan glasses, in linear light. Rows: what R, G and B take of the eye's R, G and B.
+DUBOIS_LEFT = ((0.456, 0.500, 0.176), (-0.040, -0.038, -0.016), (-0.015, -0.021, -0.005))
+DUBOIS_RIGHT = ((-0.043, -0.088, -0.002), (0.378, 0.734, -0.018), (-0.072, -0.113, 1.226))
+
+
+@dataclasses.dataclass(frozen=True)
+class Stereo:
+    """How a view is seen by two eyes."""
+
+    layout: StereoLayout
+    ipd: float  # between the eyes, in the scene's unit (metres where the base is metric)
+    convergence: float  # depth without parallax, where the screen is; inf: parallel axes
+
+    def __post_init__(self) -> None:
+        if self.layout not in LAYOUTS:
+            raise ValueError(f"unknown stereo layout {self.layout!r}: choose one of {', '.join(LAYOUTS)}")
+        if not (0 < self.ipd < math.inf and self.convergence > 0):
+            raise ValueError(f"no stereo with eyes {self.ipd:g} apart and a screen at {self.convergence:g}")
+
+    def eyes(self, camera: Camera) -> tuple[Camera, Camera]:
+        """The left and the right eye of a view: moved along its x axis, never turned.
+
+        Parallel cameras whose principal points are shifted show what is `convergence` deep at the same place.
+        Turning them inwards instead would squeeze each picture into a trapezium, and shift its rows.
+        """
+        return _moved(camera, -self.ipd / 2, self.convergence), _moved(camera, self.ipd / 2, self.convergence)
+
+    def pack(self, left: Tensor, right: Tensor) -> Tensor:
+        """Two pictures [H, W, 3], sRGB, as one frame.
+
+        sbs [H, 2W, 3] has the left eye on the left, ou [2H, W, 3] has it on top; their half variants squeeze the
+        frame to [H, W, 3] (an odd side grows by one); anaglyph is for glasses that are red on the left.
+        """
+        if self.layout == "anaglyph":
+            return anaglyph(left, right)
+        side, half = self.layout.startswith("sbs"), self.layout.endswith("half")
+        pictures = [_halved(picture, side) if half else picture for picture in (left, right)]
+        return torch.cat(pictures, dim=1 if side else 0)
+
+    def frame_size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of a frame of views of this size."""
+        if self.layout in ("sbs", "sbs-half"):
+            return 2 * (width if self.layout == "sbs" else (width + 1) // 2), height
+        if self.layout in ("ou", "ou-half"):
+            return width, 2 * (height if self.layout == "ou" else (height + 1) // 2)
+        return width, height
+
+
+def default_ipd(camera: Camera, depth_range: DepthRange) -> float:
+    """Eyes so far apart that the scene's whole depth takes 3 % of the picture's width as parallax.
+
+    parallax = fx · ipd · (1/near − 1/∞), so ipd = 0.03 · (W/fx) · z_near: no unit is needed, and things at arm's
+    length are not torn apart. For a 30 mm lens and z_near = 1.8 m this is the human 65 mm.
+    """
+    return PARALLAX * camera.width / camera.focal[0] * depth_range.near
+
+
+def anaglyph(left: Tensor, right: Tensor) -> Tensor:
+    """Red-cyan [..., 3] of two sRGB pictures [..., 3], mixed in linear light by Dubois' matrices."""
+    one, other = srgb_to_linear(left), srgb_to_linear(right)
+    mixed = one @ one.new_tensor(DUBOIS_LEFT).T + other @ other.new_tensor(DUBOIS_RIGHT).T
+    return linear_to_srgb(mixed)
+
+
+def _moved(camera: Camera, right: float, convergence: float) -> Camera:
+    K, matrix = camera.K.clone(), camera.world_to_camera.clone()
+    matrix[0, 3] -= right
+    K[0, 2] += K[0, 0] * (right / convergence)
+    return dataclasses.replace(camera, K=K, world_to_camera=matrix)
+
+
+def _halved(picture: Tensor, side: bool) -> Tensor:
+    """Half the width or the height; pixels are averaged in linear light."""
+    height, width = picture.shape[:2]
+    size = (height, (width + 1) // 2) if side else ((height + 1) // 2, width)
+    light = srgb_to_linear(picture).permute(2, 0, 1)[None]
+    return linear_to_srgb(functional.adaptive_avg_pool2d(light, size))[0].permute(1, 2, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class VideoOptions:
+    """The choices that every video has."""
+
+    format: VideoFormat | None = None  # mp4 where None
+    fps: float | None = None  # 30 where None; a clip keeps its own, and takes none
+    loop: int | None = None  # the format's where None: gif and webp for ever, the others once
+    size: tuple[int, int] | None = None  # width and height of one eye's picture; the photo's where None
+    fit: Fit = "pad"  # a view of another aspect ratio: with black or blurred margins, or cut off
+    show: Show = "color"
+    stereo: StereoLayout | None = None
+    ipd: float | None = None  # as `default_ipd` has it where None
+    convergence: float | None = None  # the focus depth where None
+
+    @property
+    def suffix(self) -> str:
+        """What the file's name ends with."""
+        return f".{self.format or 'mp4'}"
+
+    @property
+    def rate(self) -> float:
+        """Frames a second."""
+        return DEFAULT_FPS if self.fps is None else self.fps
+
+    @property
+    def plays(self) -> int:
+        """How often the video is shown; 0: for ever."""
+        return FORMATS[self.suffix].loop if self.loop is None else self.loop
+
+    def check(self) -> None:
+        """InputError for a choice that no video can have."""
+        self._blame(f"--fps {self.rate:g}", None)
+        self._blame(f"--loop {self.loop}", self.loop)
+        for option, value in {"--ipd": self.ipd, "--convergence": self.convergence}.items():
+            if value is None:
+                continue
+            if self.stereo is None:
+                raise InputError(f"{option} {value:g}: is for two eyes: add --stereo, or leave it out")
+            if not value > 0 or (option == "--ipd" and value > MAX_IPD):
+                raise InputError(f"{option} must be a positive number, got {value:g}")
+        if self.show == "depth" and self.stereo == "anaglyph":
+            raise InputError(
+                "--show depth: an anaglyph mixes the colours that stand for depth: give --stereo sbs or ou"
+            )
+
+    def _blame(self, option: str, loop: int | None) -> None:
+        """InputError that names an option for what the format refuses."""
+        try:
+            check_video(name := f"video{self.suffix}", self.rate, loop)
+        except InputError as error:
+            raise InputError(f"{option}: {str(error).removeprefix(f'{name}: ')}") from error
+
+    def for_file(self, file: Path) -> VideoOptions:
+        """The options with the format that a file's name stands for; InputError where --format says something else."""
+        suffix = file.suffix.lower()
+        meant = "mp4" if suffix in (".m4v", ".mov") else cast(VideoFormat, suffix[1:])
+        if self.format not in (None, meant):
+            raise InputError(f"--format {self.format}: {file} is a name for {meant}: leave one of them out")
+        return dataclasses.replace(self, format=meant)
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameMaker:
+    """Draws a frame of a video: one picture or two, in colours or as depth."""
+
+    options: VideoOptions
+    stereo: Stereo | None = None
+    depth: DepthColors | None = None
+
+    @staticmethod
+    def of(options: VideoOptions, gaussians: Gaussians, cameras: Sequence[Camera], source: Path) -> FrameMaker:
+        """For a scene along a path; measures on it what was not chosen; InputError (naming `source`) if it cannot."""
+        try:
+            stereo = _stereo(options, gaussians, cameras[0])
+            depth = DepthColors.over(gaussians, cameras) if options.show == "depth" else None
+        except ValueError as error:
+            raise InputError(f"{source}: no such video: {error}") from error
+        maker = FrameMaker(options, stereo, depth)
+        width, height = maker.frame_size(maker.sized(cameras[0]))
+        if max(width, height) > MAX_VIDEO_SIDE:
+            hint = "give a smaller --size" if stereo is None else "give a smaller --size, or --stereo sbs-half"
+            raise InputError(
+                f"{source}: frames of {width}×{height} have more than {MAX_VIDEO_SIDE} pixels a side: {hint}"
+            )
+        return maker
+
+    @property
+    def plain(self) -> bool:
+        """Whether a frame is what one view shows, at its own size."""
+        return self.stereo is None and self.depth is None and self.options.size is None
+
+    @property
+    def canvas(self) -> tuple[int, int] | None:
+        """Width and height of one eye's picture, both even, where they are chosen."""
+        size = self.options.size
+        return size and (size[0] + size[0] % 2, size[1] + size[1] % 2)
+
+    def eyes(self, camera: Camera) -> tuple[Camera, ...]:
+        """The view itself, or what the left and the right eye see."""
+        return (camera,) if self.stereo is None else self.stereo.eyes(camera)
+
+    def frame(self, views: Sequence[Rendering]) -> Tensor:
+        """One frame [H, W, 3], sRGB, of the renderings of `eyes`."""
+        pictures = [v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views]
+        if self.canvas is not None:
+            pictures = [with_margins(picture, *self.canvas, self.options.fit == "blur") for picture in pictures]
+        return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
+
+    def sized(self, camera: Camera) -> Camera:
+        """A view at the size at which it is drawn: the video's, or without the margins."""
+        if self.canvas is None:
+            return camera
+        width, height = self.canvas
+        across, down = width / camera.width, height / camera.height
+        if self.options.fit == "crop" or abs(across / down - 1) < ALIKE:
+            return cover(camera, width, height)
+        scale = min(across, down)
+        return camera.resized(*(max(1, round(scale * side)) for side in (camera.width, camera.height)))
+
+    def frame_size(self, camera: Camera) -> tuple[int, int]:
+        """Width and height of a frame of a view of this size; the file's, too, where these are even."""
+        size = self.canvas or (camera.width, camera.height)
+        return size if self.stereo is None else self.stereo.frame_size(*size)
+
+    def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
+        """What a report says of the video: its file, for there may be others from earlier runs, and what it shows."""
+        width, height = self.frame_size(self.sized(camera))
+        stereo: dict[str, object] | None = None
+        if self.stereo is not None:
+            convergence = self.stereo.convergence if math.isfinite(self.stereo.convergence) else None  # as JSON can
+            stereo = {"layout": self.stereo.layout, "ipd": self.stereo.ipd, "convergence": convergence}
+        return {
+            "file": name,
+            "frames": frames,
+            "fps": self.options.rate,
+            "plays": self.options.plays,  # 0: for ever
+            "width": width,
+            "height": height,
+            "show": self.options.show,
+            "stereo": stereo,
+        }
+
+
+def _stereo(options: VideoOptions, gaussians: Gaussians, camera: Camera) -> Stereo | None:
+    """The eyes that were chosen, or that suit the scene."""
+    if options.stereo is None:
+        return None
+    ipd, convergence = options.ipd, options.convergence
+    if ipd is None or convergence is None:
+        depths = DepthRange.of(gaussians)
+        ipd = default_ipd(camera, depths) if ipd is None else ipd
+        convergence = depths.focus if convergence is None else convergence
+    if camera.focal[0] * ipd / convergence > camera.width:
+        raise ValueError(
+            f"eyes {ipd:g} apart and a screen at {convergence:g}: give a smaller --ipd or a larger --convergence"
+        )
+    return Stereo(options.stereo, ipd, convergence)
+
+
+def cover(camera: Camera, width: int, height: int) -> Camera:
+    """The view on another grid with nothing squeezed: another aspect ratio cuts off two sides."""
+    scale = max(width / camera.width, height / camera.height)
+    K = camera.zoomed(scale).K
+    center = torch.tensor([camera.width / 2, camera.height / 2])
+    K[:2, 2] = torch.tensor([width / 2, height / 2]) + scale * (camera.K[:2, 2] - center)
+    return dataclasses.replace(camera, K=K, width=width, height=height)
+
+
+def with_margins(picture: Tensor, width: int, height: int, blurred: bool) -> Tensor:
+    """A picture [h, w, 3] in the middle of another [height, width, 3], whose margins are black or a blur of it."""
+    h, w = picture.shape[:2]
+    if (w, h) == (width, height):
+        return picture
+    canvas = picture.new_zeros(height, width, 3)
+    if blurred:
+        scale = max(width / w, height / h)
+        rows, columns = (min(side, max(1, round(n / scale))) for side, n in ((h, height), (w, width)))
+        top, left = (h - rows) // 2, (w - columns) // 2
+        seen = picture[top : top + rows, left : left + columns].permute(2, 0, 1)[None]
+        small = [max(1, round(BLURRED_PX * side / max(rows, columns))) for side in (rows, columns)]
+        coarse = interpolate(interpolate(seen, size=small, mode="area"), size=(height, width), mode="bicubic")
+        canvas = BLURRED_LIGHT * coarse[0].clamp(0, 1).permute(1, 2, 0)
+    top, left = (height - h) // 2, (width - w) // 2
+    canvas[top : top + h, left : left + w] = picture
+    return canvas
+
+
+def video_problem(cameras: Sequence[Camera]) -> str | None:
+    """Why these views cannot be the frames of a video, or None."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(sizes) > 1:
+        return "the frames differ in size"
+    if max(max(size) for size in sizes) > MAX_VIDEO_SIDE:
+        return f"the frames have more than {MAX_VIDEO_SIDE} pixels a side"
+    return None
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """WxH, or one of `PRESETS`, to (width, height); InputError for anything else."""
+    if text in PRESETS:
+        return PRESETS[text]
+    match = re.fullmatch(r"([0-9]{1,5})[xX×]([0-9]{1,5})", text)
+    width, height = (int(side) for side in match.groups()) if match else (0, 0)
+    if not (1 <= width <= MAX_VIDEO_SIDE and 1 <= height <= MAX_VIDEO_SIDE):
+        some = ", ".join(["1280x720", *PRESETS])
+        raise InputError(f"--size {text}: give width and height up to {MAX_VIDEO_SIDE}, such as {some}")
+    return width, height
