@@ -81,9 +81,13 @@ def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     assert len(list(frames)) == 2
     view = scene.path(frames=3)[1]
     assert psnr(renderer.render(loaded, view).rgb, scene.render(view).rgb) > 50
-    photo = write_photo(tmp_path / "wide.png", 3072, 12)
-    made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(3072, 12)), kind="swipe", network=None)
-    assert (made.camera.width, made.camera.height) == (1536, 6)  # the working size of a large photo
+    photo = write_photo(tmp_path / "wide.png", 1600, 200)
+    made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(1600, 200)), kind="swipe", fill="none")
+    assert (made.camera.width, made.camera.height) == (1536, 192)  # the working size of a large photo
+    for width, height in ((1, 1), (31, 64), (290, 36), (40, 321)):
+        photo = write_photo(tmp_path / "odd.png", width, height)
+        with pytest.raises(spackle.InputError, match=rf"odd\.png: {width}×{height} is too small or too narrow: give"):
+            spackle.predict(photo)
 
 
 def test_a_scene_is_loaded_exported_and_shown(scene: spackle.Scene, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ T = TypeVar("T")
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".tif", ".tiff")  # looked for in folders
 MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as float32
 SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels in a byte
+LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels, and long side over short side: there is no scene in less, or in a stripe
 MAX_SIDE = 1536  # long side of the working size
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -61,6 +62,14 @@ class Photo:
     @property
     def width(self) -> int:
         return int(self.rgb.shape[1])
+
+    def check_shape(self) -> None:
+        """InputError for a photo that is too small, or too narrow, to show a scene."""
+        short, long = sorted((self.width, self.height))
+        if short < LEAST_SIDE or long > MOST_ASPECT * short:
+            wanted = f"at least {LEAST_SIDE} pixels a side, and at most {MOST_ASPECT} times as long as wide"
+            size = f"{self.width}×{self.height}"
+            raise InputError(f"{self.path}: {size} is too small or too narrow: give a photo with {wanted}")
 
     @property
     def framed_size(self) -> tuple[int, int]:

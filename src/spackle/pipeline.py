@@ -150,6 +150,7 @@ class Pipeline:
 
     def predict(self, photo: Photo, reporter: Reporter) -> tuple[BasePrediction, ResolvedBase]:
         """The photo's Gaussians, and the base that made them; says which one, the focal length and the move."""
+        photo.check_shape()
         name = photo.path.name
         if photo.frame is not None:
             reporter.log(f"{name}: {photo.frame.note}; --keep-frame keeps it")

@@ -120,7 +120,7 @@ def test_every_command_has_a_help() -> None:
 
 def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
-    write_photo(photos / "photo.png", 32, 24)
+    write_photo(photos / "photo.png", 48, 36)
     write_depth(photos / "photo.npy", metres(32, 24))
     (photos / "torn.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     options = ("--depth", photos, "-o", tmp_path / "out", "--frames", 2, "--residual", "seeds", "--json")

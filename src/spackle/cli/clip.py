@@ -94,6 +94,7 @@ def predict_clip(
             for index in range(len(clip)):
                 with timed("decode", completer.seconds):
                     photo = Photo(next(pictures), *focal, path / NAME.format(index))
+                photo.check_shape()
                 with timed("base", completer.seconds):
                     prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:
