@@ -266,12 +266,10 @@ def test_a_few_bad_pixels_are_filled_and_counted(maps: list[DepthMap]) -> None:
     assert 2 * 0.9 < float(prediction.gaussians.means[:, 2].min()) < float(prediction.gaussians.means[:, 2].max()) < 5.5
 
 
-def test_a_field_of_view_that_no_lens_has_is_refused() -> None:
-    for fov in (0.0, 179.999, math.nan):
-        base = saying(SLOPE, "canonical disparity", fov)
-        with pytest.raises(InputError, match="which no lens has: give the focal length with --focal-mm"):
-            base.predict(photo_of(source="default 30 mm"))
-        assert base.predict(photo_of()).camera.focal[0] == 80  # the lens is known
+def test_a_field_of_view_that_no_lens_has_does_not_count() -> None:
+    for fov in (0.0, 174.0, 179.999, math.nan):
+        found = saying(SLOPE, "canonical disparity", fov).predict(photo_of(source="default 30 mm"))
+        assert (found.camera.focal[0], found.lens_source) == (80, "")
 
 
 def test_a_photo_that_a_model_cannot_work_on_is_one_line(folders: Folders, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,10 +407,8 @@ def test_folders_are_told_from_names_of_the_hub(
         shutil.copytree(folders["metric"], tmp_path / name)
     for name in ("plain", "owner/name", "./plain", "~/plain", str(tmp_path / "plain")):
         assert HfBase.load(name, device="cpu").name == f"hf:{name}"
-    for name in ("./absent", "../absent", "~/absent", str(tmp_path / "absent")):
-        with pytest.raises(InputError, match=f"^hf:{name}: no such folder: check the name$"):
-            HfBase.load(name)
-    for name in ("absent", "a/b/c", "", "a//b", "a b/c", "other/", "https://huggingface.co/a/b"):
+    names = f"./absent ~/absent {tmp_path}/absent absent a/b/c a//b other/ https://huggingface.co/a/b".split()
+    for name in [*names, "", "a b/c"]:
         with pytest.raises(InputError, match="neither a folder nor a model of the hub: give a folder, or owner/name"):
             HfBase.load(name)
 

@@ -26,7 +26,6 @@ from spackle.device import Precision, enough_memory, own_arithmetic, pick_device
 from spackle.errors import InputError, reading, reason_in_a_line
 from spackle.image import Photo, resize_photo
 
-NOT_INSTALLED = "depth models need a package: pip install 'spackle-nvs[hf]'"
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it
 
@@ -48,7 +47,6 @@ ANTIALIAS = {"depth_pro": False, "tipsv2_dpt": True}
 # NEAREST_M: their ratio of 20 gives a clear parallax, and one step of the network's noise far away is not yet a depth
 # edge. The smallest value is not stretched to FARTHEST_M: a wall seen from the front would become a valley.
 FARTHEST_M = 30.0
-CANONICAL_LIMITS = (1e-4, 1e4)  # in 1/m: Depth Pro's own
 FLAT = 1e-5  # relative spread below which all pixels say the same
 
 
@@ -61,24 +59,17 @@ class HfBase:
         self.precision = precision
 
     @staticmethod
-    def load(
-        model: str, *, device: str | None = None, precision: Precision = "auto", name: str | None = None
-    ) -> HfBase:
+    def load(model: str, *, device: str | None = None, precision: Precision = "auto", name: str = "") -> HfBase:
         """Read a model in a folder, or owner/name of the hub, whose cache is asked first; nothing in it is executed.
 
         The products of matrices are bf16 at the precision auto where the hardware multiplies it natively. The base's
-        name is hf:MODEL where none is given.
-
-        Raises:
-            InputError: a device, package, model or file that is missing, broken or unknown, or too little memory.
-            ValueError: an unknown precision.
+        name is hf:MODEL where none is given. InputError for a device, package, model or file that is missing, broken or
+        unknown, and for too little memory; ValueError for an unknown precision.
         """
         target = pick_device(device)
         dtype, name = pick_dtype(precision, target), name or f"hf:{model}"
         source = os.path.expanduser(model)
         is_folder = os.path.isdir(source)
-        if not is_folder and model.startswith(("./", "../", "/", "~")):
-            raise InputError(f"hf:{model}: no such folder: check the name")
         if not is_folder and not _HUB_NAME.fullmatch(model):
             raise InputError(f"hf:{model}: neither a folder nor a model of the hub: give a folder, or owner/name")
         transformers = _transformers()
@@ -105,13 +96,10 @@ class HfBase:
         with reading(photo.path, problem), enough_memory("give a smaller model"):
             raw, fov = self._ask(photo.rgb)
         camera, lens_source = photo.camera, ""
-        if fov is not None and photo.focal_source.startswith("default"):
-            focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2) if 0 < fov < 180 else math.nan
-            if not believed_lens(focal, photo.width, photo.height):
-                seen = f"{self.name} sees a field of view of {fov:g}°, which no lens has"
-                raise InputError(f"{photo.path}: {seen}: give the focal length with --focal-mm")
-            camera = Camera.from_focal(focal, photo.width, photo.height)
-            lens_source = "Depth Pro"  # the only kind that gives a lens
+        if fov is not None and 0 < fov < 180 and photo.focal_source.startswith("default"):
+            focal = 0.5 * photo.width / math.tan(math.radians(fov) / 2)
+            if believed_lens(focal, photo.width, photo.height):  # by Depth Pro, the only kind that gives one
+                camera, lens_source = Camera.from_focal(focal, photo.width, photo.height), "Depth Pro"
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
         if progress:
             progress(1, 2)
@@ -174,7 +162,7 @@ def to_depth_map(raw: Tensor, meaning: Meaning, focal: float, name: str, photo: 
         share = (raw / (near if near > 0 else high)).clamp(0, 1)
         depth = 1 / ((1 - share) / FARTHEST_M + share / NEAREST_M)
     else:
-        depth = 1 / (raw / focal).clamp(*CANONICAL_LIMITS)
+        depth = 1 / (raw / focal).clamp(1e-4, 1e4)  # in 1/m: Depth Pro's own limits
     valid = known & (depth > 0) & torch.isfinite(1 / depth)
     return DepthMap(depth.where(valid, 0.0), valid, None, None, "depth" if meaning == "metres" else "disparity", photo)
 
@@ -186,7 +174,7 @@ def _transformers() -> Any:
         import transformers.utils.logging as logs
     except Exception as error:  # a torchvision of another build raises RuntimeError
         if isinstance(error, ModuleNotFoundError) and error.name in ("transformers", "huggingface_hub"):
-            raise InputError(NOT_INSTALLED) from error
+            raise InputError("depth models need a package: pip install 'spackle-nvs[hf]'") from error
         raise InputError(f"transformers cannot be imported ({reason_in_a_line(error)}): install it again") from error
     logs.set_verbosity(logs.CRITICAL)  # what matters is raised
     logs.disable_progress_bar()
@@ -215,11 +203,8 @@ def _read(transformers: Any, source: str, name: str, *, from_hub: bool) -> tuple
 
 
 def _lower_linear(network: nn.Module, dtype: torch.dtype) -> None:
-    """Let the linear layers, where a transformer spends its time, multiply in `dtype`; they take and give float32.
-
-    The last layers of all these models are convolutions and stay float32: eight bits would turn slanted surfaces into
-    stairs.
-    """
+    """Let the linear layers, where a transformer spends its time, multiply in `dtype`; they take and give float32."""
+    # The last layers are convolutions and stay float32: eight bits would turn slanted surfaces into stairs.
     for module in network.modules():
         if type(module) is nn.Linear and dtype != torch.float32:
             module.to(dtype)
