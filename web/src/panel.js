@@ -70,7 +70,7 @@ export function panel(viewer, say) {
   }
 
   function showDisparity() {
-    slider.max = Math.ceil(viewer.description.orbit.limit * 20) / 20;
+    slider.max = viewer.description.orbit.limit;
     if (document.activeElement !== slider || !viewer.onPath) slider.value = viewer.disparity;
     const shown = viewer.disparity.toFixed(2);
     slider.style.setProperty("--at", `${(100 * viewer.disparity) / slider.max}%`);

@@ -25,8 +25,7 @@ from spackle.gaussians import Gaussians
 
 SAMPLES = 121  # of a path, between which the page goes straight
 USUAL, FOREIGN = 0.3, 0.6  # disparities that a scene is good for if nobody says: a completed one, one of others
-LEAST, MOST = 0.1, 1.0
-BEYOND = 1.3  # how much farther than that the eye never goes
+LEAST, MOST = 0.01, 1.0
 BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1 of opacity
 SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
 BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
@@ -58,7 +57,7 @@ def page_scene(
         base: what the photo shows.
         aux: what completion added; may be empty.
         camera: the photo's, at the world's origin.
-        disparity: how far it was completed: up to there the eye follows the hand, and little farther.
+        disparity: how far it was completed: up to there the eye goes.
         note: what a person should know of it; the part before the semicolon stays in sight.
 
     Raises:
@@ -80,7 +79,7 @@ def page_scene(
         "camera": {"K": drawn.K.tolist(), "width": camera.width, "height": camera.height},
         "focus": depths.focus,
         "zNear": depths.near,
-        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": BEYOND * free},
+        "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": free},
         "paths": {kind: _path(kind, camera, depths) for kind in TRAJECTORIES},
         "layers": layers,
     }
