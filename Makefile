@@ -8,7 +8,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
 # Numba keeps compiled kernels here between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
 
-.PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench viewer clean clean-cache
+.PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench reproduce viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	@echo "Installing Spackle and what it needs into $(VENV), once: some minutes, and about 400 MB of downloads."
@@ -57,6 +57,11 @@ check: lint types test
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/suite.py --only renderer,video -o bench-suite
 
+# The paper's whole experiment in miniature: tables, figures and a report.
+reproduce: $(VENV)/.installed
+	rm -rf reproduction
+	$(BIN)/python benchmarks/reproduce.py -o reproduction
+
 # The documentation as a site: build/site/index.html.
 docs: pyproject.toml
 	test -x build/docs/bin/mkdocs || { $(PYTHON) -m venv build/docs && \
@@ -72,4 +77,4 @@ clean-cache:
 	find src -name '*.nb[ci]' -delete
 
 clean:
-	rm -rf $(VENV) .numba_cache demo-output build dist
+	rm -rf $(VENV) .numba_cache demo-output reproduction build dist

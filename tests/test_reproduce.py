@@ -1,0 +1,57 @@
+"""`make reproduce`: the paper's chain in miniature gives every table and figure, and gives them in time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from spackle.evaluation.datasets import DATASETS
+from spackle.evaluation.folder import load_run
+from spackle.residual.architectures import load_residual
+
+ROOT = Path(__file__).parents[1]
+TABLES = (  # the paper's labels
+    "large_view_nr_iqa",
+    "controlled_disocclusion",
+    "efficiency_gaussian_overhead",
+    "near_view",
+    "mask_guided_init",
+    "expanded_efficiency_gaussian_overhead",
+)
+
+
+@pytest.mark.slow
+def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    out, began = tmp_path / "out", time.monotonic()
+    done = subprocess.run([sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr + (out / "log.txt").read_text()[-2000:]
+    assert time.monotonic() - began < 480
+    for name in ("unet", "sharp-decoder"):
+        first, *_, last = json.loads((out / name / "run.json").read_text())["history"]
+        assert load_residual(out / name / "best.safetensors").name == name
+        assert last["loss"] < first["loss"]
+    text = (out / "tables" / "tables.md").read_text()
+    tables = {label: text.partition(f"`tab:{label}`")[2].partition("\n**")[0] for label in TABLES}
+    for dataset in DATASETS.values():
+        titles = [label for label, table in tables.items() if dataset.title in table]
+        assert titles == list(TABLES), dataset.title
+    for name in DATASETS:
+        run = load_run(out / "runs" / f"{name}-large")
+        size = {row.metric: float(row.value) for row in run.rows if row.metric in ("width", "height")}
+        har, before, aux = (
+            sum(float(row.value) for row in run.rows if (row.method, row.metric) == ("paper", metric))
+            for metric in ("har", "har_before", "aux")
+        )
+        assert har < 0.1 * before
+        assert aux / (before * size["width"] / 2 * size["height"] / 2) == pytest.approx(1, abs=0.05)
+    for name in ("comparison", "direct_ft"):
+        assert (out / "figures" / f"{name}.pdf").stat().st_size > 10_000
+        with Image.open(out / "figures" / f"{name}.png") as figure:
+            assert min(figure.size) > 500
