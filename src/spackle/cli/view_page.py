@@ -121,7 +121,7 @@ class Uploads:
         """InputError: an option that cannot be used."""
         self.first, self.keep_frame, self.reporter = base, keep_frame, reporter
         name = AUTO if base.name == "rgbd" else base.name
-        self._base = dataclasses.replace(base, name=name, depth=None, calib=None)
+        self._base = dataclasses.replace(base, name=name, depth=None, calib=None, depth_kind="auto")
         self._base.check()
         self._path = PathOptions(disparity=disparity)
         self._path.check()
@@ -151,7 +151,8 @@ class Uploads:
         teller = Teller(self.reporter, tell, path, name)
         settings = self._base
         if depth is not None:
-            settings = dataclasses.replace(settings, name=AUTO, depth=depth, checkpoint=None)
+            kind = self.first.depth_kind
+            settings = dataclasses.replace(settings, name=AUTO, depth=depth, depth_kind=kind, checkpoint=None)
         elif base not in ("", settings.name):
             check_name("base", base, self.bases)
             settings = dataclasses.replace(settings, name=base, checkpoint=None)
