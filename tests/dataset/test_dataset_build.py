@@ -257,6 +257,16 @@ def test_training_takes_each_view_once_and_judges_by_other_photos(whole: Path, c
     assert one == same != other
 
 
+def test_the_papers_recipe_learns_from_a_dataset(whole: Path, tmp_path: Path) -> None:
+    options = f"data.pseudo={whole} data.cells=16 data.validation_views=8 loss.features=none optim.batch=2"
+    done = run("train", "--recipe", "paper", "-o", tmp_path / "out", *options.split(), "optim.steps=3")
+    assert done.code == 0, done.err
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (report["ended"], report["step"], report["recipe"]["network"]) == ("steps", 3, "sharp-decoder")
+    assert 0 < report["samples"]["train"] <= 9
+    assert report["hole_psnr"]["untrained"] + 3 < report["hole_psnr"]["colours of the targets"]
+
+
 @pytest.mark.parametrize("name", ["none", "geometry"])
 def test_targets_that_the_untrained_network_draws_are_refused(copy: Path, tmp_path: Path, name: str) -> None:
     manifest = load_manifest(copy)

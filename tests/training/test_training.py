@@ -9,12 +9,13 @@ import shutil
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import gsplat_stand_in
 import numpy as np
 import pytest
 import torch
-from command import Run, names_in, run
+from command import Run, names_in, refuses, run
 from holes import random_network
 from photos import picture
 from PIL import Image
@@ -258,6 +259,12 @@ def test_what_cannot_be_trained_is_said_in_a_line(place: Path, tmp_path: Path, o
     done = train(place, tmp_path / "out", *filled, f"data.cache={tmp_path}/cache")
     assert (done.code, said in done.lines[-1]) == (2, True), done.err
     assert not (tmp_path / "out" / "checkpoint.pt").exists()
+
+
+def test_a_disk_that_is_too_full_is_a_line(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=100_000))
+    done = train(place, tmp_path / "out", f"data.cache={tmp_path}/cache")
+    refuses(done, f"{tmp_path}/cache: the samples may take 831.5 kB, and 100.0 kB are free: give data.cache=FOLDER")
 
 
 def test_a_gradient_that_is_no_number_keeps_what_made_it(place: Path, whole: Path, tmp_path: Path) -> None:
