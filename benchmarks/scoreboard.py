@@ -117,10 +117,7 @@ def one_surface(own: Any) -> Any:
 
 # What is switched off while a photo is lifted, and while it is completed: names in the package, and what replaces them.
 LIFT: dict[str, dict[str, Replace]] = {
-    "smooth_noise": {"smooth_noise": first},
-    "sky": {"push_sky": lambda own: lambda inverse_depth, rgb, known: (inverse_depth, known, 0.0)},
-    "undo_quantisation": {"undo_quantisation": first},
-    "attach_flying": {"attach_flying_pixels": first},
+    "smoothed": {"smoothed": first},
     "edges": {"find_edges": no_edges},
     "two layers": {"find_layers": one_surface},
     "colour fit": {"splats._fitted": first},

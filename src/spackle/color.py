@@ -29,16 +29,6 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, linear * 12.92, power)
 
 
-BLUE, DARKEST_BLUE = 1.1, 0.25  # blue over red, and the least blue
-
-
-def bright_or_blue(rgb: Tensor, bright: float) -> Tensor:
-    """[...] bool: which colours [..., 3], sRGB, a sky may have: all channels above `bright`, or blue the strongest."""
-    red, green, blue = rgb.unbind(-1)
-    is_blue = (blue >= BLUE * red) & (blue >= green) & (blue > DARKEST_BLUE)
-    return (rgb.amin(-1) > bright) | is_blue
-
-
 MEASURED, LOOKS = 50_000, 60  # Gaussians and views that are looked at for the scale: torch's quantile stops at 16 M
 FARTHEST, NEAREST = 0.002, 0.998  # quantiles of inverse depth at the ends of the scale
 UNKNOWN_GREY = 0.5  # grey, which the map does not hold

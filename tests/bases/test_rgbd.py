@@ -5,21 +5,18 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from plain_cleanup import cheapest
 from scenes import Scene, box_before_wall, box_mask, cast, motorcycle, motorcycle_base, psnr, slanted_plane, wall
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from spackle.bases.depth_map import DepthMap
-from spackle.bases.lift import COLOR_COST, MEDIAN, NEAR_COST, RgbdBase, fill_missing, lift
+from spackle.bases.lift import RgbdBase, lift
 from spackle.bases.quadtree import LEVELS
 from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes, trajectory
 from spackle.color import srgb_to_linear
-from spackle.filters import far_fill
 from spackle.image import Photo
 from spackle.photo_frame import PhotoFrame
 from spackle.render import CpuRenderer
@@ -101,32 +98,6 @@ def test_missing_depth_is_filled_from_behind_and_reported() -> None:
     assert torch.equal(z[elsewhere], scene.lift(levels=0).gaussians.means[: 72 * 96, 2].reshape(72, 96)[elsewhere])
     assert float(z[strip].min()) > 5.99  # the wall's depth is 6, the box's 2
     assert wall().lift().notes["depth_filled"] == 0
-
-
-def plain_missing(inverse: Tensor, rgb: Tensor, valid: Tensor) -> Tensor:
-    """`fill_missing` by Dijkstra's algorithm and a median of windows."""
-    far, _ = far_fill(inverse, inverse[None], valid)
-
-    def step(p: tuple[int, int], q: tuple[int, int]) -> float:
-        near = max(0.0, 1 - float(far[q] / inverse[p])) if valid[p] else 0.0
-        return COLOR_COST * float((rgb[p] - rgb[q]).abs().sum()) + NEAR_COST * near
-
-    origin = cheapest(valid.numpy(), ~valid.numpy(), step)
-    height, width = inverse.shape
-    spread = np.array([[float(inverse[origin[y, x]]) for x in range(width)] for y in range(height)], np.float32)
-    wide = np.pad(spread, MEDIAN // 2, mode="edge")
-    median = [[np.median(wide[y : y + MEDIAN, x : x + MEDIAN]) for x in range(width)] for y in range(height)]
-    return torch.where(valid, inverse, torch.tensor(np.array(median)))
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_filling_of_missing_depth_matches_dijkstra(seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    inverse = 0.1 + torch.rand(9 + seed, 11, generator=generator)
-    rgb = 0.3 * torch.rand(9 + seed, 11, 3, generator=generator)
-    valid = torch.rand(9 + seed, 11, generator=generator) < 0.25
-    found = fill_missing(torch.where(valid, inverse, 0.0), rgb, valid)
-    torch.testing.assert_close(found, plain_missing(inverse, rgb, valid))
 
 
 def test_the_lens_is_the_calibrations_else_the_photos() -> None:

@@ -1,4 +1,4 @@
-"""Gaussians in a surface, the slope of a depth image, and the cleaning of depth maps."""
+"""Gaussians in a surface, and the slope of a depth image."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import slanted_plane
 from torch import Tensor
 
-from spackle.bases.lift import attach_flying_pixels, undo_quantisation
 from spackle.camera import Camera
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.surface import CREASE, EDGE, RAGGED, THICKNESS, surface_gaussians, surface_slope
@@ -92,36 +90,3 @@ def test_slopes_match_a_plain_loop(image: tuple[int, int, int, float]) -> None:
     across = torch.tensor([plain_slope(row.tolist()) for row in inverse], dtype=torch.float64)
     down = torch.tensor([plain_slope(column.tolist()) for column in inverse.T], dtype=torch.float64).T
     torch.testing.assert_close(surface_slope(inverse), torch.stack([across, down], dim=-1), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize(("hanging", "side"), [(0.7, 1.0), (0.5, 0.2), (0.95, 1.0), (0.21, 0.2)])
-def test_a_flying_pixel_joins_the_nearer_side(hanging: float, side: float, turned: bool) -> None:
-    row = torch.tensor([1.0, 1.0, 1.0, hanging, 0.2, 0.2, 0.2])
-    expected = torch.where(row == hanging, side, row) if abs(hanging - side) > EDGE * hanging else row
-    image, clean = row.expand(5, 7), expected.expand(5, 7)
-    found = attach_flying_pixels(image.T.contiguous() if turned else image)
-    assert torch.equal(found, clean.T if turned else clean)
-
-
-def test_clean_edges_thin_things_borders_and_planes_do_not_fly() -> None:
-    """A pixel at the border has no neighbour on one side, so it cannot lie between two."""
-    for axis in (0, 1):  # near the horizon each row of a floor is much farther than the one below it
-        inverse = 1 / slanted_plane(1.5, 1000, axis, width=40, height=30).depth
-        torch.testing.assert_close(attach_flying_pixels(inverse), inverse, rtol=1e-5, atol=0)
-    rows = [[1.0, 1.0, 0.2, 0.2], [0.2, 0.2, 1.0, 0.2, 0.2], [1.0, 1.0, 0.2, 1.0, 1.0], [0.5] * 4, [0.5]]
-    rows += [[1.0, 0.2, 0.2, 0.2], [0.2, 1.0, 1.0, 1.0]]
-    for row in [*rows, *(row[::-1] for row in rows)]:
-        image = torch.tensor(row).expand(4, len(row))
-        assert torch.equal(attach_flying_pixels(image), image)
-        assert torch.equal(attach_flying_pixels(image.T), image.T)
-
-
-@PROPERTY
-@given(IMAGES, st.floats(0.001, 0.1))
-def test_what_was_rounded_still_rounds_to_the_same_step(image: tuple[int, int, int, float], quantum: float) -> None:
-    stored = (random_image(*image).float() / quantum).round() * quantum
-    valid = torch.rand(stored.shape, generator=torch.Generator().manual_seed(image[0])) < 0.8
-    found = undo_quantisation(stored, valid, quantum, sweeps=30)
-    assert float((found - stored).abs().max()) <= quantum / 2 * (1 + 1e-4)
-    assert torch.equal(found[~valid], stored[~valid])

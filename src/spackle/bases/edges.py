@@ -6,9 +6,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from spackle._numba import inlined_kernel, kernel
+from spackle.filters import far_fill
 from spackle.surface import EDGE
 
 STEEPEST = 5.0  # a surface at 79° to the image plane; only what is steeper may be a smeared edge
@@ -216,48 +218,43 @@ def _sample(
     return values, state, heights
 
 
-COLOR_COST = 100.0  # pixels of detour that a change from 0 to 1 in one channel is worth
+COLOR_COST = 35.0  # pixels of detour that a change from 0 to 1 in one channel is worth
 DEPTH_COST = 40.0  # and the way from one side of a smeared edge to the other
+NEAR_COST = 300.0  # and a start of a hole's filling that is far too near
 ROUNDS = 4  # sweeps down and up; a path may turn as often
 LEAN = 0.25  # how far a side's surface may be continued into an edge, relative to its inverse depth
-VOTERS = 2  # pixels to each side that are heard on where an outline runs
-SAME_COLOR = 0.1  # sum of the channels' differences at which a vote counts a quarter
-VOTES, RELAXATIONS = 2, 10
-SAME_SURFACE = EDGE / 2
 
 
-def settle(sampled: Sampled, rgb: Floats) -> tuple[Floats, Bools]:
-    """Give every open pixel the depth of the side that it is best connected to in the photo, sRGB [H, W, 3].
+def settle(sampled: Sampled, rgb: Floats) -> Floats:
+    """Give every open pixel, and then every hole, the depth of the one that it is best connected to in the photo.
 
-    A path over the image costs its length, the colour change along it and the change of the smeared depth: so a side's
-    depth, continued along its surface, spreads to the colour edge, and where there is none to the middle of what was
-    smeared. Then neighbours of a like colour outvote the few that stand alone, and steps within one surface are evened
-    out.
+    A path over the image costs its length and the change of sRGB [H, W, 3] along it, so that a depth spreads within
+    things and stops at their outlines. In a smeared edge it costs the change of the smeared depth, too, and so ends in
+    the middle where the photo shows no outline; there a side is continued along its surface. In a hole a start nearer
+    than the hole's far side costs extra, because most holes are background that a second camera could not see.
 
     Returns:
-        Inverse depth [H, W] and where it is known; settled pixels as they were.
+        Inverse depth [H, W]; settled pixels as they were.
     """
-    open_pixels = np.flatnonzero(sampled.state == OPEN)
-    known = sampled.state != HOLE
-    if not len(open_pixels):
-        return sampled.inverse_depth, known
-    cost = np.where(sampled.state == SETTLED, np.float32(0), np.float32(np.inf))
-    sources = np.arange(cost.size)
-    _spread(cost, sources, sampled.inverse_depth, sampled.step, rgb, open_pixels)
-    source, reached = sources[open_pixels], np.isfinite(cost.reshape(-1)[open_pixels])
-    known.reshape(-1)[open_pixels[~reached]] = False
-    open_pixels, source = open_pixels[reached], source[reached]
-    width = sampled.state.shape[1]
-    at_source = sampled.inverse_depth.reshape(-1)[source]
-    across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
-    lean = across * (open_pixels % width - source % width) + down * (open_pixels // width - source // width)
-    depth = sampled.inverse_depth.copy()
-    depth.reshape(-1)[open_pixels] = at_source + np.clip(lean, -LEAN * at_source, LEAN * at_source)
-    for _ in range(VOTES):
-        before = depth.copy()
-        _vote(before, known, rgb, open_pixels, depth)
-    _relax(depth, known, open_pixels)
-    return depth, known
+    depth, hole = sampled.inverse_depth.copy(), sampled.state == HOLE
+    for state in (OPEN, HOLE):
+        pixels = np.flatnonzero(sampled.state == state)
+        if not len(pixels):
+            continue
+        cost = np.where(sampled.state > state, np.float32(0), np.float32(np.inf))
+        source, far, step = np.arange(cost.size), depth, sampled.step
+        if state == HOLE:
+            far = far_fill(*(torch.from_numpy(a) for a in (depth, depth[None], ~hole)))[0].numpy()
+            step = np.full_like(step, np.inf)
+        _spread(cost, source, depth, step, far, rgb, pixels)
+        source, width = source[pixels], cost.shape[1]
+        found = depth.reshape(-1)[source]
+        if state == OPEN:
+            across, down = (slope.reshape(-1)[source] for slope in sampled.slope)
+            lean = across * (pixels % width - source % width) + down * (pixels // width - source // width)
+            found = found + np.clip(lean, -LEAN * found, LEAN * found)
+        depth.reshape(-1)[pixels] = found
+    return depth
 
 
 @inlined_kernel
@@ -268,10 +265,10 @@ def color_change(rgb: Any, y: int, x: int, v: int, u: int) -> Any:
 
 
 @kernel
-def _spread(cost: Any, source: Any, depths: Any, steps: Any, rgb: Any, pixels: Any) -> None:
-    """For each open pixel the settled one, as y·W + x, that the cheapest path leads to, and what that costs.
+def _spread(cost: Any, source: Any, depths: Any, steps: Any, far: Any, rgb: Any, pixels: Any) -> None:
+    """For each of some pixels the start, as y·W + x, that the cheapest path leads to, and what that costs.
 
-    At first settled pixels cost 0, the others infinitely much, and each is its own source.
+    At first starts cost 0, the others infinitely much, and each is its own source.
     """
     height, width = depths.shape
     for sweep in range(2 * ROUNDS):
@@ -284,69 +281,14 @@ def _spread(cost: Any, source: Any, depths: Any, steps: Any, rgb: Any, pixels: A
                 v, u = (y + way, x + k - 1) if k < 3 else (y, x + way)
                 if v < 0 or u < 0 or v >= height or u >= width or cost[v, u] == np.inf:
                     continue
-                change = color_change(rgb, y, x, v, u)
-                climb = abs(depths[y, x] - depths[v, u]) / max(steps[y, x], np.float32(1e-12))
                 length = 1.0 if v == y or u == x else 1.4142135
-                total = np.float32(cost[v, u] + length + COLOR_COST * change + DEPTH_COST * climb)
+                climb = abs(depths[y, x] - depths[v, u]) / max(steps[y, x], np.float32(1e-12))
+                total = cost[v, u] + length + COLOR_COST * color_change(rgb, y, x, v, u) + DEPTH_COST * climb
+                if cost[v, u] == 0 and steps[y, x] == np.inf:
+                    total += NEAR_COST * max(0.0, 1 - far[y, x] / depths[v, u])
                 if total < cost[y, x]:
                     cost[y, x] = total
                     source[n] = source[v * width + u]
                     changed = True
         if not changed and sweep > 0:
             break
-
-
-@kernel
-def _vote(depths: Any, known: Any, rgb: Any, pixels: Any, result: Any) -> None:
-    """Open pixels near an edge change sides where most neighbours, by colour and distance, stand on the other."""
-    height, width = depths.shape
-    for n in pixels:
-        y, x = n // width, n % width
-        top, bottom = max(y - VOTERS, 0), min(y + VOTERS + 1, height)
-        left, right = max(x - VOTERS, 0), min(x + VOTERS + 1, width)
-        low = high = depths[y, x]
-        for v in range(top, bottom):
-            for u in range(left, right):
-                if known[v, u]:
-                    low, high = min(low, depths[v, u]), max(high, depths[v, u])
-        if high - low <= EDGE * high:
-            continue
-        middle = 0.5 * (low + high)
-        balance, strongest = 0.0, 0.0
-        for v in range(top, bottom):
-            for u in range(left, right):
-                if not known[v, u]:
-                    continue
-                change = color_change(rgb, y, x, v, u) / SAME_COLOR
-                vote = 1 / (1 + change * change) ** 2
-                if (depths[v, u] > middle) == (depths[y, x] > middle):
-                    balance += vote
-                    continue
-                balance -= vote
-                vote /= (v - y) ** 2 + (u - x) ** 2
-                if vote > strongest:
-                    strongest, other = vote, depths[v, u]
-        if balance < 0:
-            result[y, x] = other
-
-
-@kernel
-def _relax(depths: Any, known: Any, pixels: Any) -> None:
-    """Move open pixels to the mean of opposite neighbours on their surface, in place; a plane stays as it is."""
-    height, width = depths.shape
-    for _ in range(RELAXATIONS):
-        for n in pixels:
-            y, x = n // width, n % width
-            here = depths[y, x]
-            total, count = np.float32(0), 0
-            for dy, dx in ((0, 1), (1, 0)):
-                if y - dy < 0 or x - dx < 0 or y + dy >= height or x + dx >= width:
-                    continue
-                if not (known[y - dy, x - dx] and known[y + dy, x + dx]):
-                    continue
-                before, after = depths[y - dy, x - dx], depths[y + dy, x + dx]
-                if max(abs(before - here), abs(after - here)) < SAME_SURFACE * here:
-                    total += before + after
-                    count += 2
-            if count:
-                depths[y, x] = total / count
