@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -34,10 +34,11 @@ def sum_of(run: Run, method: str, metric: str) -> float:
 @pytest.mark.slow
 def test_the_papers_chain_gives_its_tables_and_figures(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
-    out, began = tmp_path / "out", time.monotonic()
+    out, before = tmp_path / "out", os.times()
     done = subprocess.run([sys.executable, ROOT / "benchmarks/reproduce.py", "-o", out], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr + (out / "log.txt").read_text()[-2000:]
-    assert time.monotonic() - began < 480
+    # Eight minutes of two cores, however busy the machine is.
+    assert sum(os.times()[2:4]) - sum(before[2:4]) < 2 * 480
     for name in ("unet", "sharp-decoder", "direct-ft"):
         report = json.loads((out / name / "run.json").read_text())
         assert (report["ended"], report["processes"]) == ("steps", 2)

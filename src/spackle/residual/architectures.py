@@ -121,6 +121,9 @@ class SharpDecoder(ResidualNet):
         self.feature_model = FeatureNetwork(config)
         self.geometry = ExactConv(config.feature_width, GEOMETRY_CHANNELS, 1)
         self.texture = ExactConv(config.feature_width, TEXTURE_CHANNELS, 1)
+        for name, layer in self.feature_model.named_modules():
+            if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
+                _scale(0.0 if name.endswith(("residual.3", "residual.5")) else 1.0, layer)  # blocks are the identity
         _scale(STEM_GAIN, self.stem)
         _scale(math.sqrt(2), *self.down, *self.maps)
         _scale(0.0, self.geometry, self.texture)
@@ -157,8 +160,10 @@ def _initialise(network: UNet) -> None:
 def _scale(gain: float, *layers: Any) -> None:
     """Random weights that multiply the size of what comes in by about `gain`, and no bias."""
     for layer in layers:
-        nn.init.normal_(layer.weight, std=gain / math.sqrt(layer.weight[0].numel()))
-        nn.init.zeros_(layer.bias)
+        taps = layer.in_channels if isinstance(layer, nn.ConvTranspose2d) else layer.weight[0].numel()
+        nn.init.normal_(layer.weight, std=gain / math.sqrt(taps))
+        if layer.bias is not None:
+            nn.init.zeros_(layer.bias)
 
 
 def open_residual(name: str, config: SharpConfig = FULL) -> ResidualNet:
