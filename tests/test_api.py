@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import html
+import io
 import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import av
+import numpy as np
+import portraits
 import pytest
 import torch
 from photos import HEIGHT, WIDTH, metres, read_ply, write_depth, write_pair, write_photo
+from PIL import Image
 from scenes import psnr, same_bits
 
 import spackle
@@ -69,6 +74,75 @@ def test_files_names_and_values_are_the_same_input(scene: spackle.Scene, pair: t
     assert same_bits(scene.gaussians.select(torch.arange(len(scene.base))), scene.base)
 
 
+def test_a_photo_and_its_depth_in_every_form(scene: spackle.Scene, pair: tuple[Path, Path]) -> None:
+    photo, depth = pair
+    pixels, metres_of = np.asarray(Image.open(photo).convert("RGB")), spackle.load_depth(depth)
+    depths = [depth.read_bytes(), io.BytesIO(depth.read_bytes()), metres_of.depth.numpy(), metres_of.depth.double()]
+    photos = [
+        photo.read_bytes(),
+        io.BytesIO(photo.read_bytes()),
+        Image.open(photo),
+        pixels,
+        torch.from_numpy(pixels / 255),
+    ]
+    session = spackle.Spackle(residual="seeds")
+    expected = session.predict(photo, depth)
+    for form in photos:
+        assert same_bits(session.predict(form, depth).gaussians, expected.gaussians)
+    for form in depths:  # an array says nothing of the steps in which a file stores depth
+        made = session.predict(photo, form, trajectory="swipe").base
+        assert len(made) == len(expected.base)
+        torch.testing.assert_close(made.means, expected.base.means, rtol=2e-3, atol=2e-3)
+    portrait = portraits.apple_jpeg(portraits.codes(), portraits.apple_xmp())
+    assert isinstance(portrait, bytes)
+    assert len(session.predict(portrait).base) == len(expected.base)  # by the depth in it
+    with pytest.warns(DeprecationWarning, match="trajectory= now"):
+        assert len(scene.path(kind="swipe", frames=3)) == 3
+
+
+JPEG = b"\xff\xd8" + bytes(100_000)
+
+
+@pytest.mark.parametrize(
+    ("photo", "options", "words"),
+    [
+        (JPEG, {}, "photo: not an image"),
+        ("x" * 100_000, {}, "cannot be read"),
+        (io.StringIO("x" * 100_000), {}, "binary mode"),
+        (np.zeros((48, 64)), {}, "[height, width, 3]"),
+        (np.full((48, 64, 3), 200.0), {}, "from 200 to 200"),
+        (object(), {}, "a path, bytes"),
+        (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64), complex)}, "metres"),
+        (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
+        (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "not both"),
+        (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
+        (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "cannot be read"),
+    ],
+    ids=repr,
+)
+def test_whatever_it_is_given_the_message_is_short(photo: Any, options: Any, words: str) -> None:
+    with pytest.raises(spackle.InputError) as caught:
+        spackle.predict(photo, **options)
+    assert words in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+def test_scenes_go_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
+    scene.save(tmp_path / "scene.ply")
+    saved, exported, video = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    scene.save(saved)
+    scene.export(exported, "spz")
+    scene.save_video(video, "swipe", frames=3)
+    assert saved.getvalue() == (tmp_path / "scene.ply").read_bytes() == scene.to_bytes("ply")
+    assert exported.getvalue() == scene.to_bytes("spz")
+    with av.open(io.BytesIO(video.getvalue())) as container:
+        assert len(list(container.decode(video=0))) == 3
+    depth = scene.depth_map()
+    assert torch.allclose(depth[depth > 0], torch.from_numpy(metres())[depth > 0], rtol=0.1)
+    with pytest.raises(spackle.InputError, match="which format"):
+        scene.export(io.BytesIO())
+
+
 def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     scene.save(tmp_path / "scene.ply")
     assert read_ply(tmp_path / "scene.ply").count == len(scene.gaussians)
@@ -82,7 +156,7 @@ def test_save_and_load(scene: spackle.Scene, tmp_path: Path) -> None:
     view = scene.path(frames=3)[1]
     assert psnr(renderer.render(loaded, view).rgb, scene.render(view).rgb) > 50
     photo = write_photo(tmp_path / "wide.png", 1600, 200)
-    made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(1600, 200)), kind="swipe", fill="none")
+    made = spackle.predict(photo, write_depth(tmp_path / "d.npy", metres(1600, 200)), trajectory="swipe", fill="none")
     assert (made.camera.width, made.camera.height) == (1536, 192)  # the working size of a large photo
     for width, height in ((1, 1), (31, 64), (290, 36), (40, 321)):
         photo = write_photo(tmp_path / "odd.png", width, height)
@@ -115,7 +189,7 @@ def test_predict_takes_a_lens_and_tells_how_far_it_is(
     pair: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     photo, depth = pair
-    made = spackle.predict(photo, depth, fov=90, disparity=0.1, network=None, progress=True)
+    made = spackle.predict(photo, depth, fov=90, disparity=0.1, residual="seeds", progress=True)
     assert made.camera.focal[0] == pytest.approx(WIDTH / 2)
     assert "complete" in capsys.readouterr().err
     with pytest.raises(ValueError, match="load_photo"):

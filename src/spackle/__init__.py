@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.image import Photo as Photo
     from spackle.image import load_photo as load_photo
     from spackle.pipeline import complete as complete
-    from spackle.pipeline import predict as predict
     from spackle.render import Renderer as Renderer
     from spackle.render import get_renderer as get_renderer
     from spackle.render.protocol import Rendering as Rendering
@@ -39,6 +38,8 @@ if TYPE_CHECKING:  # for editors and type checkers
     from spackle.scene_fill import FillContext as FillContext
     from spackle.scene_fill import fill_scene as fill_scene
     from spackle.scene_fill import fill_view as fill_view
+    from spackle.session import Spackle as Spackle
+    from spackle.session import predict as predict
 
 __version__ = "0.1.0"
 
@@ -58,9 +59,10 @@ _NAMES = {
     "spackle.render": ("Renderer", "get_renderer"),
     "spackle.render.protocol": ("Rendering",),
     "spackle.residual": ("complete_view", "hole_area_ratio", "hole_mask"),
-    "spackle.pipeline": ("complete", "predict"),
+    "spackle.pipeline": ("complete",),
     "spackle.scene": ("Scene",),
     "spackle.scene_fill": ("FillContext", "fill_scene", "fill_view"),
+    "spackle.session": ("Spackle", "predict"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted(_HOMES)

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import reprlib
-from collections.abc import Iterable, Iterator
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from typing import ParamSpec, TypeVar
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+LONGEST = 300  # characters of a message
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 
@@ -14,8 +21,13 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 class InputError(ValueError):
     """Bad input from a person: the message names the file or value, what is wrong and what to do.
 
-    The command line prints the message as one line and exits with code 2.
+    The command line prints the message as one line and exits with code 2. Of a longer message the middle is left out.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(
+            message if len(message) <= LONGEST else f"{message[: LONGEST // 2]} … {message[3 - LONGEST // 2 :]}"
+        )
 
 
 def reason_in_a_line(error: object) -> str:
@@ -52,6 +64,23 @@ def one_line(text: str) -> str:
 def shown(value: object) -> str:
     """A stranger's value for the middle of a message: at most 60 characters, however long or deep it is."""
     return _SHORT.repr(value)[:60]
+
+
+def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Let a function take arguments by the names that they had in the release before, with a DeprecationWarning."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(function)
+        def called(*arguments: P.args, **named: P.kwargs) -> R:
+            for old, new in names.items():
+                if old in named:
+                    warnings.warn(f"{function.__name__}({old}=) is called {new}= now", DeprecationWarning, stacklevel=2)
+                    named[new] = named.pop(old)
+            return function(*arguments, **named)
+
+        return called
+
+    return decorate
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:

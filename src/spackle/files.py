@@ -78,6 +78,17 @@ def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
         temporary.write_bytes(content)
 
 
+Target = str | os.PathLike[str] | BinaryIO  # of a result: a path, or a file that is open for writing bytes
+
+
+def write_bytes(content: bytes, target: Target) -> None:
+    """Write to a path, whole or not at all, or to an open file."""
+    if isinstance(target, str | os.PathLike):
+        write_whole(target, content)
+    else:
+        target.write(content)
+
+
 def check_writable(path: str | os.PathLike[str]) -> Path:
     """The file that a write to `path` would replace, links followed.
 

@@ -9,16 +9,17 @@ import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.device import run_chunks
-from spackle.errors import InputError, reading
+from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 from spackle.photo_frame import PhotoFrame, find_frame
 
@@ -117,10 +118,51 @@ def load_photo(
         return _to_rgb(_upright(image), path), tags
 
     rgb, exif = read_image(path, read)
+    return _photo(rgb, exif, Path(path), keep_frame, focal_px, focal_mm, fov)
+
+
+def photo_of_picture(
+    picture: Image.Image | NDArray[Any] | Tensor,
+    *,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
+    keep_frame: bool = True,
+) -> Photo:
+    """A picture that a program holds, by PIL or as [H, W, 3] sRGB: uint8, or floats in 0..1; else as `load_photo`."""
+    _check_focal(focal_px, focal_mm, fov)
+    path, exif = Path("photo"), dict[int, object]()
+    if isinstance(picture, Image.Image):
+        check_pixels(picture.width, picture.height, MAX_PIXELS, path)
+        exif = _exif(picture)
+        with reading(path, "the picture cannot be used: {reason}"):
+            rgb = _to_rgb(_upright(picture), path)
+    else:
+        values = picture.detach().cpu() if isinstance(picture, Tensor) else torch.from_numpy(np.array(picture))
+        if values.ndim != 3 or values.shape[2] != 3 or not values.numel():
+            raise InputError(f"{path}: a picture of shape {shown(tuple(values.shape))}: give [height, width, 3]")
+        check_pixels(values.shape[1], values.shape[0], MAX_PIXELS, path)
+        if values.dtype != torch.uint8 and not values.is_floating_point():
+            raise InputError(f"{path}: colours as {values.dtype}: give uint8, or floats from 0 to 1")
+        rgb = values.float() / 255 if values.dtype == torch.uint8 else values.float().clone()
+        if not (torch.isfinite(rgb).all() and rgb.min() >= 0 and rgb.max() <= 1):
+            raise InputError(f"{path}: colours from {rgb.min():g} to {rgb.max():g}: give floats from 0 to 1, or uint8")
+    return _photo(rgb, exif, path, keep_frame, focal_px, focal_mm, fov)
+
+
+def _photo(
+    rgb: Tensor,
+    exif: dict[int, object],
+    path: Path,
+    keep_frame: bool,
+    focal_px: float | None,
+    focal_mm: float | None,
+    fov: float | None,
+) -> Photo:
     height, width = rgb.shape[:2]
     focal, source = focal_length(path, width, height, exif, focal_px=focal_px, focal_mm=focal_mm, fov=fov)
     frame = None if keep_frame or source.startswith("--") else find_frame(rgb)
-    return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, Path(path), frame)
+    return Photo(frame.inside(rgb, width, height) if frame else rgb, focal, source, path, frame)
 
 
 def focal_length(

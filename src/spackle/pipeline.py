@@ -8,26 +8,23 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import logging
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 from torch import Tensor
 
-from spackle.bases import Base, BasePrediction
-from spackle.bases.depth_map import DepthKind, DepthMap
-from spackle.bases.open import OpenedBase, ResolvedBase, open_base, open_loaded
+from spackle.bases import BasePrediction
+from spackle.bases.open import OpenedBase, ResolvedBase, open_base
 from spackle.bases.settings import BaseSettings
 from spackle.camera import Camera
-from spackle.camera_path import KeyframePath, TrajectoryKind
+from spackle.camera_path import KeyframePath
 from spackle.device import Precision
 from spackle.errors import InputError
 from spackle.gaussians import Gaussians
-from spackle.image import Photo, load_photo
+from spackle.image import Photo
 from spackle.inpaint import InpainterOptions, get_inpainter
-from spackle.progress import Reporter, Step, progress_line
+from spackle.progress import LogReporter, Reporter, Step
 from spackle.render import Renderer, get_renderer
 from spackle.residual.architectures import SHIPPED, load_residual, shipped_network
 from spackle.residual.network import ResidualNet
@@ -37,7 +34,6 @@ from spackle.scene_fill.texture import Texture, exemplar_texture, painted_textur
 from spackle.views import PathOptions, PlannedViews, choose_move, plan_views
 from spackle.weights import installed
 
-LOG = logging.getLogger("spackle")
 Shipped = Literal["shipped"]  # the weights that come with the package, if it has any
 Fill = Literal["auto", "network", "exemplar", "lama", "none"]  # of the texture in holes
 Mode = Literal["scene", "view"]  # one set of aux Gaussians for all views, or one for each
@@ -215,90 +211,6 @@ def _with_farthest_view(done: CompletedPhoto) -> CompletedPhoto:
     return dataclasses.replace(done, scene=scene, saved_view=name)
 
 
-class LogReporter(Reporter):
-    """Tells the logger "spackle", and draws progress on one line of the standard error if asked to."""
-
-    def __init__(self, progress: bool = False) -> None:
-        super().__init__()
-        self._progress = progress
-
-    def log(self, line: str) -> None:
-        LOG.info(line)
-
-    def warn(self, line: str) -> None:
-        LOG.warning(line)
-
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[Step]:
-        with progress_line(name, self._progress and name in ("base", "complete")) as step:
-            yield step
-
-
-def predict(
-    photo: str | os.PathLike[str] | Photo,
-    depth: str | os.PathLike[str] | DepthMap | None = None,
-    *,
-    base: Base | None = None,
-    kind: TrajectoryKind = "rotate-forward",
-    disparity: float | None = None,
-    depth_kind: DepthKind = "auto",
-    network: ResidualNet | Shipped | None = "shipped",
-    fill: Fill = "auto",
-    renderer: Renderer | None = None,
-    keep_frame: bool = False,
-    focal_px: float | None = None,
-    focal_mm: float | None = None,
-    fov: float | None = None,
-    progress: bool = False,
-) -> Scene:
-    """A photo to a scene without holes along a camera path.
-
-    Args:
-        photo: a file, or a loaded photo.
-        depth: of the photo, a file or a loaded depth map.
-        base: what turns the photo into Gaussians, such as `SharpBase.load(weights)`. Without it and without depth the
-            best one on this machine: the depth in the photo's file, else SHARP or MoGe where its weights have been
-            downloaded, else `LiteBase`, whose geometry is rough. The logger "spackle" is told which, and warned of
-            what could not be used. A network is then loaded for this photo alone: for many, load a base once.
-        kind: the path that the scene is completed for, besides the views farthest to the left and to the right.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as the photo bears it
-            (see `choose_move`), at most 0.15 for lite, else 0.3.
-        depth_kind: what the numbers of a depth map's file are, see `spackle.load_depth`.
-        network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
-        fill: see `open_texture`; "none" leaves the holes open.
-        renderer: the CPU's where None.
-        keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
-            focal length is given.
-        focal_px: focal length of a photo's file in pixels; by default the file's own, see `load_photo`.
-        focal_mm: its 35 mm film equivalent, in its place.
-        fov: horizontal field of view in degrees, in its place.
-        progress: show how far it is, on one line of the standard error.
-
-    Raises:
-        InputError: a photo or a depth map that cannot be used, or a base's name in place of a base.
-        ValueError: depth and base both given, or a lens for a photo that is loaded.
-    """
-    if depth is not None and base is not None:
-        raise ValueError("predict takes the photo's depth, or a base that needs none, but not both")
-    if isinstance(base, str):
-        raise InputError(f"base={base!r}: give a base that is loaded, such as base=spackle.LiteBase.load()")
-    source = Path(depth) if isinstance(depth, (str, os.PathLike)) else depth
-    options = Options(
-        BaseSettings(depth=source, depth_kind=depth_kind), PathOptions(kind, disparity), FillOptions(fill=fill)
-    )
-    if isinstance(photo, Photo):
-        if (focal_px, focal_mm, fov) != (None, None, None):
-            raise ValueError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
-        loaded = photo
-    else:
-        keep_frame = keep_frame or options.give_geometry
-        loaded = load_photo(photo, focal_px=focal_px, focal_mm=focal_mm, fov=fov, keep_frame=keep_frame)
-    opened = open_base(options.base) if base is None else open_loaded(base)
-    chosen = shipped_network() if network == "shipped" else network
-    pipeline = Pipeline(options, opened, chosen, renderer or get_renderer())
-    return pipeline.complete(loaded, LogReporter(progress)).scene
-
-
 def complete(
     prediction: BasePrediction,
     cameras: Sequence[Camera],
@@ -318,8 +230,8 @@ def complete(
         cameras: the views.
         mode: "view" fills each view by itself, and leaves `Scene.aux` empty.
         exact: the views are these and no others between them; for scene mode.
-        network: see `predict`.
-        fill: see `predict`.
+        network: residual weights, by default those that come with Spackle; None: the seeds alone fill the holes.
+        fill: see `open_texture`; "none" leaves the holes open.
         renderer: the CPU's where None.
         precision: of the network.
         progress: called with views done and their number.

@@ -6,6 +6,7 @@ import contextlib
 import copy
 import io
 import json
+import logging
 import os
 import signal
 import sys
@@ -158,6 +159,25 @@ class Reporter:
     def _bars(self, *columns: ProgressColumn) -> Progress:
         description = TextColumn("{task.description:<12}")
         return Progress(description, BarColumn(), *columns, TimeRemainingColumn(), console=self.console, transient=True)
+
+
+class LogReporter(Reporter):
+    """Tells the logger "spackle", and draws progress on one line of the standard error if asked to."""
+
+    def __init__(self, progress: bool = False) -> None:
+        super().__init__()
+        self._progress, self._log = progress, logging.getLogger("spackle")
+
+    def log(self, line: str) -> None:
+        self._log.info(line)
+
+    def warn(self, line: str) -> None:
+        self._log.warning(line)
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[Step]:
+        with progress_line(name, self._progress and name in ("base", "complete")) as step:
+            yield step
 
 
 class Notes(Reporter):

@@ -5,22 +5,26 @@ from __future__ import annotations
 import dataclasses
 import html
 import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from spackle.bases import USUAL_DISPARITY
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
-from spackle.files import write_whole
-from spackle.formats.ply import PlyFile, save_ply
+from spackle.errors import renamed
+from spackle.files import Target, check_writable, write_bytes
+from spackle.formats.ply import PlyFile
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of
 from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
+from spackle.residual.view_features import hole_mask
 from spackle.views import PATH_FRAMES, scene_path
 from spackle.web import PageScene, page_scene, single_html
 
@@ -83,11 +87,12 @@ class Scene:
         """The sets that a completed view is drawn with."""
         return [self.base, self.aux if self.by_view is None else self.by_view[index]]
 
+    @renamed(kind="trajectory")
     def path(
-        self, kind: TrajectoryKind = "rotate-forward", disparity: float | None = None, frames: int = PATH_FRAMES
+        self, trajectory: TrajectoryKind = "rotate-forward", disparity: float | None = None, frames: int = PATH_FRAMES
     ) -> list[Camera]:
         """Cameras of a video around the photo's eye, both sides of the picture even."""
-        return scene_path(self.base, self.camera, kind, self._reach(disparity), frames)
+        return scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames)
 
     def along(self, keyframes: KeyframePath, frames: int | None = None, fps: float = 30) -> list[Camera]:
         """Cameras through keyframes, see `spackle.formats.load_path`; without a number as many as they take at `fps`.
@@ -108,53 +113,85 @@ class Scene:
         for camera in cameras:
             yield self.render(camera, renderer)
 
-    def save(self, path: str | os.PathLike[str], disparity: float | None = None) -> None:
+    def depth_map(self, renderer: Renderer | None = None) -> Tensor:
+        """Depth [H, W] of the base at the photo's camera, metres where the base is metric; 0 where it shows nothing."""
+        with torch.no_grad():
+            view = (renderer or get_renderer()).render(self.base, self.camera)
+        return torch.where(hole_mask(view.alpha), 0, view.depth)
+
+    def save(self, target: Target, disparity: float | None = None) -> None:
         """Write a plain PLY that every common viewer opens.
 
         Args:
-            path: the file.
+            target: a path, or a file that is open for writing bytes.
             disparity: how far the scene was completed, by default as `Scene.disparity` has it: so far `spackle view`
                 goes.
         """
         reach = self.disparity if disparity is None else disparity
-        save_ply(self.gaussians, path, camera=self.camera, base_count=len(self.base), disparity=reach)
+        write_bytes(dataclasses.replace(self, disparity=reach).to_bytes("ply"), target)
 
     def page(self, name: str, note: str = "") -> PageScene:
         """The scene for the page of `spackle view`, under a name, with a note as `page_scene` has it."""
         return page_scene(name, self.base, self.aux, self.camera, self.disparity, note)
 
-    def export(self, path: str | os.PathLike[str]) -> None:
-        """Write a file for other viewers: .ply, .compressed.ply, .spz, .splat, .sog, .glb, or .html, a page of its own.
+    def export(self, target: Target, format: str | None = None) -> None:
+        """Write a file for other viewers.
 
-        InputError for another name, and for a scene too large for a format.
+        Args:
+            target: a path, or a file that is open for writing bytes.
+            format: "ply", "compressed.ply", "spz", "splat", "sog", "glb", or "html", a page of its own; by default as
+                the path ends.
+
+        Raises:
+            InputError: an unknown format, or a scene too large for it.
         """
-        target = Path(path)
+        name = Path(f"scene.{format}") if format else None
+        if isinstance(target, str | os.PathLike):
+            check_writable(target)
+            name = name or Path(target)
+        write_bytes(self._encoded(name or Path("scene")), target)
+
+    def to_bytes(self, format: str) -> bytes:
+        """What `export` would write."""
+        return self._encoded(Path(f"scene.{format}"))
+
+    def _encoded(self, name: Path) -> bytes:
         page: Encoder = lambda file: single_html(self.page(file.path.stem))  # noqa: E731
-        file = SceneFile(target, self.gaussians, self.camera, len(self.base), self.disparity)
-        write_whole(target, encoder_of(target, {".html": page})(file))
+        file = SceneFile(name, self.gaussians, self.camera, len(self.base), self.disparity)
+        return encoder_of(name, {".html": page})(file)
 
     def show(self, height: int = 480) -> InlinePage:
         """The page with the scene in it, `height` pixels high: the last value of a notebook's cell is shown."""
         return InlinePage(single_html(self.page("scene")).decode(), height)
 
+    @renamed(kind="trajectory")
     def save_video(
         self,
-        path: str | os.PathLike[str],
-        kind: TrajectoryKind = "rotate-forward",
+        target: Target,
+        trajectory: TrajectoryKind = "rotate-forward",
         disparity: float | None = None,
         frames: int = PATH_FRAMES,
         fps: float = 30,
         loop: int | None = None,
         overscan: float = OVERSCAN,
+        format: str | None = None,
     ) -> None:
-        """Write a video of a camera path: .mp4, .webm, .gif or .webp; `loop` as in `spackle.formats.VideoWriter`.
+        """Write a video of a camera path; `loop` as in `spackle.formats.VideoWriter`.
 
         The lens is longer than the photo's by the share `overscan`: most of what lies beyond the photo stays outside.
+        `target` is a path, or a file that is open for writing bytes; `format` is "mp4", "webm", "gif" or "webp", by
+        default as the path ends, and mp4 for an open file.
         """
-        plays = check_video(path, fps, loop).loop if loop is None else loop
-        cameras = scene_path(self.base, self.camera, kind, self._reach(disparity), frames, looped=plays != 1)
-        views = self.frames(camera.zoomed(1 + overscan) for camera in cameras)
-        save_video((view.rgb for view in views), path, fps, loop)
+        if format is None and isinstance(target, str | os.PathLike):
+            plays = check_video(target, fps, loop).loop if loop is None else loop
+            cameras = scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames, looped=plays != 1)
+            views = self.frames(camera.zoomed(1 + overscan) for camera in cameras)
+            save_video((view.rgb for view in views), target, fps, loop)
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"video.{format or 'mp4'}"
+            self.save_video(path, trajectory, disparity, frames, fps, loop, overscan)
+            write_bytes(path.read_bytes(), target)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -176,7 +176,7 @@ def test_focal_length_of_person_then_map_then_photo(tmp_path: Path, photo: Path)
         assert (ours.camera.focal[0], ours.lens_source) == (60, "")
         # depth = baseline · focal / (disparity + doffs)
         torch.testing.assert_close(ours.gaussians.means[front, 2], 0.75 * prediction.gaussians.means[front, 2])
-        scene = spackle.predict(ours_px, depth=depth, network=None, fill="none")
+        scene = spackle.predict(ours_px, depth=depth, residual="none")
         assert scene.camera.focal[0] == 60
         assert same_bits(scene.base, ours.gaussians)
     of_the_file = dataclasses.replace(ours_px, focal_source="EXIF")
@@ -205,7 +205,7 @@ def test_broken_depth_in_the_photo_fails(
     with pytest.raises(InputError, match=r"photo\.jpg"):
         pick(photo, name="rgbd")
     with caplog.at_level(logging.INFO, "spackle"):  # in Python
-        spackle.predict(photo, network=None)
+        spackle.predict(photo, residual="seeds")
     assert [record.levelname for record in caplog.records] == ["WARNING", "INFO", "INFO", "INFO"]
     assert all(record.getMessage().startswith("photo.jpg: ") for record in caplog.records)
     depth = torch.full((WIDTH, HEIGHT), 2.0)
@@ -319,13 +319,12 @@ def test_weights_are_apples_by_name_and_size(tmp_path: Path, monkeypatch: pytest
 
 def test_python_takes_depth_or_a_base_and_photos_without_file(tmp_path: Path, photo: Path) -> None:
     loaded = load_photo(photo)
-    scene = spackle.predict(loaded, network=None, fill="none")
+    scene = spackle.predict(loaded, residual="none")
     drawn = dataclasses.replace(loaded, path=Path("nowhere.png"))
-    assert same_bits(spackle.predict(drawn, network=None, fill="none").base, scene.base)
-    assert same_bits(spackle.predict(photo, base=LiteBase.load(), network=None, fill="none").base, scene.base)
+    assert same_bits(spackle.predict(drawn, residual="none").base, scene.base)
+    assert same_bits(spackle.predict(photo, base=LiteBase.load(), residual="none").base, scene.base)
     with pytest.raises(ValueError, match="not both"):
         spackle.predict(photo, write_depth(tmp_path / "d.npy"), base=LiteBase.load())
-    with pytest.raises(ValueError, match=r"base='lite': give a base that is loaded"):
-        spackle.predict(photo, base="lite")  # type: ignore[arg-type]
+    assert same_bits(spackle.predict(photo, base="lite", residual="none").base, scene.base)
     with pytest.raises(InputError, match="gone"):
         spackle.predict(tmp_path / "gone.jpg")

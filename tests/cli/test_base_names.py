@@ -197,7 +197,7 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
         assert said in result.err
         assert PlyFile(tmp_path / "out" / "photo" / "scene.ply").disparity() == far
         assert [row["view"] for row in report["hole_area_ratio"]] == [f"-{far:g}", f"+{far:g}"]
-    scene = spackle.predict(photo, network=None, fill="none")
+    scene = spackle.predict(photo, residual="none")
     assert scene.disparity == 0.14
     assert torch.equal(scene.path()[20].position, scene.path(disparity=0.14)[20].position)
     succeeds(predict(tmp_path, "-i", photo))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from spackle.errors import InputError, reading
+from spackle.errors import InputError, reading, shown
 from spackle.files import check_file
 from spackle.image import MAX_PIXELS, check_pixels, read_image
 
@@ -141,6 +141,17 @@ def load_depth(
     stored, is_png = read_array(path)
     if kind == "auto" and lens is None and is_png:
         _check_metric(stored, path)
+    return _depth_map(stored, is_png, lens, Path(path))
+
+
+def depth_of_array(stored: Array, path: Path, kind: DepthKind = "auto") -> DepthMap:
+    """The depth map of an array [H, W]: metres with 0, NaN and inf for unknown, or relative; `path` is for messages."""
+    if stored.ndim != 2 or not stored.size or stored.dtype.kind not in "fiu":
+        raise InputError(f"{path}: an array of {stored.dtype} {shown(stored.shape)}: give [height, width] in metres")
+    return relative_depth(stored, kind, path) if kind in RELATIVE else _depth_map(stored, False, None, path)
+
+
+def _depth_map(stored: Array, is_png: bool, lens: Calibration | None, path: Path) -> DepthMap:
     values = np.where(np.isfinite(stored), stored, 0)
     if negative := int((values < 0).sum()):
         raise InputError(f"{path}: {negative} of {values.size} values are negative: mark unknown pixels with 0 or NaN")
@@ -154,7 +165,7 @@ def load_depth(
     integers = stored.dtype.kind in "iu" or lens is not None  # whole metres as floats mean nothing
     step = grid_step(values[known.numpy()]) if integers else None
     quantum = None if step is None else step * unit
-    return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, Path(path))
+    return DepthMap(metres.where(known, 0.0), known, None if lens is None else lens.K, quantum, quantity, path)
 
 
 def relative_depth(

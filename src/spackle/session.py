@@ -1,0 +1,201 @@
+"""The Python interface: a photo in whatever form a program holds it, a completed scene out."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from spackle.bases import Base
+from spackle.bases.depth_map import DepthKind, DepthMap, depth_of_array, load_depth
+from spackle.bases.open import open_base, open_loaded
+from spackle.bases.settings import AUTO, BaseSettings
+from spackle.camera_path import TrajectoryKind
+from spackle.errors import InputError, renamed, shown
+from spackle.image import Photo, load_photo, photo_of_picture
+from spackle.pipeline import Fill, FillOptions, Options, Pipeline
+from spackle.progress import LogReporter
+from spackle.render import Renderer, get_renderer
+from spackle.residual.network import ResidualNet
+from spackle.scene import Scene
+from spackle.views import PathOptions
+
+Pixels = NDArray[Any] | Tensor
+PhotoSource = str | os.PathLike[str] | bytes | BinaryIO | Image.Image | Pixels | Photo
+DepthSource = str | os.PathLike[str] | bytes | BinaryIO | Pixels | DepthMap
+Residual = str | os.PathLike[str] | ResidualNet | None
+T = TypeVar("T")
+
+
+class Spackle:
+    """Completes many photos with networks that are loaded once, at the first photo that needs them."""
+
+    def __init__(
+        self,
+        base: str | Base = AUTO,
+        *,
+        residual: Residual = None,
+        fill: Fill = "auto",
+        device: str = "auto",
+        renderer: Renderer | None = None,
+    ) -> None:
+        """Choose what the scenes are made with.
+
+        Args:
+            base: as `--base` names it, or a loaded one, such as `SharpBase.load(weights)`. "auto" takes the best for
+                each photo: its depth, else SHARP or MoGe where weights have been downloaded, else
+                lite, whose geometry is rough. The logger "spackle" is told which, and warned of what cannot be used.
+            residual: a file of weights, a loaded network, "seeds" for none, or "none", which leaves the holes open;
+                None: the weights that come with Spackle.
+            fill: where texture comes from, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
+            device: "auto", "cpu" or "cuda", of base and renderer.
+            renderer: the device's where None.
+
+        Raises:
+            InputError: an unknown name, or weights that cannot be used.
+        """
+        name = base if isinstance(base, str) else AUTO
+        network = residual if isinstance(residual, ResidualNet) else None
+        chosen = FillOptions(None if residual is None or network else os.fspath(residual), fill)  # type: ignore[arg-type]
+        options = Options(BaseSettings(name, device=device), fill=chosen)
+        options.base.check()
+        opened = open_base(options.base) if isinstance(base, str) else open_loaded(base)
+        self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
+        self._pipeline = Pipeline(options, opened, network or chosen.load(), renderer or get_renderer(device))
+
+    def predict(
+        self,
+        photo: PhotoSource,
+        depth: DepthSource | None = None,
+        *,
+        trajectory: TrajectoryKind = "rotate-forward",
+        disparity: float | None = None,
+        depth_kind: DepthKind = "auto",
+        keep_frame: bool = False,
+        focal_px: float | None = None,
+        focal_mm: float | None = None,
+        fov: float | None = None,
+        progress: bool = False,
+    ) -> Scene:
+        """A photo to a scene without holes along a camera path; see `spackle.predict`."""
+        if depth is not None and self._given:
+            raise InputError("predict takes the photo's depth, or a base that needs none, but not both")
+        lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
+        if isinstance(photo, Photo) and lens != dict.fromkeys(lens):
+            raise InputError("a loaded photo has a lens: give focal_px, focal_mm or fov to load_photo")
+        pipeline, options = self._pipeline, self._pipeline.options
+        options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
+        options.path.check()
+        with contextlib.ExitStack() as stack:
+            if depth is not None:
+                source = stack.enter_context(_depth(depth, depth_kind))
+                options = dataclasses.replace(
+                    options, base=dataclasses.replace(options.base, depth=source, depth_kind=depth_kind)
+                )
+                pipeline = dataclasses.replace(pipeline, base=open_base(options.base))
+            keep = keep_frame or options.give_geometry
+            loaded = stack.enter_context(_photo(photo, keep_frame=keep, **lens))
+            return dataclasses.replace(pipeline, options=options).complete(loaded, LogReporter(progress)).scene
+
+
+@renamed(kind="trajectory")
+def predict(
+    photo: PhotoSource,
+    depth: DepthSource | None = None,
+    *,
+    base: str | Base = AUTO,
+    trajectory: TrajectoryKind = "rotate-forward",
+    disparity: float | None = None,
+    depth_kind: DepthKind = "auto",
+    residual: Residual = None,
+    fill: Fill = "auto",
+    device: str = "auto",
+    renderer: Renderer | None = None,
+    keep_frame: bool = False,
+    focal_px: float | None = None,
+    focal_mm: float | None = None,
+    fov: float | None = None,
+    progress: bool = False,
+) -> Scene:
+    """A photo to a scene without holes along a camera path; for many photos keep a `Spackle`, which loads once.
+
+    Args:
+        photo: a path, the bytes of a file, an open file, a PIL picture, a loaded photo, or an array or tensor
+            [H, W, 3] of sRGB, uint8 or floats in 0..1.
+        depth: of the photo: a path, bytes or an open file as `load_depth` reads them, an array or tensor [H, W] in
+            metres (0, NaN or inf: unknown), or a loaded depth map.
+        base, residual, fill, device, renderer: see `Spackle`.
+        trajectory: the path that the scene is completed for, besides the views farthest to the left and to the right.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as
+            the photo bears it (see `choose_move`), at most 0.15 for lite, else 0.3.
+        depth_kind: what the numbers of a depth map's file are, see `spackle.load_depth`.
+        keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
+            focal length is given.
+        focal_px: focal length in pixels of the upright photo; by default the file's own, see `load_photo`.
+        focal_mm: its 35 mm film equivalent, in its place.
+        fov: horizontal field of view in degrees, in its place.
+        progress: show how far it is, on one line of the standard error.
+
+    Raises:
+        InputError: a photo, a depth map, a name or weights that cannot be used; a base beside depth, or a lens for a
+            photo that is loaded.
+    """
+    session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
+    path: dict[str, Any] = {"trajectory": trajectory, "disparity": disparity, "depth_kind": depth_kind}
+    lens: dict[str, Any] = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
+    return session.predict(photo, depth, **path, **lens, keep_frame=keep_frame, progress=progress)
+
+
+@contextlib.contextmanager
+def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
+    """A loaded photo; the block may read the file of a photo that came as bytes, which may hold its depth."""
+    if isinstance(source, Photo):
+        yield source
+    elif isinstance(source, Image.Image | np.ndarray | Tensor):
+        yield photo_of_picture(source, **options)
+    else:
+        with _as_file(source, "photo") as path:
+            yield load_photo(path, **options)
+
+
+@contextlib.contextmanager
+def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
+    if isinstance(source, np.ndarray | Tensor):
+        yield depth_of_array(
+            np.array(source.detach().cpu() if isinstance(source, Tensor) else source), Path("depth"), kind
+        )
+    elif isinstance(source, DepthMap | str | os.PathLike):
+        yield source if isinstance(source, DepthMap) else Path(source)
+    else:
+        with _as_file(source, "depth") as path:
+            yield load_depth(path, kind=kind)
+
+
+@contextlib.contextmanager
+def _as_file(source: str | os.PathLike[str] | bytes | BinaryIO, kind: str) -> Iterator[Path]:
+    """A path to the source's bytes; messages call a temporary one "photo" or "depth"."""
+    if isinstance(source, str | os.PathLike):
+        yield Path(source)
+        return
+    content = source if isinstance(source, bytes | bytearray | memoryview) else None
+    if content is None and callable(read := getattr(source, "read", None)):
+        content = read()
+    if not isinstance(content, bytes | bytearray | memoryview):
+        holds = "a path, bytes, a file opened in binary mode, or an array"
+        raise InputError(f"{kind}: {type(source).__name__} {shown(source)} is none that is known: give {holds}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / kind
+        path.write_bytes(content)
+        try:
+            yield path
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), kind)) from error
