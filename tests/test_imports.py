@@ -21,7 +21,7 @@ OPTIONAL += ("cv2", "fsspec", "pytorchcv", "torchvision")
 # The rooms of the house, and what each may import besides itself. Single files at the top are rooms of their own where
 # they are named here; all others are values.
 BELOW_SCENE = {"values", "render", "bases", "inpaint", "residual", "scene_fill", "formats", "weights"}
-SCENE = {"pipeline", "scene", "views", "video_frames", "photo_results"}
+SCENE = {"pipeline", "scene", "session", "views", "video_frames", "photo_results"}
 BELOW_DATASET = {*BELOW_SCENE, "scene"}
 ALLOWED: dict[str, set[str]] = {
     "values": set(),

@@ -170,9 +170,8 @@ def _photo(source: PhotoSource, **options: Any) -> Iterator[Photo]:
 @contextlib.contextmanager
 def _depth(source: DepthSource, kind: DepthKind) -> Iterator[Path | DepthMap]:
     if isinstance(source, np.ndarray | Tensor):
-        yield depth_of_array(
-            np.array(source.detach().cpu() if isinstance(source, Tensor) else source), Path("depth"), kind
-        )
+        array = source.detach().cpu().numpy() if isinstance(source, Tensor) else source
+        yield depth_of_array(array, Path("depth"), kind)
     elif isinstance(source, DepthMap | str | os.PathLike):
         yield source if isinstance(source, DepthMap) else Path(source)
     else:
