@@ -117,7 +117,7 @@ JPEG = b"\xff\xd8" + bytes(100_000)
         (np.zeros((48, 64, 3)), {"depth": np.zeros((48, 64))}, "all-invalid"),
         (np.zeros((48, 64, 3)), {"base": "lite", "depth": np.ones((48, 64))}, "not both"),
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
-        (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "cannot be read"),
+        (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),
     ],
     ids=repr,
 )
@@ -139,7 +139,7 @@ def test_scenes_go_to_open_files(scene: spackle.Scene, tmp_path: Path) -> None:
     with av.open(io.BytesIO(video.getvalue())) as container:
         assert len(list(container.decode(video=0))) == 3
     depth = scene.depth_map()
-    assert torch.allclose(depth[depth > 0], torch.from_numpy(metres())[depth > 0], rtol=0.1)
+    assert float(((depth / torch.from_numpy(metres()) - 1).abs() < 0.05).float().mean()) > 0.9  # but for its outlines
     with pytest.raises(spackle.InputError, match="which format"):
         scene.export(io.BytesIO())
 

@@ -25,11 +25,7 @@ EXAMPLES = (
     ("spackle view photo.jpg", "look at it in the browser"),
     ("spackle export out/photo/scene.ply -o photo.html", "one file to send"),
 )
-OPTIONS = (
-    ("--install-completion", "Completion for the shell that this is"),
-    ("-h, --help", "This; after a command, what it takes"),
-)
-RESEARCH = ("train", "dataset", "evaluate", "tables", "bench")
+RESEARCH = ("train", "dataset", "evaluate", "tables", "figures", "bench")
 WIDTH = 80
 
 
@@ -49,9 +45,7 @@ class Overview(TyperGroup):
             for name, command in rows:
                 if (name in RESEARCH) == wanted:
                     write(f"  {name:<{indent - 2}}{command.get_short_help_str(WIDTH - indent)}\n")
-        write("\nOptions:\n")
-        for name, meaning in OPTIONS:
-            write(f"  {name:<22}{meaning}\n")
+        write("\n-h after a command shows what it takes; --install-completion completes words in this shell.\n")
 
 
 app = typer.Typer(
