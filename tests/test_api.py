@@ -119,7 +119,7 @@ JPEG = b"\xff\xd8" + bytes(100_000)
         (np.zeros((48, 64, 3)), {"base": "sharpest"}, "sharp"),
         (np.zeros((48, 64, 3)), {"residual": "no" * 9000}, "no such weight file"),
     ],
-    ids=repr,
+    ids=lambda value: value if isinstance(value, str) and len(value) < 30 else type(value).__name__,
 )
 def test_whatever_it_is_given_the_message_is_short(photo: Any, options: Any, words: str) -> None:
     with pytest.raises(spackle.InputError) as caught:
