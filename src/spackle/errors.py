@@ -21,13 +21,8 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 2, 60, 60
 class InputError(ValueError):
     """Bad input from a person: the message names the file or value, what is wrong and what to do.
 
-    The command line prints the message as one line and exits with code 2. Of a longer message the middle is left out.
+    The command line prints the message as one line and exits with code 2.
     """
-
-    def __init__(self, message: str) -> None:
-        super().__init__(
-            message if len(message) <= LONGEST else f"{message[: LONGEST // 2]} … {message[3 - LONGEST // 2 :]}"
-        )
 
 
 def reason_in_a_line(error: object) -> str:
@@ -81,6 +76,18 @@ def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         return called
 
     return decorate
+
+
+@contextlib.contextmanager
+def short_messages() -> Iterator[None]:
+    """Leave the middle out of messages of more than 300 characters, as those about a value that a program gave."""
+    try:
+        yield
+    except InputError as error:
+        message, half = str(error), LONGEST // 2 - 2
+        if len(message) <= LONGEST:
+            raise
+        raise InputError(f"{message[:half]} … {message[-half:]}") from error
 
 
 def check_name(option: str, name: str, known: Iterable[str]) -> None:

@@ -20,7 +20,7 @@ from spackle.bases.depth_map import DepthKind, DepthMap, depth_of_array, load_de
 from spackle.bases.open import open_base, open_loaded
 from spackle.bases.settings import AUTO, BaseSettings
 from spackle.camera_path import TrajectoryKind
-from spackle.errors import InputError, renamed, shown
+from spackle.errors import InputError, renamed, short_messages, shown
 from spackle.image import Photo, load_photo, photo_of_picture
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
 from spackle.progress import LogReporter
@@ -95,7 +95,7 @@ class Spackle:
         pipeline, options = self._pipeline, self._pipeline.options
         options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
         options.path.check()
-        with contextlib.ExitStack() as stack:
+        with short_messages(), contextlib.ExitStack() as stack:
             if depth is not None:
                 source = stack.enter_context(_depth(depth, depth_kind))
                 options = dataclasses.replace(
@@ -149,7 +149,8 @@ def predict(
         InputError: a photo, a depth map, a name or weights that cannot be used; a base beside depth, or a lens for a
             photo that is loaded.
     """
-    session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
+    with short_messages():
+        session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
     path: dict[str, Any] = {"trajectory": trajectory, "disparity": disparity, "depth_kind": depth_kind}
     lens: dict[str, Any] = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
     return session.predict(photo, depth, **path, **lens, keep_frame=keep_frame, progress=progress)
