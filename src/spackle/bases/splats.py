@@ -32,7 +32,7 @@ TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
 # close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
-BACKING_SPREAD = 0.48  # of the backing's, in its sides; wider ones are seen beyond the rims of what stands before them
+BACKING_SPREAD = 0.45  # of the backing's, in its sides; wider ones are seen beyond the rims of what stands before them
 LARGE_BACKING_SPREAD = 0.65  # of those for more than 2×2 pixels, which keep away from depth steps
 BACKING_GAP = 0.005  # the backing's distance behind the front, relative
 WORTH = 0.015  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
