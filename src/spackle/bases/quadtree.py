@@ -16,38 +16,45 @@ from spackle.device import run_chunks
 
 LEVELS = 3  # the largest tiles have 8×8 pixels
 BEND = np.float32(0.003)  # most that the inverse depth in and around a tile leaves its plane, relative
+SQUARE, FLAT, TALL = 0, 1, 2  # one tile for a block, or two halves of it: one above the other, or side by side
+SAMPLE = 100_000  # blocks that are enough for a median
+GRAIN = 16  # rows of blocks that a thread takes at a time
 
 
 @dataclasses.dataclass(frozen=True)
 class Tiles:
-    """Squares of one size that lie on a grid of such squares."""
+    """Rectangles of one size that lie on a grid of such rectangles."""
 
-    side: int  # pixels
+    height: int  # pixels
+    width: int
     rows: Tensor  # [N] of the grid
     columns: Tensor  # [N]
 
     def means(self, image: Tensor) -> Tensor:
         """[N, ...]: an image's [H, W, ...] mean in each."""
-        return block_means(image, self.side)[self.rows, self.columns]
+        flat, width = image.flatten(0, 1), image.shape[1]
+        first = self.rows * (self.height * width) + self.columns * self.width
+        total = sum(flat[first + (y * width + x)] for y in range(self.height) for x in range(self.width))
+        return cast("Tensor", total) / (self.height * self.width)
 
     def centers(self) -> Tensor:
         """[N, 2] in pixels, as (x, y)."""
-        return (torch.stack([self.columns, self.rows], dim=-1) + 0.5) * self.side
+        return torch.stack([(self.columns + 0.5) * self.width, (self.rows + 0.5) * self.height], dim=-1)
 
 
-def block_means(image: Tensor, side: int) -> Tensor:
-    """[H/side, W/side, ...]: an image's mean in each whole block of a grid."""
-    rows, columns = (n // side * side for n in image.shape[:2])
-    tall = sum(image[y:rows:side, :columns] for y in range(side))
-    return cast("Tensor", sum(cast("Tensor", tall)[:, x::side] for x in range(side))) / side**2
+def grid_means(image: Tensor, height: int, width: int) -> Tensor:
+    """[H/height, W/width, ...]: an image's mean in each whole rectangle of a grid."""
+    rows, columns = image.shape[0] // height * height, image.shape[1] // width * width
+    tall = sum(image[y:rows:height, :columns] for y in range(height))
+    return cast("Tensor", sum(cast("Tensor", tall)[:, x::width] for x in range(width))) / (height * width)
 
 
 class Quadtree:
-    """Blocks of 2×2, 4×4, … pixels, and what each would lose as one tile.
+    """Blocks of 2×2, 4×4, … pixels, and what each would lose as one tile or as two halves.
 
     Lost is the squared difference from tiles' means with smooth transitions, summed over pixels, mean of channels. A
     block with a pixel that is not free, or a depth that leaves its plane, in it or within a block's side around it is
-    no tile: its Gaussian reaches as far. Nor is a steep one.
+    not for tiles: their Gaussians reach as far. Nor is a steep one.
     """
 
     def __init__(
@@ -64,17 +71,24 @@ class Quadtree:
             steepest: most that the inverse depth changes across a block, relative.
         """
         self.shape = inverse_depth.shape
-        self.lost: list[Tensor] = []  # [H/side, W/side] for each level
-        for side in (2**level for level in range(1, levels + 1)):
-            means = [block_means(image, side) for image in (picture, inverse_depth, slope)]
-            arrays = [image.contiguous().numpy() for image in (picture, inverse_depth, free, *means)]
-            lost = np.empty(means[1].shape, np.float32)
-            _measure_all(side, np.float32(steepest), lost, arrays)
-            self.lost.append(torch.from_numpy(lost))
+        self.lost: list[Tensor] = []  # [H/side, W/side, 3] for each level: of one tile, of flat and of tall halves
+        for level in range(1, levels + 1):
+            side = 2**level
+            rows, columns = (n // side for n in self.shape)
+            if rows and columns:
+                inside = picture[: rows * side, : columns * side]
+                means = [grid_means(inside, h, w) for h, w in _sizes(side)]
+                planes = (grid_means(inverse_depth, side, side), grid_means(slope, side, side))
+                arrays = [image.contiguous().numpy() for image in (picture, *means, inverse_depth, *planes, free)]
+                lost = np.empty((rows, columns, 3), np.float32)
+                _measure_all(side, np.float32(steepest), lost, arrays)
+                self.lost.append(torch.from_numpy(lost))
 
     def detail(self) -> float:
         """The median deviation of pixels from what a tile of 2×2 would show, where there may be one."""
-        finite = self.lost[0][torch.isfinite(self.lost[0])] if self.lost else torch.empty(0)
+        lost = self.lost[0][..., SQUARE] if self.lost else torch.empty(0)
+        finite = lost[torch.isfinite(lost)]
+        finite = finite[:: 1 + len(finite) // SAMPLE]
         return math.sqrt(float(finite.median()) / 4) if finite.numel() else 0.0
 
     def cut(self, worth: float) -> tuple[Tensor, list[Tiles]]:
@@ -82,36 +96,53 @@ class Quadtree:
 
         Returns [H, W] bool, which pixels stay for themselves, and the tiles.
         """
-        cost, whole = torch.full(self.shape, worth), []
+        single = torch.ones(self.shape, dtype=torch.bool)
+        cost = torch.full(self.shape, worth)
+        choices = []
         for lost in self.lost:
-            parts = 4 * block_means(cost[: 2 * lost.shape[0], : 2 * lost.shape[1]], 2)
-            whole.append(lost + worth < parts)
-            cost = torch.minimum(lost + worth, parts)
-        single, tiles = torch.ones(self.shape, dtype=torch.bool), []
-        for level in range(len(whole), 0, -1):
-            side, (rows, columns) = 2**level, whole[level - 1].shape
-            chosen = whole[level - 1] & single[: rows * side : side, : columns * side : side]
-            tiles.append(Tiles(side, *chosen.nonzero(as_tuple=True)))
-            covered = chosen.repeat_interleave(side, 0).repeat_interleave(side, 1)
-            single[: rows * side, : columns * side] &= ~covered
+            parts = 4 * grid_means(cost[: 2 * lost.shape[0], : 2 * lost.shape[1]], 2, 2)
+            options = lost + worth * torch.tensor([1.0, 2.0, 2.0])
+            cost, choice = torch.cat([options, parts[..., None]], dim=-1).min(dim=-1)
+            choices.append(choice)
+        tiles = []
+        for level in range(len(choices), 0, -1):
+            side, choice = 2**level, choices[level - 1]
+            rows, columns = (n * side for n in choice.shape)
+            open_ = single[:rows:side, :columns:side]
+            for shape, (height, width) in enumerate(_sizes(side)):
+                chosen = open_ & (choice == shape)
+                chosen = chosen.repeat_interleave(side // height, 0).repeat_interleave(side // width, 1)
+                tiles.append(Tiles(height, width, *chosen.nonzero(as_tuple=True)))
+            left = ~open_ | (choice > TALL)
+            single[:rows, :columns] &= left.repeat_interleave(side, 0).repeat_interleave(side, 1)
         return single, [part for part in tiles if len(part.rows)]
 
 
+def _sizes(side: int) -> tuple[tuple[int, int], ...]:
+    """(height, width) of a block's tiles: SQUARE, FLAT, TALL."""
+    return (side, side), (side // 2, side), (side, side // 2)
+
+
 def _measure_all(side: int, steepest: np.float32, lost: NDArray[np.float32], arrays: list[NDArray[Any]]) -> None:
-    run_chunks(lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost), grain=16)
+    run_chunks(lambda start, stop: _measure(start, stop, side, steepest, lost, *arrays), len(lost), GRAIN)
 
 
 @kernel
 def _measure(
     start: int, stop: int, side: int, steepest: Any, lost: Any,
-    picture: Any, inverse_depth: Any, free: Any, colors: Any, depths: Any, slopes: Any,
+    picture: Any, square: Any, flat: Any, tall: Any, inverse_depth: Any, depths: Any, slopes: Any, free: Any,
 ) -> None:  # fmt: skip
     """Rows start..stop of the blocks."""
     for row in range(start, stop):
         for column in range(lost.shape[1]):
-            lost[row, column] = np.inf
-            if _fits(row, column, side, steepest, inverse_depth, depths[row, column], slopes[row, column], free):
-                lost[row, column] = _lost(row, column, side, colors, picture)
+            if not _fits(row, column, side, steepest, inverse_depth, depths[row, column], slopes[row, column], free):
+                lost[row, column, :] = np.inf
+                continue
+            lost[row, column, SQUARE] = _lost(row, column, side, side, square, picture)
+            lost[row, column, FLAT] = lost[row, column, TALL] = 0
+            for half in range(2):
+                lost[row, column, FLAT] += _lost(2 * row + half, column, side // 2, side, flat, picture)
+                lost[row, column, TALL] += _lost(row, 2 * column + half, side, side // 2, tall, picture)
 
 
 @kernel
@@ -132,19 +163,19 @@ def _fits(
 
 
 @kernel
-def _lost(row: int, column: int, side: int, means: Any, picture: Any) -> Any:
-    """Squared difference of a block's pixels from its grid's means, interpolated bilinearly."""
+def _lost(row: int, column: int, height: int, width: int, means: Any, picture: Any) -> Any:
+    """Squared difference of a tile's pixels from its grid's means, interpolated bilinearly."""
     rows, columns, channels = means.shape
     total = np.float32(0)
-    for y in range(side):
-        v = (y + np.float32(0.5)) / side - np.float32(0.5)
+    for y in range(height):
+        v = (y + np.float32(0.5)) / height - np.float32(0.5)
         row2, v = min(max(row + (1 if v > 0 else -1), 0), rows - 1), abs(v)
-        for x in range(side):
-            u = (x + np.float32(0.5)) / side - np.float32(0.5)
+        for x in range(width):
+            u = (x + np.float32(0.5)) / width - np.float32(0.5)
             column2, u = min(max(column + (1 if u > 0 else -1), 0), columns - 1), abs(u)
             for c in range(channels):
                 here = (1 - u) * means[row, column, c] + u * means[row, column2, c]
                 there = (1 - u) * means[row2, column, c] + u * means[row2, column2, c]
-                off = picture[row * side + y, column * side + x, c] - ((1 - v) * here + v * there)
+                off = picture[row * height + y, column * width + x, c] - ((1 - v) * here + v * there)
                 total += off * off
     return total / channels

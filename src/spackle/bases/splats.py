@@ -5,18 +5,17 @@ Together they blend to what the photo shows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from spackle._numba import kernel
 from spackle.bases.edges import Floats
-from spackle.bases.quadtree import LEVELS, Quadtree, Tiles, block_means
+from spackle.bases.quadtree import LEVELS, Quadtree, Tiles
 from spackle.bases.silhouettes import Layers, find_layers
 from spackle.camera import Camera
 from spackle.color import linear_to_srgb
@@ -28,25 +27,30 @@ SPREAD_PX = 0.5  # standard deviation of a pixel's Gaussian
 # Not higher: a blob that would bring the transmittance below the renderer's stop (1e-4) is not drawn at all, so
 # behind a thin veil of alpha 0.9 one of opacity 0.999 would leave a hole that nothing can fill.
 OPACITY = np.float32(0.99)
-TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
 # Blobs of half a pixel reproduce the photo sharply, but light passes between them. Blobs wide enough to
 # close the surface would blur it. So a coarse backing, one blob for 2×2 pixels or more, closes it from behind:
 # 2 dB sharper at the photo's camera than one layer of wider blobs.
-BACKING_SPREAD = 0.45  # of the backing's, in its sides; wider ones are seen beyond the rims of what stands before them
-LARGE_BACKING_SPREAD = 0.65  # of those for more than 2×2 pixels, which keep away from depth steps
+TILE_SPREAD = 0.55  # standard deviation of a tile's Gaussian, in its sides
+BACKING_SPREAD = 0.55  # of the backing's for 2×2 pixels
+RIM_BACKING_SPREAD = 0.42  # of those at a near surface's rim, beyond which they would be seen from beside
+LARGE_BACKING_SPREAD = 0.65  # and of its larger ones, which keep away from depth steps
 BACKING_GAP = 0.005  # the backing's distance behind the front, relative
-WORTH = 0.015  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
+BACKING_SLOPE_GAP = 2.0  # and so many of its sides further along a slanted surface, so that none pokes through
+RIM_BACKING_SLOPE_GAP = 0.5  # at a near rim: what stands far behind it shows beyond it, as teeth, from beside
+MAX_BACKING_GAP = 0.2
+WORTH = 0.012  # the squared difference in sRGB that one Gaussian is worth, over the photo's detail
 LEAST_WORTH, MOST_WORTH = 1e-5, 2e-4
 STEEPEST = 0.06  # change of the inverse depth across a tile
 STEEPEST_BACKING = 0.01  # and across one of the backing, which stands the farther behind the steeper it is
 BACKING_SHARE = 0.02  # of a difference in the backing that shows
-LEAST_MIXED = 0.05  # share of a pixel
+LEAST_MIXED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+MOST = 1.5  # Gaussians a pixel
 FITS = 3  # corrections of the colours
 UNTOUCHED = 2  # rings beside a step whose colours stay, as the border's do: corrected ones show as ghosts from beside
 
 
 def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, levels: int = LEVELS) -> Gaussians:
-    """Gaussians which blend to the photo from its camera.
+    """At most 1.5 Gaussians a pixel, which blend to the photo from its camera.
 
     First come those of single pixels in row-major order, on the surface that covers most of the pixel; then tiles of
     up to 8×8 pixels, where the picture and the depth allow them; then the other surface of pixels that a depth step
@@ -65,10 +69,14 @@ def layered_gaussians(inverse_depth: Tensor, colors: Tensor, camera: Camera, lev
     worth = min(max(WORTH * tree.detail(), LEAST_WORTH), MOST_WORTH)
     single, tiles = tree.cut(worth)
     surface = _Surface(inverse_depth, slope, colors, torch.full_like(inverse_depth, float(OPACITY)))
-    most, rest, mixed, near = _split(layers, colors)
-    front = [most.pixels(single, camera), *(surface.samples(part, TILE_SPREAD) for part in tiles)]
-    parts = [*front, rest.pixels(mixed, camera), *_backing(most, mixed, near, ring > 0, worth, levels)]
-    samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+    front = [surface.samples(part, TILE_SPREAD) for part in tiles]
+    for least in LEAST_MIXED:
+        pixels = _split(layers, least, colors)
+        rest = pixels.rest.pixels(pixels.mixed, camera)
+        parts = [pixels.most.pixels(single, camera), *front, rest, *_backing(pixels, worth, levels)]
+        samples = _Samples(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+        if len(samples.uv) <= MOST * single.numel():
+            break
     corrected = _inner((ring == 0) | (ring > UNTOUCHED))[single]
     return surface_gaussians(camera, *_fitted(samples, colors, single, corrected, tiles))
 
@@ -123,48 +131,71 @@ class _Surface(NamedTuple):
         """An opaque Gaussian for each tile, `spread` of its sides wide; a cell of the surface is `pixels` wide."""
         depth, slope, color = (tiles.means(image) for image in (self.depth, self.slope, self.color))
         opacity = torch.full_like(depth, float(OPACITY))
-        spreads = torch.full_like(slope, spread * tiles.side * pixels)
-        return _Samples(tiles.centers() * pixels, depth, slope, spreads, color, opacity)
+        sides = torch.tensor([tiles.width, tiles.height]) * (spread * pixels)
+        return _Samples(tiles.centers() * pixels, depth, slope, sides.expand(len(depth), 2), color, opacity)
 
 
-def _split(layers: Layers, colors: Tensor) -> tuple[_Surface, _Surface, Tensor, Tensor]:
-    """The surface that covers most of each pixel, the other one, and [H, W] where that shows and which is the near one.
+class _Pixels(NamedTuple):
+    """The surfaces of a photo's pixels."""
 
-    A pixel is mixed where either surface covers at least `LEAST_MIXED` of it; else one covers all.
-    """
-    alpha = torch.from_numpy(layers.alpha)
+    most: _Surface  # the one that covers most of a pixel
+    rest: _Surface  # the other one, where `mixed`
+    mixed: Tensor  # [H, W] bool
+    near: Tensor  # [H, W] bool: `most` is the near one of both
+    edge: Tensor  # [H, W] bool: a depth step is close
+
+
+def _split(layers: Layers, least: float, colors: Tensor) -> _Pixels:
+    """A pixel is mixed where either surface covers at least `least` of it; else one covers all."""
+    ring, alpha = torch.from_numpy(layers.ring), torch.from_numpy(layers.alpha)
     near = alpha >= 0.5
-    mixed = torch.minimum(alpha, 1 - alpha) >= LEAST_MIXED
+    mixed = torch.minimum(alpha, 1 - alpha) >= least
     opacity = float(OPACITY) * blended_opacities(torch.where(mixed, alpha, near.float()).numpy(), layers.ring)
     surfaces = []
     for side, opaque in enumerate((torch.from_numpy(opacity), torch.full_like(alpha, float(OPACITY)))):
         depth, slope, own = (torch.from_numpy(a[side]) for a in (layers.depth, layers.slope, layers.color))
         surfaces.append(_Surface(depth, slope, torch.where(mixed[..., None], own, colors), opaque))
-    return surfaces[1].instead(near, surfaces[0]), surfaces[0].instead(near, surfaces[1]), mixed, near
+    most, rest = surfaces[1].instead(near, surfaces[0]), surfaces[0].instead(near, surfaces[1])
+    return _Pixels(most, rest, mixed, near, ring > 0)
 
 
-def _backing(
-    most: _Surface, mixed: Tensor, near: Tensor, edge: Tensor, worth: float, levels: int
-) -> Iterator[_Samples]:
-    """A wide Gaussian for each 2×2 pixels, behind the farthest of them; one for more in flat places.
+def _backing(pixels: _Pixels, worth: float, levels: int) -> list[_Samples]:
+    """A wide Gaussian for each 2×2 pixels, behind the farthest of them and in its surface; one for more in flat places.
 
-    None is where the rest of a mixed pixel lies behind, or pixels of both sides of an edge [H, W] lie in one cell.
+    None is where only the rest of mixed pixels lies behind, or where pixels of both surfaces lie in one cell.
     """
-    if min(edge.shape) < 2:
-        return
-    slope, color = block_means(most.slope, 2), block_means(most.color, 2)
-    depth = -max_pool2d(-most.depth[None, None], 2)[0, 0]
-    has_near, has_far, has_rest = (block_means(a.float(), 2) > 0 for a in (edge & near, edge & ~near, mixed & near))
-    wanted = ~(has_near & has_far | has_rest)
-    flat = _inner(wanted & ~has_near & ~has_far)
-    tree = Quadtree(linear_to_srgb(color), depth, 2 * slope, flat, levels, STEEPEST_BACKING)
+    behind = pixels.mixed & pixels.near
+    deepest = pixels.most.instead(behind, pixels.rest)
+    cells = _cells(deepest.depth)
+    if not cells.numel():  # one pixel high or wide
+        return []
+    far, pick = cells.min(dim=-1)
+    slope = _cells(deepest.slope).gather(2, pick[..., None, None].expand(*pick.shape, 1, 2)).squeeze(2)
+    # The cell's centre lies half a pixel from the farthest pixel's.
+    offset = torch.stack([0.5 - pick % 2, 0.5 - pick // 2], dim=-1)
+    at_center = (far + (slope * offset).sum(-1)).clamp_min(0.5 * far.min())
+    # Its colour is the mean of the pixels on that surface.
+    same = (cells - far[..., None] < 0.02 * far[..., None]).to(far)
+    color = (_cells(deepest.color) * same[..., None]).sum(2) / same.sum(2)[..., None]
+    has_near, has_far = (_cells(pixels.edge & side).any(-1) for side in (pixels.near, ~pixels.near))
+    wanted = torch.where(has_far, ~has_near, ~_cells(behind).any(-1))
+    flat = _inner(wanted & ~_cells(pixels.edge).any(-1))
+    tree = Quadtree(linear_to_srgb(color), at_center, 2 * slope, flat, levels, STEEPEST_BACKING)
     single, tiles = tree.cut(worth / BACKING_SHARE)
-    surface = _Surface(depth, slope, color, torch.ones_like(depth))
-    for part in (*tiles, Tiles(1, *(single & wanted).nonzero(as_tuple=True))):
-        samples = surface.samples(part, BACKING_SPREAD if part.side == 1 else LARGE_BACKING_SPREAD, pixels=2)
-        # Along a slanted surface half a side more, so that none pokes through.
-        gap = BACKING_GAP + 0.5 * part.side * samples.slope.abs().sum(-1) / samples.depth
-        yield samples._replace(depth=samples.depth * (1 - gap), slope=samples.slope * (1 - gap)[:, None])
+    surface = _Surface(at_center, slope, color, torch.full_like(far, float(OPACITY)))
+    kinds = (~has_near, BACKING_SPREAD, BACKING_SLOPE_GAP), (has_near, RIM_BACKING_SPREAD, RIM_BACKING_SLOPE_GAP)
+    parts = [(part, LARGE_BACKING_SPREAD, BACKING_SLOPE_GAP) for part in tiles]
+    for where, spread, slope_gap in kinds:
+        parts.append((Tiles(1, 1, *(single & wanted & where).nonzero(as_tuple=True)), spread, slope_gap))
+    return [_receded(surface.samples(part, spread, pixels=2), part, gap) for part, spread, gap in parts]
+
+
+def _receded(samples: _Samples, tiles: Tiles, slope_gap: float) -> _Samples:
+    """The backing behind the front, by so many of its sides along a slanted surface; `tiles` are of cells."""
+    reach = 2 * slope_gap * torch.tensor([tiles.width, tiles.height])
+    gap = BACKING_GAP + (reach * samples.slope.abs()).sum(-1) / samples.depth
+    recede = 1.0 - gap.clamp_max(MAX_BACKING_GAP)
+    return samples._replace(depth=samples.depth * recede, slope=samples.slope * recede[:, None])
 
 
 def _inner(free: Tensor) -> Tensor:
@@ -172,6 +203,13 @@ def _inner(free: Tensor) -> Tensor:
     inner = torch.zeros_like(free)
     inner[1:-1, 1:-1] = free[1:-1, 1:-1]
     return inner
+
+
+def _cells(image: Tensor) -> Tensor:
+    """[H, W, ...] to [H/2, W/2, 4, ...]: the pixels of each 2×2 cell in row-major order."""
+    height, width = (n // 2 for n in image.shape[:2])
+    grid = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *image.shape[2:])
+    return grid.transpose(1, 2).flatten(2, 3)
 
 
 WEIGHTS = np.exp(-0.5 / SPREAD_PX**2 * np.array([2, 1, 2, 1, 0, 1, 2, 1, 2])).astype(np.float32)  # of 3×3 neighbours
