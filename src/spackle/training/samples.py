@@ -248,14 +248,18 @@ def make_samples(
         rng = np.random.default_rng([seed, index])
         return int(rng.choice(len(sources), p=shares / shares.sum())), rng
 
-    choices = [drawn(index)[0] for index in range(views)]
+    places, counts = list[tuple[int, int]](), [0] * len(sources)  # of each view: its source, and its number there
+    for index in range(views):
+        choice = drawn(index)[0]
+        places.append((choice, counts[choice]))
+        counts[choice] += 1
     mine = range(*(views * part // rank_count() for part in (rank(), rank() + 1)))  # one process reads a photo's views
     for done, index in enumerate(mine, 1):
         if _crop_files(folder, index) is None:
-            (choice, rng), crops = drawn(index), list[Sample]()
-            source, number = sources[choice], choices[:index].count(choice)  # of the source's views
+            (choice, place), rng, crops = places[index], drawn(index)[1], list[Sample]()
+            source = sources[choice]
             try:
-                view = source.view(rng, number if source.views is None else number % source.views)
+                view = source.view(rng, place if source.views is None else place % source.views)
                 crops = random_crops(view, rng, data.crops, data.cells)
             except (InputError, ValueError) as error:
                 warn(str(error))
