@@ -17,7 +17,7 @@ from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.errors import renamed
 from spackle.files import Target, check_writable, write_bytes
-from spackle.formats.ply import PlyFile
+from spackle.formats.ply import PlyFile, save_ply
 from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of
 from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
@@ -128,7 +128,10 @@ class Scene:
                 goes.
         """
         reach = self.disparity if disparity is None else disparity
-        write_bytes(dataclasses.replace(self, disparity=reach).to_bytes("ply"), target)
+        if isinstance(target, str | os.PathLike):
+            save_ply(self.gaussians, target, camera=self.camera, base_count=len(self.base), disparity=reach)
+        else:
+            target.write(dataclasses.replace(self, disparity=reach).to_bytes("ply"))
 
     def page(self, name: str, note: str = "") -> PageScene:
         """The scene for the page of `spackle view`, under a name, with a note as `page_scene` has it."""

@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,12 @@ Pixels = NDArray[Any] | Tensor
 PhotoSource = str | os.PathLike[str] | bytes | BinaryIO | Image.Image | Pixels | Photo
 DepthSource = str | os.PathLike[str] | bytes | BinaryIO | Pixels | DepthMap
 Residual = str | os.PathLike[str] | ResidualNet | None
-T = TypeVar("T")
 
 
 class Spackle:
     """Completes many photos with networks that are loaded once, at the first photo that needs them."""
 
+    @short_messages()
     def __init__(
         self,
         base: str | Base = AUTO,
@@ -52,8 +52,8 @@ class Spackle:
 
         Args:
             base: as `--base` names it, or a loaded one, such as `SharpBase.load(weights)`. "auto" takes the best for
-                each photo: its depth, else SHARP or MoGe where weights have been downloaded, else
-                lite, whose geometry is rough. The logger "spackle" is told which, and warned of what cannot be used.
+                each photo: its depth, else SHARP or MoGe where weights have been downloaded, else lite, whose geometry
+                is rough. The logger "spackle" is told which, and warned of what cannot be used.
             residual: a file of weights, a loaded network, "seeds" for none, or "none", which leaves the holes open;
                 None: the weights that come with Spackle.
             fill: where texture comes from, see `spackle.pipeline.open_texture`; "none" leaves the holes open.
@@ -72,6 +72,7 @@ class Spackle:
         self._given = not isinstance(base, str) or base not in (AUTO, "rgbd")
         self._pipeline = Pipeline(options, opened, network or chosen.load(), renderer or get_renderer(device))
 
+    @short_messages()
     def predict(
         self,
         photo: PhotoSource,
@@ -95,7 +96,7 @@ class Spackle:
         pipeline, options = self._pipeline, self._pipeline.options
         options = dataclasses.replace(options, path=PathOptions(trajectory, disparity))
         options.path.check()
-        with short_messages(), contextlib.ExitStack() as stack:
+        with contextlib.ExitStack() as stack:
             if depth is not None:
                 source = stack.enter_context(_depth(depth, depth_kind))
                 options = dataclasses.replace(
@@ -135,8 +136,8 @@ def predict(
             metres (0, NaN or inf: unknown), or a loaded depth map.
         base, residual, fill, device, renderer: see `Spackle`.
         trajectory: the path that the scene is completed for, besides the views farthest to the left and to the right.
-        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as
-            the photo bears it (see `choose_move`), at most 0.15 for lite, else 0.3.
+        disparity: how far the path goes, see `spackle.camera_path.max_offset`; where None as far as the
+            photo bears it (see `choose_move`), at most 0.15 for lite, else 0.3.
         depth_kind: what the numbers of a depth map's file are, see `spackle.load_depth`.
         keep_frame: keep a uniform frame around a file's picture; it is otherwise cut off where neither depth nor a
             focal length is given.
@@ -149,11 +150,18 @@ def predict(
         InputError: a photo, a depth map, a name or weights that cannot be used; a base beside depth, or a lens for a
             photo that is loaded.
     """
-    with short_messages():
-        session = Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer)
-    path: dict[str, Any] = {"trajectory": trajectory, "disparity": disparity, "depth_kind": depth_kind}
-    lens: dict[str, Any] = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    return session.predict(photo, depth, **path, **lens, keep_frame=keep_frame, progress=progress)
+    return Spackle(base, residual=residual, fill=fill, device=device, renderer=renderer).predict(
+        photo,
+        depth,
+        trajectory=trajectory,
+        disparity=disparity,
+        depth_kind=depth_kind,
+        keep_frame=keep_frame,
+        focal_px=focal_px,
+        focal_mm=focal_mm,
+        fov=fov,
+        progress=progress,
+    )
 
 
 @contextlib.contextmanager

@@ -77,7 +77,7 @@ def open_folder(output: Path, config: Mapping[str, Any], about: Mapping[str, Any
 
 
 def image_file(output: Path, index: int, name: str, suffix: str) -> Path:
-    """One of an image's files: its rows (.json), its strip (.png), or its picture by a method (.METHOD.webp)."""
+    """One of an image's files: its rows (.json), or one of its pictures (.METHOD.webp)."""
     return output / IMAGES / f"{index:05d}-{re.sub(r'[^A-Za-z0-9.-]+', '_', name)[-80:]}{suffix}"
 
 

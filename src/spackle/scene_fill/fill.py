@@ -139,7 +139,7 @@ def fill_scene(
         cameras: the frames of a path, in their order; with `exact` any views.
         exact: look at every view and complete it if it has a hole; else holes too small to see may stay open, and
             every second frame of a long path is looked at.
-        progress: called with (views visited, views in all).
+        progress: called with (views visited, views that are visited in all).
     """
     if not cameras:
         return FilledScene(Gaussians.empty(context.base.means.device), {})
