@@ -228,7 +228,9 @@ def test_bad_input_is_a_value_error_that_names_the_file(scene: spackle.Scene, tm
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("example", sorted((Path(__file__).parents[1] / "examples").glob("*.py")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "example", sorted((Path(__file__).parents[1] / "examples").glob("0[1-3]*.py")), ids=lambda p: p.stem
+)
 def test_the_examples_run(tmp_path: Path, example: Path) -> None:
     pytest.importorskip("skimage.data")
     command = [sys.executable, "-W", "error", str(example), str(tmp_path / "new" / "out")]

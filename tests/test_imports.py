@@ -33,14 +33,15 @@ ALLOWED: dict[str, set[str]] = {
     "residual": {"values", "render", "bases"},
     "scene_fill": {"values", "render", "residual", "inpaint"},
     "clips": {"values", "render", "bases", "residual", "scene_fill", "inpaint", "formats"},
-    "web": {"values", "formats"},
-    "scene": {*BELOW_SCENE, "web"},
+    "page": {"values", "formats"},  # of the room `web`, which a scene shows itself with
+    "web": {*BELOW_SCENE, "scene", "page"},
+    "scene": {*BELOW_SCENE, "page"},
     "workers": {"values"},
     "dataset": {*BELOW_DATASET, "workers"},
     "training": {*BELOW_DATASET, "dataset"},
     "evaluation": {*BELOW_DATASET, "dataset", "training"},
     "app": {*BELOW_DATASET, "evaluation"},
-    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "web", "app", "workers", "clips"},
+    "cli": {*BELOW_DATASET, "dataset", "training", "evaluation", "web", "page", "app", "workers", "clips"},
 }
 
 # Runs in a fresh interpreter: hides every installed package that the core does not need, then imports all of ours.
@@ -89,6 +90,8 @@ def module_of(path: Path) -> str:
 def room_of(module: str) -> str:
     """The room of a module of ours."""
     first = [*module.split(".")[1:], ""][0]
+    if module == "spackle.web.page":
+        return "page"
     if first in SCENE:
         return "scene"
     return first if first in ALLOWED or (SOURCES / first).is_dir() else "values"

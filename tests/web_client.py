@@ -1,4 +1,4 @@
-"""The viewer's server with nothing behind it, and clients that behave well or not."""
+"""The server with nothing behind it, and clients that behave well or not, over real sockets of this machine."""
 
 from __future__ import annotations
 
@@ -7,34 +7,43 @@ import dataclasses
 import http.client
 import io
 import json
-import os
 import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
+import web_work
 from photos import picture
 from PIL import Image
 
-from spackle.web.guard import Limits
-from spackle.web.handler import Tell
-from spackle.web.page import PageScene
-from spackle.web.server import Complete, ViewerServer
+from spackle.web import create_app
+from spackle.web.guard import Access, Limits
+from spackle.web.jobs import Jobs, Keep
+from spackle.web.server import serving
 
-Where = ViewerServer | str  # the latter: the page's address
-PAGES = {"/": ("text/html; charset=utf-8", b"<p>page"), "/viewer.js": ("text/javascript", b"go()")}
-QUICK = Limits(pause=0.3, upload=0.6, send=0.5, heartbeat=0.05, stop=0.3, upload_bytes=100_000)
+QUICK = Limits(pause=0.3, upload=0.6, send=0.5, upload_bytes=100_000)
+SCENES, BOUNDARY = "/api/v1/scenes", "7d1"
 
 
-def saved(kind: str) -> bytes:
+def saved(kind: str, **options: Any) -> bytes:
     """A small picture as a file of a format."""
-    Image.fromarray(picture()).save(file := io.BytesIO(), kind)
+    Image.fromarray(picture()).save(file := io.BytesIO(), kind, **options)
     return file.getvalue()
 
 
 PHOTO = saved("PNG")
+
+
+def form(content: bytes = PHOTO, name: str = "photo.png", **fields: Any) -> bytes:
+    """A multipart body; a field's value is text, or a pair of a file's name and bytes."""
+    parts = b""
+    for field, value in {"photo": (name, content), **fields}.items():
+        file, data = value if isinstance(value, tuple) else (None, value.encode())
+        shown = "" if file is None else f'; filename="{file}"'
+        head = f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="{field}"{shown}\r\n\r\n'
+        parts += head.encode() + data + b"\r\n"
+    return parts + f"--{BOUNDARY}--\r\n".encode()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,43 +59,59 @@ class Reply:
         return json.loads(self.body)
 
 
-def a_scene(name: str = "a", content: bytes = b"layer", **more: Any) -> PageScene:
-    layers = [{"name": "base", "file": "base.bin", "count": 1}]
-    return PageScene({"name": name, "layers": layers}, {"base.bin": content}, **more)
+@dataclasses.dataclass(frozen=True)
+class Served:
+    """A server of this process, or one elsewhere."""
 
+    port: int
+    root: str = ""  # of the paths: the token
+    jobs: Jobs = None  # type: ignore[assignment]
 
-def complete(photo: Path, name: str, tell: Tell) -> PageScene:
-    """What stands for the network: the scene's one layer is the photo's bytes."""
-    tell({"stage": "base", "done": 1, "total": 2})
-    return a_scene(name, photo.read_bytes())
+    def ask(self, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
+        fields = {name.replace("_", "-"): value for name, value in headers.items()}
+        if body is not None:
+            fields.setdefault("Content-Type", f"multipart/form-data; boundary={BOUNDARY}")
+        with contextlib.closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)) as connection:
+            connection.request(method, self.root + path, body, fields)
+            answer = connection.getresponse()
+            return Reply(answer.status, dict(answer.headers), answer.read())
+
+    def send(self, content: bytes = PHOTO, name: str = "photo.png", **fields: Any) -> Reply:
+        return self.ask(SCENES, "POST", form(content, name, **fields))
+
+    def events(self, id: str) -> list[Any]:
+        """All that a job tells."""
+        blocks = self.ask(f"{SCENES}/{id}/events").body.decode().split("\n\n")
+        return [json.loads(block.removeprefix("data: ")) for block in blocks if block.startswith("data: ")]
+
+    def dial(self, data: bytes = b"") -> socket.socket:
+        connection = socket.create_connection(("127.0.0.1", self.port), timeout=5)
+        connection.sendall(data)
+        return connection
+
+    def raw(self, data: bytes) -> tuple[int, bytes]:
+        """The status and the body that the server has for these bytes, however wrong; 0 where it just hangs up."""
+        with self.dial(data) as connection:
+            head, _, body = answer_of(connection).partition(b"\r\n\r\n")
+            return int(head.split()[1]) if head else 0, body
 
 
 @contextlib.contextmanager
-def serving(work: Complete = complete, limits: Limits = QUICK, **options: Any) -> Iterator[ViewerServer]:
-    with ViewerServer(PAGES, work, limits=limits, **options) as server:
-        yield server
-
-
-def ask(where: Where, path: str = "/", method: str = "GET", body: bytes | None = None, **headers: str) -> Reply:
-    """A well-formed request to a server, or below the page's address."""
-    url = urlsplit(where if isinstance(where, str) else f"http://127.0.0.1:{where.port}")
-    if method == "POST":  # as every browser does
-        headers = {"Origin": f"http://{url.netloc}", **headers}
-    with contextlib.closing(http.client.HTTPConnection(url.netloc, timeout=60)) as connection:
-        fields = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection.request(method, url.path.rstrip("/") + path, body, fields)
-        answer = connection.getresponse()
-        return Reply(answer.status, dict(answer.headers), answer.read())
-
-
-def send(where: Where, content: bytes = PHOTO, name: str = "photo.png", **headers: str) -> Reply:
-    return ask(where, f"/photos?name={name}", "POST", content, **headers)
-
-
-def dial(server: ViewerServer, data: bytes = b"") -> socket.socket:
-    connection = socket.create_connection(("127.0.0.1", server.port), timeout=5)
-    connection.sendall(data)
-    return connection
+def served(
+    folder: Path,
+    token: str | None = "s3cret",
+    host: str = "127.0.0.1",
+    work: Any = web_work.work,
+    limits: Limits = QUICK,
+    keep: Keep = Keep(),  # noqa: B008
+) -> Iterator[Served]:
+    with socket.socket() as listener:
+        listener.bind((host, 0))
+        listener.listen()
+        address, port = listener.getsockname()
+        app = create_app(folder, work, keep=keep, access=Access.at(host, address, token), limits=limits)
+        with serving(app, listener, silent=0.3):
+            yield Served(port, f"/{token}" if token else "", app.state.jobs)
 
 
 def answer_of(connection: socket.socket) -> bytes:
@@ -96,41 +121,19 @@ def answer_of(connection: socket.socket) -> bytes:
     return b""
 
 
-def raw(server: ViewerServer, data: bytes) -> tuple[int, bytes]:
-    """The status and the body that the server has for these bytes, however wrong; 0 where it just hangs up."""
-    with dial(server, data) as connection:
-        head, _, body = answer_of(connection).partition(b"\r\n\r\n")
-        return int(head.split()[1]) if head else 0, body
-
-
 def request(target: str, *headers: str, method: str = "GET", host: str = "localhost") -> bytes:
-    """The head of a request."""
-    lines = [f"{method} {target} HTTP/1.1", f"Host: {host}", *headers]
+    """The head of a request, after which the connection ends."""
+    lines = [f"{method} {target} HTTP/1.1", f"Host: {host}", "Connection: close", *headers]
     return ("\r\n".join(lines) + "\r\n\r\n").encode("latin-1")
 
 
-def get(target: str, *headers: str, host: str = "localhost") -> bytes:
-    return request(target, "Connection: close", *headers, host=host)
+def post(length: int, *headers: str, method: str = "POST") -> bytes:
+    kind = f"Content-Type: multipart/form-data; boundary={BOUNDARY}"
+    return request(f"/s3cret{SCENES}", kind, f"Content-Length: {length}", *headers, method=method)
 
 
-def post(length: int, *headers: str, name: str = "a.png") -> bytes:
-    return request(
-        f"/photos?name={name}", "Origin: http://localhost", f"Content-Length: {length}", *headers, method="POST"
-    )
-
-
-def events(where: Where, job: str) -> list[Any]:
-    """All that a job tells, heartbeats left out."""
-    body = ask(where, f"{job}/events").body.decode()
-    return [json.loads(block.removeprefix("data: ")) for block in body.split("\n\n") if block.startswith("data: ")]
-
-
-def eventually(condition: Callable[[], object], within: float = 10.0) -> None:
+def eventually(condition: Callable[[], object], within: float = 20.0) -> None:
     end = time.monotonic() + within
     while not condition():
         assert time.monotonic() < end, "it did not come"
         time.sleep(0.01)
-
-
-def uploads_of(server: ViewerServer) -> list[str]:
-    return [name for _, _, names in os.walk(server.uploads.name) for name in names]

@@ -26,7 +26,7 @@ from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
 from spackle.views import PATH_FRAMES, scene_path
-from spackle.web import PageScene, page_scene, single_html
+from spackle.web.page import PageScene, page_scene, single_html
 
 DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
 

@@ -22,7 +22,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager
-from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -30,6 +29,7 @@ import torch
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.folders import differences
+from spackle.task_process import end_with_parent
 
 QUEUED = 2  # jobs of a worker: the one it works on, and the next; results that are not yet taken use memory
 MAX_WORKERS = 1024
@@ -147,9 +147,7 @@ def _start(threads: int, open_worker: Callable[[], PhotoWorker], numbers: Any) -
     global _open_worker
     _open_worker = functools.cache(open_worker)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     torch.set_num_threads(threads)
     if numbers is not None and torch.cuda.device_count() > 1:
         torch.cuda.set_device(numbers.get() % torch.cuda.device_count())
@@ -157,12 +155,6 @@ def _start(threads: int, open_worker: Callable[[], PhotoWorker], numbers: Any) -
 
 def _make(job: Any) -> Any:
     return _open_worker().make(job)
-
-
-def _end_with(sentinel: int) -> None:
-    """A worker whose main process was killed would wait for ever."""
-    connection.wait([sentinel])
-    os._exit(1)
 
 
 # On a Ray cluster ---------------------------------------------------------------------------------

@@ -19,23 +19,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from photos import write_pair
 from PIL import Image
 from scenes import box_before_wall, psnr
 from torch import Tensor
+from web_client import served
 
 from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
 from spackle.color import linear_to_srgb
-from spackle.formats import save_png
 from spackle.gaussians import Gaussians
 from spackle.gaussians import quat_to_matrix as matrices
 from spackle.pipeline import complete
 from spackle.render import CpuRenderer
 from spackle.scene import Scene
 from spackle.views import scene_path
-from spackle.web import PageScene, page_files, page_scene, single_html
-from spackle.web.page import BYTES, encode_layer
-from spackle.web.server import ViewerServer
+from spackle.web.guard import Limits
+from spackle.web.page import BYTES, PageScene, encode_layer, page_files, page_scene, single_html
+from spackle.web.work import SceneWork
 
 WEB = Path(__file__).parents[2] / "web"
 EVIL = "</script><b>&\"'\ud800"
@@ -254,7 +255,7 @@ def test_the_slider_opens_the_hole_and_only_the_hole_is_filled(page: Any) -> Non
     page.locator("#disparity").fill("0.3")
     assert page.evaluate("spackle.pose().eye") == pytest.approx(page.evaluate("spackle.eye('swipe', 0.3, 1)"))
     filled = canvas(page)
-    page.get_by_role("button", name="Base", exact=True).click(force=True)
+    page.get_by_role("button", name="What the photo shows", exact=True).click(force=True)
     base = canvas(page)
     hole, rest = hole_and_rest(page, *base.shape[:2])
     change = (filled - base).abs().amax(dim=-1)
@@ -308,23 +309,33 @@ def test_hand_and_keys_move_the_eye_within_the_limit(page: Any) -> None:
 
 
 def test_a_photo_is_sent_to_the_server_and_watched(browser: Any, tmp_path: Path) -> None:
-    photo = tmp_path / "my photo.png"
-    save_png(torch.rand(8, 8, 3), photo)
-
-    def complete_photo(path: Path, name: str, tell: Callable[[dict[str, object]], None]) -> PageScene:
-        tell({"stage": "complete", "done": 1, "total": 2})
-        return dataclasses.replace(made := page_of_box(name), description={**made.description, "note": "a; b"})
-
-    with ViewerServer(page_files(), complete_photo) as server:
-        server.show(page_of_box("First"))
-        found = opened(browser, server.url)
-        settled(found.page, "spackle.ready")
-        assert found.page.title() == "First · Spackle"
-        found.page.locator("#file").set_input_files(photo)
-        found.page.get_by_role("heading", name="my photo.png").wait_for()
-        settled(found.page, "spackle.settled()")
-        found.page.get_by_text("Gaussians · a").wait_for()
-        assert found.page.get_by_role("alert").text_content() == "a; b"
-        assert found.said == []
-        assert all(url.startswith((server.url, f"blob:{server.url}")) for url in found.asked)
-        found.page.context.close()
+    photo, depth = write_pair(tmp_path / "first")
+    photo = photo.rename(tmp_path / "my photo.png")
+    with served(tmp_path / "scenes", work=SceneWork(), limits=Limits()) as server:
+        address = f"http://127.0.0.1:{server.port}{server.root}/"
+        page = (found := opened(browser, address)).page
+        page.get_by_role("button", name="Choose a photo…").click()
+        page.locator("summary").click()
+        page.locator("[name=depth]").set_input_files(depth)
+        page.locator("#file").set_input_files(photo)
+        page.get_by_role("button", name="Start").click()
+        page.locator("#frame.waiting #photo").wait_for()  # the picture stands where the scene will
+        page.get_by_role("heading", name="my photo.png").wait_for()
+        page.locator("#notice").wait_for(state="hidden")
+        for start, name in (
+            (lambda: page.locator("#record").click(), "my-photo.mp4"),
+            (lambda: page.locator("#download").select_option(".glb"), "my-photo.glb"),
+        ):
+            with page.expect_download() as download:
+                start()
+            assert download.value.suggested_filename == name
+        page.reload()
+        settled(page, "spackle.ready")
+        assert page.title() == "my photo.png · Spackle"
+        page.get_by_role("button", name="Open a photo").click(force=True)
+        page.locator("#file").set_input_files({"name": "rough.png", "mimeType": "image/png", "buffer": b"no photo"})
+        page.get_by_role("button", name="Start").click()
+        page.get_by_text("rough.png: not an image").wait_for()
+        assert [line for line in found.said if "415" not in line] == []
+        assert all(url.startswith((address, f"blob:http://127.0.0.1:{server.port}")) for url in found.asked)
+        page.context.close()

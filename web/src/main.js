@@ -6,12 +6,13 @@ import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
 
 const STAGES = {
-  load: "Loading", base: "Finding depth", complete: "Filling what the photo hides", page: "Almost there",
+  load: "Loading", prepare: "Reading the depth map", base: "Finding depth", complete: "Filling what the photo hides",
+  write: "Almost there", measure: "Almost there", page: "Almost there",
 };
 const element = (id) => document.getElementById(id);
 const viewer = started();
 let upload = null; // what the server takes, where there is one
-let working = false;
+let working = null; // the scene that is waited for
 
 if (viewer) {
   control(viewer.canvas, viewer);
@@ -39,18 +40,24 @@ function started() {
 async function first() {
   const own = await source.embedded();
   if (own) return show(own);
-  const state = await source.current();
-  upload = state.upload;
+  ({ upload } = await source.current());
   element("open").hidden = !upload;
   if (upload) element("file").accept = upload.suffixes.join(",");
   element("choices").querySelector("select").replaceChildren(...(upload?.bases ?? []).map((name) => new Option(name)));
-  if (state.scene) await show(await source.load(state.scene, (share) => progress("load", share)));
-  if (state.job) await watch(state.job);
-  else if (!state.scene) notice("Spackle", "Open a photo, or drop one here, to look around in it.");
+  addEventListener("hashchange", () => chosen() && chosen() !== viewer.id && watch(chosen()));
+  if (chosen()) return watch(chosen());
+  for (const button of document.querySelectorAll("[data-example]")) button.firstChild.src = source.here(`/${button.dataset.example}`);
+  notice("Step into your photo", upload ? "Drop a photo here, or choose one, and look around in it." : "The address names no scene.");
+  element("notice").classList.add("empty");
 }
 
-async function show({ description, layers }) {
-  viewer.show(description, layers);
+/** The scene that the address names. */
+function chosen() {
+  return /^#([0-9a-f]{16})$/.exec(location.hash)?.[1];
+}
+
+async function show({ description, layers }, id = null) {
+  viewer.show(description, layers, id);
   element("name").textContent = description.name;
   document.title = `${description.name} · Spackle`;
   element("frame").hidden = false;
@@ -60,29 +67,44 @@ async function show({ description, layers }) {
   await viewer.stage.settled();
   element("frame").classList.remove("waiting");
   element("notice").hidden = true;
-  const places = description.downloads ?? {};
-  const saved = element("download");
-  saved.hidden = !Object.keys(places).length;
-  saved.replaceChildren(saved.options[0], ...Object.entries(places).map(([suffix, place]) => new Option(suffix, source.here(place))));
+  element("download").hidden = !id;
   if (description.note) say(description.note);
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) viewer.play();
 }
 
-/** Follow a job to its scene. */
-async function watch(job) {
-  working = true;
+/** Follow a photo to its scene; the photo stands in its place meanwhile. */
+async function watch(id) {
+  working = id;
   viewer.playing = false; // the processor is needed elsewhere
+  history.replaceState(null, "", `#${id}`);
+  if (!stand.url) stand(source.file(id, "photo.jpg"));
   progress(null, null);
   try {
-    const url = await source.follow(job, ({ stage, done, total, line }) => {
+    await source.follow(id, ({ stage, done, total, line }) => {
       if (stage) progress(stage, total ? done / total : null);
       else element("notice").querySelector("p").textContent = line;
     });
-    await show(await source.load(url, (share) => progress("load", share)));
+    await show(await source.load(id, (share) => progress("load", share)), id);
   } catch (error) {
     failed(error);
   }
-  working = false;
+  working = null;
+  stand(null);
+}
+
+/** Show a picture until the scene is there. */
+function stand(url) {
+  const photo = element("photo");
+  if (stand.url?.startsWith("blob:")) URL.revokeObjectURL(stand.url);
+  stand.url = url;
+  if (!url) return;
+  photo.onload = () => {
+    element("frame").hidden = false;
+    element("frame").classList.add("waiting");
+    fit(viewer, { width: photo.naturalWidth, height: photo.naturalHeight });
+  };
+  photo.onerror = () => url.startsWith("blob:") && /^[0-9a-f]{16}$/.test(working) && stand(source.file(working, "photo.jpg"));
+  photo.src = url;
 }
 
 async function open(photo) {
@@ -90,27 +112,30 @@ async function open(photo) {
   const suffix = /\.[^.]*$/.exec(photo.name.toLowerCase())?.[0] ?? "";
   if (!upload.suffixes.includes(suffix)) return say(`${photo.name}: not a photo; it takes ${upload.suffixes.join(", ")}`);
   if (photo.size > upload.max_bytes) return say(`${photo.name} is larger than ${Math.floor(upload.max_bytes / 2 ** 20)} MB`);
-  working = true;
+  working = "…";
+  stand(URL.createObjectURL(photo));
   progress(null, null);
   try {
     await watch(await source.send(photo, choices()));
   } catch (error) {
     failed(error);
   }
-  working = false;
+  working = null;
+  stand(null);
 }
 
 function uploads() {
   const file = element("file");
   const dialog = element("choices");
-  const ask = () => (upload?.bases?.length ? dialog.showModal() : file.click());
-  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = ask;
-  element("choose").onclick = () => file.click();
+  const start = element("start");
+  for (const button of document.querySelectorAll("[data-do=open]")) button.onclick = () => dialog.showModal();
+  for (const button of document.querySelectorAll("[data-example]")) button.onclick = () => example(button.dataset.example);
+  element("stop").onclick = () => source.remove(working).catch((error) => say(error.message));
   file.onchange = () => {
-    dialog.close();
-    open(file.files[0]);
-    file.value = "";
+    start.disabled = !file.files[0];
+    if (!dialog.open) take();
   };
+  start.onclick = take;
   const holdsFile = (event) => upload && !working && event.dataTransfer?.types.includes("Files");
   addEventListener("dragover", (event) => {
     event.preventDefault();
@@ -120,8 +145,23 @@ function uploads() {
   addEventListener("drop", (event) => {
     event.preventDefault();
     document.body.classList.remove("dropping");
-    if (holdsFile(event)) open(event.dataTransfer.files[0]);
+    if (!holdsFile(event)) return;
+    if (dialog.open) dialog.close();
+    open(event.dataTransfer.files[0]);
   });
+
+  function take() {
+    dialog.close();
+    open(file.files[0]);
+    file.value = "";
+    start.disabled = true;
+  }
+}
+
+/** One of the photos that come with the page. */
+async function example(name) {
+  const photo = await (await fetch(source.here(`/${name}`))).blob();
+  open(new File([photo], name, { type: photo.type }));
 }
 
 /** What the dialog says: {base, disparity, depth}. */
@@ -134,8 +174,10 @@ function choices() {
 function notice(title, text, busy = false) {
   const box = element("notice");
   box.hidden = false;
+  box.classList.remove("empty");
   box.classList.toggle("busy", busy);
   box.classList.toggle("may-open", !busy && Boolean(upload));
+  box.classList.toggle("may-stop", busy && Boolean(upload) && /^[0-9a-f]{16}$/.test(working));
   box.querySelector("h2").textContent = title;
   box.querySelector("p").textContent = text;
 }
@@ -151,21 +193,25 @@ function progress(stage, share) {
 }
 
 function failed(error) {
+  element("frame").classList.remove("waiting");
   if (viewer.description) {
+    history.replaceState(null, "", `#${viewer.id ?? ""}`);
     element("notice").hidden = true;
+    fit(viewer);
     say(error.message);
   } else {
+    element("frame").hidden = true;
     notice("That did not work", error.message);
   }
 }
 
-function say(text) {
+function say(text, stay = false) {
   const toast = element("toast");
   clearTimeout(say.timer);
   toast.classList.toggle("shown", Boolean(text));
   if (!text) return;
   toast.textContent = text;
-  say.timer = setTimeout(() => toast.classList.remove("shown"), 6000);
+  if (!stay) say.timer = setTimeout(() => toast.classList.remove("shown"), 6000);
 }
 
 /** For tests and for scripts in the console. Everything that changes the view resolves when it is drawn. */

@@ -29,12 +29,13 @@ export function panel(viewer, say) {
   element("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
   document.addEventListener("fullscreenchange", () => press("full", Boolean(document.fullscreenElement)));
   element("download").onchange = ({ target }) => {
-    saveFile(viewer, target.value, target.selectedOptions[0].text);
+    made(`scene${target.value}`, `Making the ${target.value} file…`);
     target.value = "";
   };
   element("shot").onclick = () => savePicture(viewer).catch((error) => say(`The picture was not saved: ${error.message}`));
-  element("record").hidden = !record;
   element("record").onclick = async () => {
+    if (viewer.id) return made(`${viewer.kind}.mp4`, "Making the video…");
+    if (!record) return say("This browser cannot record a video.");
     if (pressed("record")) return viewer.pause();
     press("record", true);
     await record((share) => say(`Recording: ${Math.round(100 * share)} %`)).catch((error) => say(`No video: ${error.message}`));
@@ -46,10 +47,16 @@ export function panel(viewer, say) {
     element("more").setAttribute("aria-expanded", open);
   };
 
+  /** Save what the server makes of the scene. */
+  async function made(name, line) {
+    say(line, true);
+    await saveFile(viewer, name).then(() => say(""), (error) => say(`Not saved: ${error.message}`));
+  }
+
   viewer.addEventListener("change", update);
   viewer.addEventListener("turn", () => !viewer.onPath || showDisparity());
   viewer.addEventListener("drawn", facts);
-  new ResizeObserver(() => fit(viewer)).observe(element("area"));
+  new ResizeObserver(() => element("frame").classList.contains("waiting") || fit(viewer)).observe(element("area"));
 
   function update() {
     const { stage, description } = viewer;
@@ -74,7 +81,7 @@ export function panel(viewer, say) {
     if (document.activeElement !== slider || !viewer.onPath) slider.value = viewer.disparity;
     const shown = viewer.disparity.toFixed(2);
     slider.style.setProperty("--at", `${(100 * viewer.disparity) / slider.max}%`);
-    slider.setAttribute("aria-valuetext", `disparity ${shown}`);
+    slider.setAttribute("aria-valuetext", `move ${shown}`);
     document.querySelector("output[for=disparity]").value = shown;
   }
 
@@ -88,11 +95,11 @@ export function panel(viewer, say) {
   }
 }
 
-/** The picture as large as there is room; a narrow window crops it a little, so that it is not a strip. */
-export function fit(viewer) {
-  if (!viewer.description) return;
+/** The picture, or the `photo` in its place, as large as there is room; a narrow window crops it a little, so that it is not a strip. */
+export function fit(viewer, photo = null) {
+  const { width: W, height: H } = photo ?? viewer.description?.camera ?? {};
+  if (!W) return;
   const { clientWidth: width, clientHeight: height } = element("area");
-  const { width: W, height: H } = viewer.description.camera;
   const shape = Math.min(Math.max(width / height, Math.min(W / H, Math.max((MOST_CROP * W) / H, 0.5))), W / H);
   const frame = element("frame");
   const w = Math.min(width, height * shape);
@@ -101,7 +108,7 @@ export function fit(viewer) {
   viewer.resize(Math.floor(w), Math.floor(w / shape));
 }
 
-/** The line between base and Spackle. */
+/** The line between the photo alone and the completed scene. */
 export function divider(viewer) {
   const line = element("divider");
   const frame = element("frame");

@@ -1,4 +1,5 @@
-// Pictures and videos to the disk.
+// Pictures, videos and scenes to the disk.
+import { fetched } from "./source.js";
 
 /** The view as a PNG, not smaller than the photo. */
 export async function savePicture(viewer) {
@@ -8,9 +9,9 @@ export async function savePicture(viewer) {
   download(blob, `${fileName(viewer)}.png`);
 }
 
-/** A file that the server makes of the scene. */
-export function saveFile(viewer, place, suffix) {
-  Object.assign(document.createElement("a"), { href: place, download: fileName(viewer) + suffix }).click();
+/** A file that the server makes of the scene, for as long as that takes. */
+export async function saveFile(viewer, name) {
+  download(await fetched(viewer.id, name), fileName(viewer) + /\.[^.]*$/.exec(name)[0]);
 }
 
 function sharpest({ canvas, description }) {

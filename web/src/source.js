@@ -10,20 +10,26 @@ export async function embedded() {
   return withBytes(description, (file) => gunzip(files[file]));
 }
 
-/** What the server shows now: {scene, job, upload}. */
+const SCENES = "/api/v1/scenes";
+
+/** What the server takes: {upload}. */
 export async function current() {
-  return (await answer(await fetch(here("/scene.json"), { cache: "no-store" }))).json();
+  return (await answer(await fetch(here("/page.json"), { cache: "no-store" }))).json();
+}
+
+/** The address of a scene's file. */
+export function file(id, name) {
+  return here(`${SCENES}/${id}/files/${name}`);
 }
 
 /** A scene of the server; `onProgress` hears of shares in 0..1. */
-export async function load(url, onProgress = () => {}) {
-  const description = await (await answer(await fetch(here(url)))).json();
-  const folder = url.replace(/\.json$/, "");
+export async function load(id, onProgress = () => {}) {
+  const description = await (await answer(await fetch(file(id, "page.json")))).json();
   const sizes = description.layers.map((layer) => 20 * layer.count);
   const all = Math.max(1, sizes.reduce((sum, size) => sum + size, 0));
   let read = 0;
-  return withBytes(description, async (file) => {
-    const { body } = await answer(await fetch(here(`${folder}/${file}`)));
+  return withBytes(description, async (name) => {
+    const { body } = await answer(await fetch(file(id, name)));
     const parts = [];
     for (const reader = body.getReader(); ;) {
       const { done, value } = await reader.read();
@@ -35,28 +41,37 @@ export async function load(url, onProgress = () => {}) {
   });
 }
 
-/** Give the server a photo, and a depth map behind it; the URL of the job that completes it. */
-export async function send(photo, { base = "", disparity = "", depth = null } = {}) {
-  const fields = new URLSearchParams({ name: photo.name });
-  if (base) fields.set("base", base);
-  if (disparity) fields.set("disparity", disparity);
-  if (depth?.size) fields.set("depth", `${/\.[^.]*$/.exec(depth.name.toLowerCase())?.[0]}:${depth.size}`);
-  const body = depth?.size ? new Blob([photo, depth]) : photo;
-  const response = await fetch(here(`/photos?${fields}`), { method: "POST", body, headers: { "Content-Type": "application/octet-stream" } });
-  return (await (await answer(response)).json()).job;
+/** A file that the server makes of a scene; it may take a while. */
+export async function fetched(id, name) {
+  return (await answer(await fetch(file(id, name)))).blob();
 }
 
-/** Watch a job until it ends; the URL of its scene. `onNews` hears of {stage, done, total} and {line}. */
-export function follow(job, onNews) {
+/** Give the server a photo; the id of its scene. */
+export async function send(photo, { base = "", disparity = "", depth = null } = {}) {
+  const form = new FormData();
+  form.set("photo", photo, photo.name);
+  if (depth?.size) form.set("depth", depth, depth.name);
+  const options = { files: [], ...(base && { base }), ...(disparity && { disparity: Number(disparity) }) };
+  form.set("options", JSON.stringify(options));
+  return (await (await answer(await fetch(here(SCENES), { method: "POST", body: form }))).json()).id;
+}
+
+/** Have the server forget a scene, and end the work on it. */
+export async function remove(id) {
+  await answer(await fetch(here(`${SCENES}/${id}`), { method: "DELETE" }));
+}
+
+/** Watch a photo until its scene is done. `onNews` hears of {stage, done, total} and {line}. */
+export function follow(id, onNews) {
   return new Promise((resolve, reject) => {
-    const events = new EventSource(here(`${job}/events`));
+    const events = new EventSource(here(`${SCENES}/${id}/events`));
     let lost = 0;
     events.onmessage = ({ data }) => {
       lost = 0;
       const news = JSON.parse(data);
-      if ("ready" in news || "error" in news) events.close();
-      if ("ready" in news) resolve(news.ready);
-      else if ("error" in news) reject(new Error(news.error));
+      if ("state" in news) events.close();
+      if (news.state === "done") resolve();
+      else if ("state" in news) reject(new Error(news.error));
       else onNews(news);
     };
     events.onerror = () => {

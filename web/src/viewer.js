@@ -29,7 +29,8 @@ export class Viewer extends EventTarget {
     return this.stage.description;
   }
 
-  show(description, layers) {
+  show(description, layers, id = null) {
+    this.id = id; // of the server's scene
     this.stage.show(description, layers);
     Object.assign(this.stage.zoom, { scale: 1, x: 0, y: 0 });
     this.onPath = true;

@@ -65,6 +65,7 @@ app = typer.Typer(
 
 app.command(short_help="Photos, or a clip, to completed scenes and videos")(commands.predict)
 app.command(short_help="Look at a scene, or at a photo that becomes one")(commands.view)
+app.command(short_help="The same for programs: an HTTP interface")(commands.serve)
 app.command(short_help="A saved scene to a video")(commands.render)
 app.command(short_help="A scene for other viewers, or as one page to send")(commands.export)
 app.command(short_help="The Middlebury Motorcycle, against its true second photo")(commands.demo)

@@ -1,9 +1,8 @@
-"""`spackle predict`, `render`, `export`, `view` and `demo`: their options. The work is imported when a command runs."""
+"""Options of `spackle predict`, `render`, `export`, `view`, `serve` and `demo`; the work is imported as they run."""
 
 from __future__ import annotations
 
-import os
-import sys
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,6 +14,7 @@ from spackle.cli.options import (
     DepthKindOption,
     DeviceOption,
     FovOption,
+    HostOption,
     InputOption,
     JsonOption,
     KeepFrameOption,
@@ -185,7 +185,10 @@ def export(
 
 
 def view(
-    target: Annotated[Path, typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene (PLY), or a photo to complete.")],
+    target: Annotated[
+        Path | None,
+        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene (PLY), or a photo to complete; none: an empty page."),
+    ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
     ] = "auto",
@@ -203,33 +206,71 @@ def view(
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
     device: DeviceOption = "auto",
-    host: Annotated[
-        str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets everybody in the network in.")
-    ] = "127.0.0.1",
+    host: HostOption = "127.0.0.1",
     port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     token: Annotated[
         bool,
-        typer.Option("--token/--no-token", help="Put a secret into the page's address, without which nobody gets in."),
+        typer.Option(
+            "--token/--no-token",
+            help="Put a secret into the page's address. Without it everybody on this machine can look, and nobody can "
+            "send a photo.",
+        ),
     ] = True,
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Look at a scene, or complete a photo and look at that, on a page of this machine. Ctrl-C ends it."""
+    """Look at a scene, or complete photos and look at them, on a page of this machine. Ctrl-C ends it."""
     from spackle.bases.settings import BaseSettings
-    from spackle.cli.view_page import Uploads, view_page
+    from spackle.cli import serve as app
     from spackle.progress import Reporter
 
-    reporter = Reporter(verbose, as_json=as_json)
     settings = BaseSettings(base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device)
-    uploads = Uploads(settings, disparity, keep_frame, reporter)
-    if view_page(target, uploads, {"focal_px": focal_px, "fov": fov}, host, port, token, browser):
-        raise typer.Exit(INTERRUPTED)
-    # A step of a network cannot be interrupted, and Python would wait for it, or fall over it, on its way out.
-    reporter.console.show_cursor()
-    print("interrupted", file=sys.stderr, flush=True)
-    sys.stdout.flush()
-    os._exit(INTERRUPTED)
+    place = app.Place(host, port, secrets.token_urlsafe(16) if token else None, browser)
+    reporter = Reporter(verbose, as_json=as_json)
+    app.view(target, settings, disparity, {"focal_px": focal_px, "fov": fov}, keep_frame, place, reporter)
+    raise typer.Exit(INTERRUPTED)
+
+
+def serve(
+    host: HostOption = "127.0.0.1",
+    port: Annotated[int, typer.Option(metavar="N", help="Listen at this port; 0: any that is free.")] = 8080,
+    token: Annotated[
+        str | None,
+        typer.Option(help="What a client must send.", show_default="a new one", envvar="SPACKLE_TOKEN"),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, max=64, help="Photos at once, each in a process that holds the base's network itself.")
+    ] = 1,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Folder for photos and scenes.")] = Path(
+        "spackle-scenes"
+    ),
+    keep: Annotated[float, typer.Option(min=0, metavar="DAYS", help="Remove a scene after so many days.")] = 7,
+    quota: Annotated[
+        float, typer.Option(min=0, metavar="GB", help="Remove the oldest scenes when all take more than this.")
+    ] = 20,
+    waiting: Annotated[int, typer.Option(min=1, metavar="N", help="Photos that may wait; more are refused.")] = 32,
+    base: Annotated[
+        str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")
+    ] = "auto",
+    checkpoint: CheckpointOption = None,
+    device: DeviceOption = "auto",
+    as_json: JsonOption = False,
+    verbose: VerboseOption = False,
+) -> None:
+    """Complete photos for programs, by an HTTP interface with a page (see docs/http.md). Ctrl-C ends it."""
+    from spackle.bases.settings import BaseSettings
+    from spackle.cli import serve as app
+    from spackle.progress import Reporter
+    from spackle.web.jobs import Keep
+    from spackle.web.work import SceneWork
+
+    work = SceneWork(BaseSettings(base, checkpoint=checkpoint, device=device), verbose=verbose)
+    place = app.Place(host, port, token or secrets.token_urlsafe(16), False)
+    app.serve(
+        output, work, workers, Keep(keep * 86400, quota * 1e9, waiting), place, Reporter(verbose, as_json=as_json)
+    )
+    raise typer.Exit(INTERRUPTED)
 
 
 def demo(

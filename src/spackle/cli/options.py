@@ -25,6 +25,9 @@ InputOption = Annotated[Path | None, typer.Option("-i", "--input", hidden=True)]
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
+HostOption = Annotated[
+    str, typer.Option(metavar="H", help="Listen at this address: 0.0.0.0 lets the network in, whoever has the token.")
+]
 KeepFrameOption = Annotated[
     bool, typer.Option("--keep-frame", help="Leave a scan's margin or letterbox bars around a photo on it.")
 ]

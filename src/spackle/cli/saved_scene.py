@@ -32,7 +32,7 @@ from spackle.residual import hole_area_ratio
 from spackle.scene import DEFAULT_SIZE, Scene
 from spackle.video_frames import FrameMaker, video_problem
 from spackle.views import PathOptions
-from spackle.web import PageScene, single_html
+from spackle.web.page import PageScene, single_html
 
 TOLERATED = 0.01  # fraction of a frame that may be holes without a line about it
 PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_file(scene), scene.path))}

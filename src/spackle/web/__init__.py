@@ -1,5 +1,18 @@
-"""The page that people look at a scene with, by a server or as one file."""
+"""The page, and the server of the page and of the HTTP interface. Read `create_app`."""
 
-from spackle.web.page import PageScene, page_files, page_scene, single_html
+from __future__ import annotations
 
-__all__ = ["PageScene", "page_files", "page_scene", "single_html"]
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from spackle.web.app import create_app as create_app
+
+__all__ = ["create_app"]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "create_app":
+        raise AttributeError(f"module 'spackle.web' has no attribute {name!r}")
+    from spackle.web.app import create_app  # FastAPI takes a second to load
+
+    return create_app

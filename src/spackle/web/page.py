@@ -8,7 +8,6 @@ import gzip
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
 from importlib import resources
 
 import numpy as np
@@ -30,7 +29,8 @@ BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1
 SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
 BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
 
-FILES = {"index.html": "html", "viewer.js": "javascript", "viewer.css": "css", "licenses.txt": "plain"}
+TEXT = {"index.html": "html", "viewer.js": "javascript", "viewer.css": "css", "licenses.txt": "plain"}
+EXAMPLES = ("coffee.jpg", "cat.jpg")
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
 
@@ -41,7 +41,6 @@ class PageScene:
 
     description: dict[str, object]  # what becomes JSON
     files: dict[str, bytes]  # the layers, by the names that the description gives them
-    downloads: Mapping[str, Callable[[], bytes]] = dataclasses.field(default_factory=dict)  # ".ply" → what makes it
 
 
 def page_scene(
@@ -146,13 +145,13 @@ def as_json(value: object) -> bytes:
 
 def page_files() -> dict[str, tuple[str, bytes]]:
     """What a server hands out: URL path to content type and bytes; "/" is the page."""
-    paths = {name: "/" if name == "index.html" else f"/{name}" for name in FILES}
-    return {paths[name]: (f"text/{kind}; charset=utf-8", _read(name)) for name, kind in FILES.items()}
+    kinds = {name: f"text/{kind}; charset=utf-8" for name, kind in TEXT.items()} | dict.fromkeys(EXAMPLES, "image/jpeg")
+    return {"/" if name == "index.html" else f"/{name}": (kind, page_file(name)) for name, kind in kinds.items()}
 
 
 def single_html(scene: PageScene) -> bytes:
     """The page with a scene in it, which opens from a disk or a mail; nothing is ever fetched."""
-    page, css, js = (_read(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
+    page, css, js = (page_file(name).decode() for name in ("index.html", "viewer.css", "viewer.js"))
     held = {name: base64.b64encode(gzip.compress(data, 6, mtime=0)).decode() for name, data in scene.files.items()}
     data = as_json({"description": scene.description, "files": held}).decode()
     style, script = f"<style>{css}</style>", f"<script>{js}</script>"
@@ -170,5 +169,5 @@ def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _read(name: str) -> bytes:
+def page_file(name: str) -> bytes:
     return resources.files("spackle.web").joinpath("page", name).read_bytes()

@@ -1,0 +1,201 @@
+"""`spackle view` and `spackle serve`: the app on this machine, with a photo or a scene in it, or for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import logging
+import os
+import socket
+import sys
+import tempfile
+import threading
+import time
+import webbrowser
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from spackle.bases.open import open_base
+from spackle.bases.settings import AUTO, RGBD, BaseSettings
+from spackle.cli.saved_scene import page_of
+from spackle.errors import InputError
+from spackle.files import check_file
+from spackle.image import load_photo
+from spackle.progress import Reporter, asked_to_stop
+from spackle.scene import Scene
+from spackle.views import PathOptions
+from spackle.web import create_app
+from spackle.web.guard import Access
+from spackle.web.jobs import LOG, Jobs, Keep
+from spackle.web.server import serving
+from spackle.web.work import PREVIEW, SceneWork, check_photo, is_scene
+
+WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
+LOOPBACK = "127.0.0.1"
+
+
+class Place(NamedTuple):
+    """Where the app listens, and who is told."""
+
+    host: str
+    port: int  # 0: any that is free
+    token: str | None
+    browser: bool  # opens the page
+
+
+def view(
+    target: Path | None,
+    settings: BaseSettings,
+    disparity: float | None,
+    lens: Mapping[str, float | None],
+    keep_frame: bool,
+    place: Place,
+    reporter: Reporter,
+) -> None:
+    """Show a scene or a photo, or an empty page, until somebody stops it.
+
+    Depth, calibration and `lens`, `focal_px` and `fov`, are of that photo alone; it and what the page sends live as
+    long as this. InputError for a file that is neither, or an option that cannot be used.
+    """
+    PathOptions(disparity=disparity).check()
+    name = "Spackle" if target is None else checked(target, settings, lens, keep_frame, reporter)
+    usual = AUTO if settings.name == RGBD else settings.name
+    others = dataclasses.replace(settings, depth=None, depth_kind="auto", name=usual)
+    others.check()
+    with tempfile.TemporaryDirectory(prefix="spackle-view-", ignore_cleanup_errors=True) as folder:
+        work = SceneWork(others, disparity, keep_frame, settings.depth_kind, reporter.verbose)
+        with listening(Path(folder), work, 1, Keep(), place, reporter) as (jobs, urls):
+            fragment = ""
+            if target is not None:
+                options: dict[str, object] = {"base": settings.name, **lens, "files": []}
+                with jobs.place() as new:
+                    if not is_scene(target):
+                        check_photo(target, name, new / PREVIEW)
+                    depth = None if settings.depth is None else os.path.abspath(str(settings.depth))
+                    fragment = "#" + jobs.add(new, name, os.path.abspath(target), depth, options).id
+            announce(name, [url + fragment for url in urls], place, reporter)
+
+
+def checked(
+    target: Path, settings: BaseSettings, lens: Mapping[str, float | None], keep_frame: bool, reporter: Reporter
+) -> str:
+    """What people call a photo or a scene; InputError before a page opens where it, or its depth, is no such file."""
+    check_file(target, "photo or scene")
+    settings.check()
+    if target.suffix.lower() in WRITTEN_ONLY:
+        raise InputError(f"{target}: {target.suffix} files are written, not read: give the scene.ply it was made of")
+    with reporter.stage("load"):
+        if is_scene(target):
+            if settings.depth is not None:
+                raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
+            return str(page_of(Scene.load(target, **lens), target).description["name"])
+        photo = load_photo(target, keep_frame=keep_frame or settings.depth is not None, **lens)
+        if settings.depth is not None:
+            open_base(settings).load(photo)
+        if settings.checkpoint is not None:
+            check_file(settings.checkpoint, "file of weights")
+    return target.name
+
+
+def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter) -> None:
+    """Complete photos for programs until somebody stops it; InputError for an option that cannot be used."""
+    work.base.check()
+    with listening(folder, work, workers, keep, place, reporter) as (_, urls):
+        reporter.log(f"token: {place.token}, as `Authorization: Bearer TOKEN` or in the page's address")
+        announce("HTTP interface, and its page", urls, place, reporter)
+
+
+@contextlib.contextmanager
+def listening(
+    folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter
+) -> Iterator[tuple[Jobs, list[str]]]:
+    """Run the app during the block and then until Ctrl-C or SIGTERM; yields its jobs and the page's addresses."""
+    with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, told_to(reporter):
+        address, port = listener.getsockname()[:2]
+        access = Access.at(place.host, address, place.token)
+        if not access.local and place.token is None:
+            raise InputError(f"--host {place.host}: others could send photos: leave --no-token out")
+        app = create_app(folder, work, workers=workers, keep=keep, access=access)
+        here = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
+        addresses = [here] if access.local else [here, address_in_network(place.host)]
+        token = f"{place.token}/" if place.token else ""
+        with serving(app, listener):
+            yield app.state.jobs, [f"http://{f'[{a}]' if ':' in a else a}:{port}/{token}" for a in addresses]
+            while not stopped():
+                time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def told_to(reporter: Reporter) -> Iterator[None]:
+    """What jobs and requests log goes to the terminal, requests only if it is to be verbose."""
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            (reporter.detail if record.levelno <= logging.DEBUG else reporter.log)(self.format(record))
+
+    handler = Handler()
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.DEBUG)
+    LOG.propagate = False
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+
+
+def listener_at(host: str, port: int) -> socket.socket:
+    """A socket that listens there; InputError, naming the option, where nothing can."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any that is free)")
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
+            0
+        ]
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        line = f"--host {host}: no address of this machine: {reason}: leave it out, or give 0.0.0.0"
+        raise InputError(line) from error
+    listener = socket.socket(family, kind)
+    try:
+        if os.name == "posix":  # elsewhere that would take a port away from who has it
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        line = f"--port {port}: cannot listen at {host}: {error.strerror}: give another, or none"
+        if error.errno == errno.EADDRNOTAVAIL:
+            line = f"--host {host}: is no address of this machine: leave it out, or give 0.0.0.0 for all of them"
+        raise InputError(line) from error
+    return listener
+
+
+def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> None:
+    """Print the page's addresses, warn if it is open to the network, and open a browser if there is a screen."""
+    if len(urls) > 1:
+        reporter.log(
+            f"warning: everybody in the network who has the token can send photos to --host {place.host} and use this "
+            "machine to complete them; the connection is not encrypted"
+        )
+        reporter.log(f"{name}: from other machines {urls[1]}")
+    reporter.log(f"{name}: {urls[0]} (Ctrl-C ends)")
+    reporter.result({"url": urls[0]})
+    # A browser of text would take the terminal away.
+    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    if place.browser and sys.platform.startswith("linux") and not screen:
+        reporter.log("no screen here: open that page yourself; from another machine through `ssh -L`")
+    elif place.browser:
+        # Some browsers come back only when they are closed.
+        threading.Thread(target=webbrowser.open, args=(urls[0],), daemon=True, name="browser").start()
+
+
+def address_in_network(host: str) -> str:
+    """The address by which others reach this machine, listening at `host`."""
+    if host not in ("0.0.0.0", "::", ""):
+        return host
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # an address of documentation: asking for the way there sends nothing
+        return str(probe.getsockname()[0])
+    return socket.gethostname()  # no network

@@ -1,0 +1,81 @@
+"""A process that does one task after the other, tells how far it is, and ends with its parent."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from multiprocessing import connection
+from typing import Any
+
+from spackle.errors import InputError, reason_in_a_line
+
+DIED = "the process that worked on this died, most likely for want of memory"
+Event = Mapping[str, Any]
+Tell = Callable[[Event], None]
+Work = Callable[[Any, Tell], None]  # is pickled, as its tasks are; its InputError says why a task cannot be done
+
+
+class TaskProcess:
+    """A process, and how to talk with it."""
+
+    def __init__(self, work: Work) -> None:
+        spawn = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+        self._pipe, theirs = spawn.Pipe()
+        self._process = spawn.Process(target=_serve, args=(theirs, work), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.is_alive()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.join()
+
+    def do(self, task: object, tell: Tell) -> str | None:
+        """None where the task is done, else a line that says why not."""
+        try:
+            self._pipe.send(task)
+            while not isinstance(event := self._pipe.recv(), Ended):
+                tell(event)
+        except (EOFError, OSError):
+            self.kill()
+            return DIED
+        return event.error
+
+
+class Ended:
+    """The last thing that is said of a task."""
+
+    def __init__(self, error: str | None) -> None:
+        self.error = error
+
+
+def _serve(pipe: connection.Connection, work: Work) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    while True:
+        error = None
+        try:
+            work(pipe.recv(), pipe.send)
+        except EOFError:
+            return
+        except InputError as problem:
+            error = " ".join(str(problem).split())
+        except Exception as bug:  # or no memory: the next task may do
+            traceback.print_exc()
+            error = f"this went wrong: {type(bug).__name__}: {reason_in_a_line(bug)}"
+        pipe.send(Ended(error))
+
+
+def end_with_parent() -> None:
+    """Wait until the parent process has gone, and end this one: it would wait for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)

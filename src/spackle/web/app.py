@@ -1,0 +1,224 @@
+"""The app: the page, and the HTTP interface that the page uses as programs do. Read `create_app`."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import re
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
+from jinja2 import Template
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
+
+import spackle
+from spackle.bases.settings import AUTO
+from spackle.errors import InputError, check_name, one_line
+from spackle.image import PHOTO_SUFFIXES
+from spackle.task_process import Work
+from spackle.web.guard import Access, Guard, Limits
+from spackle.web.jobs import FullError, Job, Jobs, Keep, SceneState
+from spackle.web.page import as_json, page_file, page_files
+from spackle.web.work import PREVIEW, FileName, SceneOptions, SceneWork, check_photo
+
+PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
+SCENES = "/api/v1/scenes"
+DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle predict --depth` takes them
+PACE_S, HEARTBEAT_S = 0.1, 10.0  # between two looks of a listener; of a silent stream, so that a lost one shows
+WORK, KEEP, LIMITS = SceneWork(), Keep(), Limits()
+MAX_NAME = 80  # characters that are shown
+FILE = {"type": "string", "format": "binary"}
+UPLOAD: dict[str, Any] = {
+    "schema": {
+        "type": "object",
+        "required": ["photo"],
+        "properties": {
+            "photo": {**FILE, "description": f"One of {', '.join(PHOTO_SUFFIXES)}."},
+            "depth": {**FILE, "description": f"Its depth map, one of {', '.join(DEPTH_SUFFIXES)}."},
+            "options": SceneOptions.model_json_schema(),
+        },
+    },
+    "encoding": {"options": {"contentType": "application/json"}},
+}
+
+
+def create_app(
+    folder: Path,
+    work: Work = WORK,
+    *,
+    workers: int = 1,
+    keep: Keep = KEEP,
+    access: Access | None = None,
+    limits: Limits = LIMITS,
+) -> FastAPI:
+    """An app for a server, or to mount in another app, which then says who may ask.
+
+    Its processes start at once; `app.state.jobs.close()` ends them. Photos that wait or are at work go on when an app
+    next takes up the folder.
+
+    Args:
+        folder: for photos and scenes; InputError where another server uses it.
+        work: what a process does with a photo.
+        workers: number of processes, each of which holds the base's network.
+        keep: what the folder may hold, and how many photos may wait.
+        access: who may ask.
+        limits: what a client may take.
+    """
+    jobs = Jobs(folder, work, workers, keep)
+    bases = work.bases if isinstance(work, SceneWork) else [AUTO]
+    app = FastAPI(
+        title="Spackle",
+        version=spackle.__version__,
+        openapi_url="/api/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        exception_handlers={HTTPException: refused, RequestValidationError: unknown},
+    )
+    app.state.jobs = jobs
+    app.add_middleware(Guard, access=access, limits=limits)
+    decoding = asyncio.Lock()  # a large photo takes a gigabyte
+
+    def job_of(id: str) -> Job:
+        if (job := jobs.get(id)) is None:
+            raise HTTPException(404, "there is no such scene")
+        return job
+
+    @app.post(SCENES, status_code=202, openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}})
+    async def post_photo(request: Request, response: Response) -> SceneState:
+        """Send a photo. It waits until a process has time for it; the queue's end is 429."""
+        try:
+            with jobs.place() as new:
+                async with request.form(max_files=2, max_fields=1) as form, decoding:
+                    job = await run_in_threadpool(accept, form, new, jobs, bases)
+        except FullError as error:
+            raise HTTPException(429, str(error), {"Retry-After": str(error.seconds)}) from error
+        response.headers["Location"] = f"{request.scope['root_path']}{SCENES}/{job.id}"
+        return job
+
+    @app.get(SCENES + "/{id}")
+    async def get_state(id: str) -> SceneState:
+        """How far a photo is."""
+        return job_of(id)
+
+    @app.delete(SCENES + "/{id}", status_code=204)
+    async def delete(id: str) -> None:
+        """Forget a photo and its scene; work on it ends."""
+        await run_in_threadpool(jobs.remove, job_of(id))
+
+    @app.get(SCENES + "/{id}/events", response_class=StreamingResponse)
+    async def get_events(id: str) -> StreamingResponse:
+        """Server-sent events: {stage, done, total}, {line}, and at the end {state, error}."""
+        return StreamingResponse(events(job_of(id), jobs), media_type="text/event-stream")
+
+    @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
+    async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
+        """A file of a scene that is done; one that the options left out is made now."""
+        job = job_of(id)
+        path = (job.folder if file == PREVIEW else job.results) / file
+        if not path.is_file():
+            if job.state != "done":
+                raise HTTPException(409, job.error or "this scene is not done yet")
+            if error := await asyncio.shield(asyncio.wrap_future(jobs.make(job, file))):
+                raise HTTPException(404, error)
+        return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)
+
+    @app.get("/page.json", include_in_schema=False)
+    async def get_page_state() -> dict[str, object]:
+        writes = access is None or access.token is not None
+        upload = {"suffixes": PHOTO_SUFFIXES, "max_bytes": limits.upload_bytes, "bases": bases} if writes else None
+        return {"upload": upload}
+
+    @app.get("/healthz", include_in_schema=False)
+    async def get_health() -> dict[str, str]:
+        return {"status": "ok"}
+
+    @app.get("/docs", include_in_schema=False)
+    async def get_docs() -> HTMLResponse:
+        return HTMLResponse(Template(page_file("docs.html").decode(), autoescape=True).render(api=app.openapi()))
+
+    for path, (kind, content) in page_files().items():
+        app.add_route(path, functools.partial(asset, content, kind), methods=["GET"])
+    return app
+
+
+def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
+    """The job of a form's photo, which is decoded first; HTTPException for what is not taken."""
+    photo, depth, text = form.get("photo"), form.get("depth"), form.get("options") or "{}"
+    if not isinstance(photo, UploadFile) or not isinstance(text, str):
+        raise HTTPException(422, "send the photo as the file `photo`, and the options as the text `options`")
+    name = shown_name(photo.filename or "")
+    try:
+        options = SceneOptions.model_validate_json(text)
+        check_name("base", options.base or bases[0], bases)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise HTTPException(422, one_line(f"options: {'.'.join(map(str, first['loc']))}: {first['msg']}")) from error
+    except InputError as error:
+        raise HTTPException(422, str(error)) from error
+    source = _saved(photo, folder, "source", name, PHOTO_SUFFIXES)
+    of_depth = None
+    if isinstance(depth, UploadFile) and depth.filename:
+        of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
+    try:
+        check_photo(folder / source, name, folder / PREVIEW)
+    except InputError as error:
+        raise HTTPException(415, str(error)) from error
+    return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_defaults=True))
+
+
+def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]) -> str:
+    """Keep an upload under a name of ours."""
+    suffix = PurePosixPath(upload.filename or "").suffix.lower()
+    if suffix not in suffixes:
+        raise HTTPException(415, f"{name}: not a kind of file that is taken here: give {', '.join(suffixes)}")
+    if not upload.size:
+        raise HTTPException(400, f"{name}: the file is empty")
+    with (folder / f"{stem}{suffix}").open("xb") as file:
+        shutil.copyfileobj(upload.file, file)
+    return f"{stem}{suffix}"
+
+
+def shown_name(given: str) -> str:
+    """The last part of a file's name in a form that no terminal, page or log can take for anything but a name."""
+    last = re.split(r"[/\\]", given)[-1]
+    name = "".join(character for character in last if character.isprintable()).strip()
+    return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"
+
+
+async def events(job: Job, jobs: Jobs) -> AsyncIterator[bytes]:
+    """What is known of a job and then what comes, until its end or the server's."""
+    seen, silent = 0, 0.0
+    while True:
+        fresh = [event for number, event in job.events if number > seen]
+        if not fresh and (job.ended or jobs.closing):
+            fresh = [{"state": job.state, "error": job.error or (None if job.ended else "the server was stopped")}]
+        seen = job.events[-1][0] if job.events else 0
+        silent = 0.0 if fresh else silent + PACE_S
+        if fresh:
+            yield b"".join(b"data: " + as_json(event) + b"\n\n" for event in fresh)
+        elif silent > HEARTBEAT_S:
+            silent = 0.0
+            yield b":\n\n"
+        if any("state" in event for event in fresh):
+            return
+        await asyncio.sleep(PACE_S)
+
+
+def asset(content: bytes, kind: str, request: Request) -> Response:
+    return Response(content, media_type=kind)
+
+
+async def refused(request: Request, error: Any) -> JSONResponse:
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def unknown(request: Request, error: Any) -> JSONResponse:
+    return JSONResponse({"error": "there is nothing of that name"}, 404)
