@@ -162,7 +162,7 @@ class Pipeline:
             f"focal length {prediction.camera.focal[0]:.0f} px ({prediction.lens_source or photo.focal_source})"
         )
         if not given:
-            reporter.log(f"{name}: {_move_in_words(prediction)}")
+            reporter.log(f"{name}: {move_in_words(prediction)}")
         if depth_range := prediction.notes.get("depth_range"):
             reporter.log(f"{name}: its depth is {depth_range}")
         if missing := float(prediction.notes.get("depth_filled", 0)):
@@ -193,7 +193,7 @@ class Pipeline:
         return None if given else self.options.path.reach(prediction.disparity)
 
 
-def _move_in_words(prediction: BasePrediction) -> str:
+def move_in_words(prediction: BasePrediction) -> str:
     """How far the camera goes, as `choose_move` found it."""
     reach, usual, invented = prediction.disparity, prediction.notes["usual_disparity"], prediction.notes["uncovered"]
     of, more = (f" of {usual:g}", f"; `--disparity {usual:g}` for more") if reach != usual else ("", "")

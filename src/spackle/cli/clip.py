@@ -19,10 +19,11 @@ from spackle.folders import file_records, results_folder, whole_set
 from spackle.image import Photo, focal_length, resize_photo
 from spackle.inpaint.plain import OpenCV
 from spackle.photo_results import shared_report
-from spackle.pipeline import Options, Pipeline
+from spackle.pipeline import Options, Pipeline, move_in_words
 from spackle.progress import Reporter, timed
 from spackle.residual import hole_area_ratio
 from spackle.video_frames import VideoOptions
+from spackle.views import choose_move
 
 FILES = ("video.mp4", "report.json")
 # Frames are named by their numbers, so that a folder may hold a depth map for each: 000000.npy is the first one's.
@@ -98,6 +99,10 @@ def predict_clip(
                 with timed("base", completer.seconds):
                     prediction, choice = base.predict(photo, log=reporter.log)
                 if first is None:
+                    if completer.disparity is None:  # the first frame chooses for all
+                        prediction = choose_move(prediction, pipeline.renderer, photo.path)
+                        completer.disparity = prediction.disparity
+                        reporter.log(f"{path.name}: {move_in_words(prediction)}")
                     first, base = (photo, prediction, choice), base.only(choice)  # which predicts all others, too
                     if prediction.lens_source:  # by a network: a clip has one lens, so it holds for all other frames
                         seen = prediction.camera.focal[0] * clip.width / prediction.camera.width
