@@ -8,6 +8,7 @@ import http.client
 import io
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,9 +21,9 @@ from PIL import Image
 from spackle.web import create_app
 from spackle.web.guard import Access, Limits
 from spackle.web.jobs import Jobs, Keep
-from spackle.web.server import serving
+from spackle.web.server import server_of
 
-QUICK = Limits(pause=0.3, upload=0.6, send=0.5, upload_bytes=100_000)
+QUICK = Limits(upload=0.6, send=0.5, upload_bytes=100_000)
 SCENES, BOUNDARY = "/api/v1/scenes", "7d1"
 
 
@@ -80,7 +81,7 @@ class Served:
         return self.ask(SCENES, "POST", form(content, name, **fields))
 
     def events(self, id: str) -> list[Any]:
-        """All that a job tells."""
+        """The states of a job until its end."""
         blocks = self.ask(f"{SCENES}/{id}/events").body.decode().split("\n\n")
         return [json.loads(block.removeprefix("data: ")) for block in blocks if block.startswith("data: ")]
 
@@ -110,8 +111,14 @@ def served(
         listener.listen()
         address, port = listener.getsockname()
         app = create_app(folder, work, keep=keep, access=Access.at(host, address, token), limits=limits)
-        with serving(app, listener, silent=0.3):
+        server = server_of(app, silent=0.3)
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        try:
             yield Served(port, f"/{token}" if token else "", app.state.jobs)
+        finally:
+            server.should_exit = True
+            thread.join()
 
 
 def answer_of(connection: socket.socket) -> bytes:

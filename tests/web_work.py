@@ -11,23 +11,26 @@ from spackle.errors import InputError
 
 
 def work(task: Any, tell: Any) -> None:
-    """The scene's one layer is the photo's bytes, and a further file what the task says."""
+    """The scene's one layer is the photo's bytes, and a further file holds its name."""
+    job, file = task
+    if file is not None:
+        (job.results / file).write_text(file)
+        return
     tell({"stage": "base", "done": 1, "total": 2})
-    how = task.name.partition(".")[0]
+    how = job.name.partition(".")[0]
     if how == "slow":
         time.sleep(600)
+    if how == "brief":
+        time.sleep(0.3)
     if how == "bad":
-        raise InputError(f"{task.name}: no depth\nat all")
+        raise InputError(f"{job.name}: no depth\nat all")
     if how == "bug":
         raise KeyError("oh")
-    if how == "die" or (how == "twice" and task.results.name == "1"):
+    if how == "die" or (how == "twice" and job.attempts == 1):
         os._exit(9)
-    if task.file is not None:
-        (task.results / task.file).write_text(task.file)
-        return
     tell({"line": "focal length <50> px"})
-    depth = "" if task.depth is None else task.depth.read_text()
+    depth = "" if job.depth is None else (job.folder / job.depth).read_text()
     layer = {"name": "base", "file": "base.splats", "count": 1}
-    page = {"name": task.name, "layers": [layer], "depth": depth, "options": task.options}
-    (task.results / "base.splats").write_bytes(task.source.read_bytes())
-    (task.results / "page.json").write_text(json.dumps(page))
+    page = {"name": job.name, "layers": [layer], "depth": depth, "options": job.options}
+    (job.results / "base.splats").write_bytes((job.folder / job.source).read_bytes())
+    (job.results / "page.json").write_text(json.dumps(page))

@@ -35,7 +35,7 @@ from spackle.render import CpuRenderer
 from spackle.scene import Scene
 from spackle.views import scene_path
 from spackle.web.guard import Limits
-from spackle.web.page import BYTES, PageScene, encode_layer, page_files, page_scene, single_html
+from spackle.web.page import BYTES, PageScene, encode_layer, page_file, page_scene, single_html
 from spackle.web.work import SceneWork
 
 WEB = Path(__file__).parents[2] / "web"
@@ -114,12 +114,12 @@ def test_the_built_page_belongs_to_its_sources() -> None:
     digest = hashlib.sha256()
     for path in sorted(sources, key=lambda path: path.relative_to(WEB).as_posix()):
         digest.update(f"{path.relative_to(WEB).as_posix()}\0".encode() + path.read_bytes() + b"\0")
-    assert digest.hexdigest() in page_files()["/viewer.js"][1][:200].decode(), "run `make viewer`"
+    assert digest.hexdigest() in page_file("viewer.js")[:200].decode(), "run `make viewer`"
     assert "http" not in (WEB / "package-lock.json").read_text(encoding="utf-8")
     wanted = json.loads((WEB / "package.json").read_text(encoding="utf-8"))["devDependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in wanted.values())
-    for package, name in itertools.product(("three", "@sparkjsdev/spark", "fflate"), ("/licenses.txt", "/viewer.js")):
-        assert f"\n{package} " in page_files()[name][1][:8000].decode()
+    for package, name in itertools.product(("three", "@sparkjsdev/spark", "fflate"), ("licenses.txt", "viewer.js")):
+        assert f"\n{package} " in page_file(name)[:8000].decode()
 
 
 def test_the_single_file_runs_its_own_script_and_style_alone() -> None:

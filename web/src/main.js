@@ -80,10 +80,7 @@ async function watch(id) {
   if (!stand.url) stand(source.file(id, "photo.jpg"));
   progress(null, null);
   try {
-    await source.follow(id, ({ stage, done, total, line }) => {
-      if (stage) progress(stage, total ? done / total : null);
-      else element("notice").querySelector("p").textContent = line;
-    });
+    await source.follow(id, ({ stage, share, line }) => progress(stage, share, line));
     await show(await source.load(id, (share) => progress("load", share)), id);
   } catch (error) {
     failed(error);
@@ -183,11 +180,10 @@ function notice(title, text, busy = false) {
 }
 
 /** `share` in 0..1, or null where nobody knows. */
-function progress(stage, share) {
+function progress(stage, share, line = "") {
   const box = element("notice");
-  const line = box.classList.contains("busy") ? box.querySelector("p").textContent : "";
-  notice(STAGES[stage] ?? stage ?? "Working on your photo", line, true);
-  const bar = element("notice").querySelector("progress");
+  notice(STAGES[stage] ?? stage ?? "Working on your photo", line ?? "", true);
+  const bar = box.querySelector("progress");
   if (share === null) bar.removeAttribute("value");
   else bar.value = share;
 }

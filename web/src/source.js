@@ -61,7 +61,7 @@ export async function remove(id) {
   await answer(await fetch(here(`${SCENES}/${id}`), { method: "DELETE" }));
 }
 
-/** Watch a photo until its scene is done. `onNews` hears of {stage, done, total} and {line}. */
+/** Watch a photo until its scene is done. `onNews` hears of its state: {stage, share, line}. */
 export function follow(id, onNews) {
   return new Promise((resolve, reject) => {
     const events = new EventSource(here(`${SCENES}/${id}/events`));
@@ -69,10 +69,10 @@ export function follow(id, onNews) {
     events.onmessage = ({ data }) => {
       lost = 0;
       const news = JSON.parse(data);
-      if ("state" in news) events.close();
+      if (news.ended === null) return onNews(news);
+      events.close();
       if (news.state === "done") resolve();
-      else if ("state" in news) reject(new Error(news.error));
-      else onNews(news);
+      else reject(new Error(news.error));
     };
     events.onerror = () => {
       if (events.readyState !== EventSource.CLOSED && ++lost < 5) return; // it connects again by itself

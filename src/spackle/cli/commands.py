@@ -228,7 +228,8 @@ def view(
     settings = BaseSettings(base, depth, depth_kind=depth_kind, checkpoint=checkpoint, device=device)
     place = app.Place(host, port, secrets.token_urlsafe(16) if token else None, browser)
     reporter = Reporter(verbose, as_json=as_json)
-    app.view(target, settings, disparity, {"focal_px": focal_px, "fov": fov}, keep_frame, place, reporter)
+    usual = {"disparity": disparity, "keep_frame": keep_frame, "depth_kind": depth_kind}
+    app.view(target, settings, usual, {"focal_px": focal_px, "fov": fov}, place, reporter)
     raise typer.Exit(INTERRUPTED)
 
 

@@ -11,7 +11,6 @@ import socket
 import sys
 import tempfile
 import threading
-import time
 import webbrowser
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import NamedTuple
 from spackle.bases.open import open_base
 from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.cli.saved_scene import page_of
-from spackle.errors import InputError
+from spackle.errors import InputError, reason_in_a_line
 from spackle.files import check_file
 from spackle.image import load_photo
 from spackle.progress import Reporter, asked_to_stop
@@ -29,7 +28,7 @@ from spackle.views import PathOptions
 from spackle.web import create_app
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, Keep
-from spackle.web.server import serving
+from spackle.web.server import server_of
 from spackle.web.work import PREVIEW, SceneWork, check_photo, is_scene
 
 WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
@@ -48,34 +47,34 @@ class Place(NamedTuple):
 def view(
     target: Path | None,
     settings: BaseSettings,
-    disparity: float | None,
+    usual: Mapping[str, object],
     lens: Mapping[str, float | None],
-    keep_frame: bool,
     place: Place,
     reporter: Reporter,
 ) -> None:
     """Show a scene or a photo, or an empty page, until somebody stops it.
 
-    Depth, calibration and `lens`, `focal_px` and `fov`, are of that photo alone; it and what the page sends live as
-    long as this. InputError for a file that is neither, or an option that cannot be used.
+    Depth, calibration and `lens`, `focal_px` and `fov`, are of that photo alone, `usual`, disparity, keep_frame and
+    depth_kind, of all that the page sends; they live as long as this. InputError for a file that is neither, or an
+    option that cannot be used.
     """
-    PathOptions(disparity=disparity).check()
-    name = "Spackle" if target is None else checked(target, settings, lens, keep_frame, reporter)
-    usual = AUTO if settings.name == RGBD else settings.name
-    others = dataclasses.replace(settings, depth=None, depth_kind="auto", name=usual)
+    PathOptions(disparity=usual["disparity"]).check()  # type: ignore[arg-type]
+    name = "Spackle" if target is None else checked(target, settings, lens, bool(usual["keep_frame"]), reporter)
+    base = AUTO if settings.name == RGBD else settings.name
+    others = dataclasses.replace(settings, depth=None, depth_kind="auto", name=base)
     others.check()
     with tempfile.TemporaryDirectory(prefix="spackle-view-", ignore_cleanup_errors=True) as folder:
-        work = SceneWork(others, disparity, keep_frame, settings.depth_kind, reporter.verbose)
+        work = SceneWork(others, usual, reporter.verbose)
         with listening(Path(folder), work, 1, Keep(), place, reporter) as (jobs, urls):
-            fragment = ""
             if target is not None:
-                options: dict[str, object] = {"base": settings.name, **lens, "files": []}
                 with jobs.place() as new:
                     if not is_scene(target):
                         check_photo(target, name, new / PREVIEW)
                     depth = None if settings.depth is None else os.path.abspath(str(settings.depth))
-                    fragment = "#" + jobs.add(new, name, os.path.abspath(target), depth, options).id
-            announce(name, [url + fragment for url in urls], place, reporter)
+                    options: dict[str, object] = {"base": settings.name, **lens, "files": []}
+                    job = jobs.add(new, name, os.path.abspath(target), depth, options)
+                urls = [f"{url}#{job.id}" for url in urls]
+            announce(name, urls, place, reporter)
 
 
 def checked(
@@ -111,7 +110,7 @@ def serve(folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place,
 def listening(
     folder: Path, work: SceneWork, workers: int, keep: Keep, place: Place, reporter: Reporter
 ) -> Iterator[tuple[Jobs, list[str]]]:
-    """Run the app during the block and then until Ctrl-C or SIGTERM; yields its jobs and the page's addresses."""
+    """Yields the app's jobs and the page's addresses, and then answers there until Ctrl-C or SIGTERM."""
     with asked_to_stop(alone=True) as stopped, listener_at(place.host, place.port) as listener, told_to(reporter):
         address, port = listener.getsockname()[:2]
         access = Access.at(place.host, address, place.token)
@@ -121,23 +120,19 @@ def listening(
         here = {"0.0.0.0": LOOPBACK, "::": "::1"}.get(address, address)
         addresses = [here] if access.local else [here, address_in_network(place.host)]
         token = f"{place.token}/" if place.token else ""
-        with serving(app, listener):
-            yield app.state.jobs, [f"http://{f'[{a}]' if ':' in a else a}:{port}/{token}" for a in addresses]
-            while not stopped():
-                time.sleep(0.05)
+        with contextlib.closing(app.state.jobs) as jobs:
+            yield jobs, [f"http://{f'[{a}]' if ':' in a else a}:{port}/{token}" for a in addresses]
+            if not stopped():
+                server_of(app).run(sockets=[listener])
 
 
 @contextlib.contextmanager
 def told_to(reporter: Reporter) -> Iterator[None]:
     """What jobs and requests log goes to the terminal, requests only if it is to be verbose."""
-
-    class Handler(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            (reporter.detail if record.levelno <= logging.DEBUG else reporter.log)(self.format(record))
-
-    handler = Handler()
+    handler = logging.Handler()
+    handler.emit = lambda record: reporter.log(handler.format(record))  # type: ignore[method-assign]
     LOG.addHandler(handler)
-    LOG.setLevel(logging.DEBUG)
+    LOG.setLevel(logging.DEBUG if reporter.verbose else logging.INFO)
     LOG.propagate = False
     try:
         yield
@@ -150,26 +145,15 @@ def listener_at(host: str, port: int) -> socket.socket:
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: must lie between 1 and 65535 (0: any that is free)")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
-            0
-        ]
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        return socket.create_server(address, family=family, backlog=128)
     except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        line = f"--host {host}: no address of this machine: {reason}: leave it out, or give 0.0.0.0"
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else reason_in_a_line(error)
+        if isinstance(error, socket.gaierror | UnicodeError) or error.errno == errno.EADDRNOTAVAIL:
+            line = f"--host {host}: no address of this machine: {reason}: leave it out, or give 0.0.0.0 for all of them"
+        else:
+            line = f"--port {port}: cannot listen at {host}: {reason}: give another, or none"
         raise InputError(line) from error
-    listener = socket.socket(family, kind)
-    try:
-        if os.name == "posix":  # elsewhere that would take a port away from who has it
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        line = f"--port {port}: cannot listen at {host}: {error.strerror}: give another, or none"
-        if error.errno == errno.EADDRNOTAVAIL:
-            line = f"--host {host}: is no address of this machine: leave it out, or give 0.0.0.0 for all of them"
-        raise InputError(line) from error
-    return listener
 
 
 def announce(name: str, urls: list[str], place: Place, reporter: Reporter) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import functools
+import contextlib
 import re
 import shutil
 from collections.abc import AsyncIterator
@@ -12,12 +12,14 @@ from typing import Any, Literal
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, Response
+from fastapi.sse import EventSourceResponse
 from jinja2 import Template
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
+from starlette.staticfiles import StaticFiles
 
 import spackle
 from spackle.bases.settings import AUTO
@@ -25,18 +27,18 @@ from spackle.errors import InputError, check_name, one_line
 from spackle.image import PHOTO_SUFFIXES
 from spackle.task_process import Work
 from spackle.web.guard import Access, Guard, Limits
-from spackle.web.jobs import FullError, Job, Jobs, Keep, SceneState
-from spackle.web.page import as_json, page_file, page_files
+from spackle.web.jobs import Job, Jobs, Keep, SceneState
+from spackle.web.page import page_file
 from spackle.web.work import PREVIEW, FileName, SceneOptions, SceneWork, check_photo
 
 PagePart = Literal["page.json", "base.splats", "aux.splats", "photo.jpg"]  # what the page draws
 SCENES = "/api/v1/scenes"
 DEPTH_SUFFIXES = (".npy", ".npz", ".png", ".pfm")  # of a photo, as `spackle predict --depth` takes them
-PACE_S, HEARTBEAT_S = 0.1, 10.0  # between two looks of a listener; of a silent stream, so that a lost one shows
+PACE_S = 0.1  # between two looks of a listener
 WORK, KEEP, LIMITS = SceneWork(), Keep(), Limits()
 MAX_NAME = 80  # characters that are shown
 FILE = {"type": "string", "format": "binary"}
-UPLOAD: dict[str, Any] = {
+UPLOAD: dict[str, Any] = {  # by hand: FastAPI would read a form that it knows before there is a place for the photo
     "schema": {
         "type": "object",
         "required": ["photo"],
@@ -61,8 +63,8 @@ def create_app(
 ) -> FastAPI:
     """An app for a server, or to mount in another app, which then says who may ask.
 
-    Its processes start at once; `app.state.jobs.close()` ends them. Photos that wait or are at work go on when an app
-    next takes up the folder.
+    Its processes start at once and end with the app; where another app mounts it, `app.state.jobs.close()` ends them.
+    Photos that wait or are at work go on when an app next takes up the folder.
 
     Args:
         folder: for photos and scenes; InputError where another server uses it.
@@ -74,12 +76,19 @@ def create_app(
     """
     jobs = Jobs(folder, work, workers, keep)
     bases = work.bases if isinstance(work, SceneWork) else [AUTO]
+
+    @contextlib.asynccontextmanager
+    async def until_the_end(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        jobs.close()
+
     app = FastAPI(
         title="Spackle",
         version=spackle.__version__,
         openapi_url="/api/v1/openapi.json",
         docs_url=None,
         redoc_url=None,
+        lifespan=until_the_end,
         exception_handlers={HTTPException: refused, RequestValidationError: unknown},
     )
     app.state.jobs = jobs
@@ -94,12 +103,16 @@ def create_app(
     @app.post(SCENES, status_code=202, openapi_extra={"requestBody": {"content": {"multipart/form-data": UPLOAD}}})
     async def post_photo(request: Request, response: Response) -> SceneState:
         """Send a photo. It waits until a process has time for it; the queue's end is 429."""
-        try:
-            with jobs.place() as new:
-                async with request.form(max_files=2, max_fields=1) as form, decoding:
+        with jobs.place() as new:
+            try:
+                form = await asyncio.wait_for(request.form(max_files=2, max_fields=1), limits.upload)
+            except asyncio.TimeoutError:
+                raise HTTPException(408, "the photo came too slowly") from None
+            try:
+                async with decoding:
                     job = await run_in_threadpool(accept, form, new, jobs, bases)
-        except FullError as error:
-            raise HTTPException(429, str(error), {"Retry-After": str(error.seconds)}) from error
+            finally:
+                await form.close()
         response.headers["Location"] = f"{request.scope['root_path']}{SCENES}/{job.id}"
         return job
 
@@ -111,12 +124,17 @@ def create_app(
     @app.delete(SCENES + "/{id}", status_code=204)
     async def delete(id: str) -> None:
         """Forget a photo and its scene; work on it ends."""
-        await run_in_threadpool(jobs.remove, job_of(id))
+        await run_in_threadpool(jobs.remove, job_of(id).id)
 
-    @app.get(SCENES + "/{id}/events", response_class=StreamingResponse)
-    async def get_events(id: str) -> StreamingResponse:
-        """Server-sent events: {stage, done, total}, {line}, and at the end {state, error}."""
-        return StreamingResponse(events(job_of(id), jobs), media_type="text/event-stream")
+    @app.get(SCENES + "/{id}/events", response_class=EventSourceResponse)
+    async def get_events(id: str) -> AsyncIterator[SceneState]:
+        """Server-sent events: the state, now and whenever it changes, until the photo is done or failed."""
+        seen: SceneState | None = None
+        while seen is None or seen.ended is None:
+            if (state := jobs.get(id)) is not seen:
+                seen = state or SceneState(id=id, name="", state="failed", error="there is no such scene", ended=0)
+                yield seen
+            await asyncio.sleep(PACE_S)
 
     @app.get(SCENES + "/{id}/files/{file}", response_class=FileResponse)
     async def get_file(id: str, file: FileName | PagePart) -> FileResponse:
@@ -144,8 +162,7 @@ def create_app(
     async def get_docs() -> HTMLResponse:
         return HTMLResponse(Template(page_file("docs.html").decode(), autoescape=True).render(api=app.openapi()))
 
-    for path, (kind, content) in page_files().items():
-        app.add_route(path, functools.partial(asset, content, kind), methods=["GET"])
+    app.mount("/", StaticFiles(packages=[("spackle.web", "page")], html=True))
     return app
 
 
@@ -163,15 +180,14 @@ def accept(form: FormData, folder: Path, jobs: Jobs, bases: list[str]) -> Job:
         raise HTTPException(422, one_line(f"options: {'.'.join(map(str, first['loc']))}: {first['msg']}")) from error
     except InputError as error:
         raise HTTPException(422, str(error)) from error
-    source = _saved(photo, folder, "source", name, PHOTO_SUFFIXES)
-    of_depth = None
+    source, of_depth = _saved(photo, folder, "source", name, PHOTO_SUFFIXES), None
     if isinstance(depth, UploadFile) and depth.filename:
         of_depth = _saved(depth, folder, "depth", "depth map", DEPTH_SUFFIXES)
     try:
         check_photo(folder / source, name, folder / PREVIEW)
     except InputError as error:
         raise HTTPException(415, str(error)) from error
-    return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_defaults=True))
+    return jobs.add(folder, name, source, of_depth, options.model_dump(exclude_unset=True))
 
 
 def _saved(upload: UploadFile, folder: Path, stem: str, name: str, suffixes: tuple[str, ...]) -> str:
@@ -191,29 +207,6 @@ def shown_name(given: str) -> str:
     last = re.split(r"[/\\]", given)[-1]
     name = "".join(character for character in last if character.isprintable()).strip()
     return name if len(name) <= MAX_NAME else f"{name[: MAX_NAME // 2]}…{name[-MAX_NAME // 2 :]}"
-
-
-async def events(job: Job, jobs: Jobs) -> AsyncIterator[bytes]:
-    """What is known of a job and then what comes, until its end or the server's."""
-    seen, silent = 0, 0.0
-    while True:
-        fresh = [event for number, event in job.events if number > seen]
-        if not fresh and (job.ended or jobs.closing):
-            fresh = [{"state": job.state, "error": job.error or (None if job.ended else "the server was stopped")}]
-        seen = job.events[-1][0] if job.events else 0
-        silent = 0.0 if fresh else silent + PACE_S
-        if fresh:
-            yield b"".join(b"data: " + as_json(event) + b"\n\n" for event in fresh)
-        elif silent > HEARTBEAT_S:
-            silent = 0.0
-            yield b":\n\n"
-        if any("state" in event for event in fresh):
-            return
-        await asyncio.sleep(PACE_S)
-
-
-def asset(content: bytes, kind: str, request: Request) -> Response:
-    return Response(content, media_type=kind)
 
 
 async def refused(request: Request, error: Any) -> JSONResponse:

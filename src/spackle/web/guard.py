@@ -12,7 +12,6 @@ import ipaddress
 import logging
 import re
 import socket
-import time
 from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -24,7 +23,7 @@ from spackle.errors import one_line
 
 LOG = logging.getLogger("spackle.web")
 HOST = re.compile(r"(\[[0-9a-f:.%]+\]|[0-9a-z._-]+)(?::\d{1,5})?", re.IGNORECASE)
-OWN_SITES = ("same-origin", "none")  # none: typed by a person, or a bookmark
+OWN_SITES = {"same-origin", "none"}  # none: typed by a person, or a bookmark
 # The page has its scripts and styles from us alone, sends nothing elsewhere and stands in no other page's frame.
 HEADERS = {
     "Cache-Control": "no-store",  # a photo is private
@@ -42,7 +41,6 @@ HEADERS = {
 class Limits(NamedTuple):
     """Of a client; times in seconds."""
 
-    pause: float = 10  # between two pieces of a request
     upload: float = 300  # all of an upload
     send: float = 20  # for a piece of an answer: a client that never reads must not keep a file open
     upload_bytes: int = 200_000_000  # photo and depth map
@@ -64,18 +62,24 @@ class Access(NamedTuple):
         short = machine.partition(".")[0]
         return Access(token, frozenset({"localhost", machine, short, f"{short}.local", host.lower()}), False)
 
-    def refusal(self, headers: Headers) -> str | None:
-        """Why a request is none of a person's or a program's that wants this server, or None."""
+    def admitted(self, scope: Scope, headers: Headers) -> Scope:
+        """The request below the token in its path, or as it is; HTTPException where it has no right to ask."""
         hosts = headers.getlist("host")
         match = HOST.fullmatch(hosts[0].strip()) if len(hosts) == 1 else None
         if match is None or not self._is_own(match[1].lower()):
-            return "this server does not go by that Host name"
+            raise HTTPException(403, "this server does not go by that Host name")
         ours = {f"{scheme}://{hosts[0].strip().lower()}" for scheme in ("http", "https")}  # https: by a tunnel
-        if not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours:
-            return "asked by a page of another Origin"
-        if any(site.strip().lower() not in OWN_SITES for site in headers.getlist("sec-fetch-site")):
-            return "asked by a page of another site"
-        return None
+        sites = {site.strip().lower() for site in headers.getlist("sec-fetch-site")}
+        if not {origin.strip().lower() for origin in headers.getlist("origin")} <= ours or not sites <= OWN_SITES:
+            raise HTTPException(403, "asked by a page of another site")
+        root, path = scope["root_path"], scope["path"]
+        first = path.removeprefix(root).split("/")[1] if path.count("/") > 1 else ""
+        if self._is_token(first):
+            return {**scope, "root_path": f"{root}/{first}"}
+        may_ask = scope["method"] in ("GET", "HEAD") if self.token is None else path == "/healthz"
+        if not may_ask and not self._is_token(headers.get("authorization", "").removeprefix("Bearer ")):
+            raise HTTPException(401, "this needs the token that the server said as it started")
+        return scope
 
     def _is_own(self, name: str) -> bool:
         try:
@@ -83,16 +87,8 @@ class Access(NamedTuple):
         except ValueError:
             return name.rstrip(".") in self.names
 
-    def admits(self, scope: Scope, headers: Headers) -> Scope | None:
-        """The request below the token in its path, or as it is if it has a right to ask; None without the token."""
-        root, path = scope["root_path"], scope["path"]
-        first = path.removeprefix(root).split("/")[1] if path.count("/") > 1 else ""
-        bearer = headers.get("authorization", "").removeprefix("Bearer ")
-        if self.token is None:
-            return scope if scope["method"] in ("GET", "HEAD") else None
-        if hmac.compare_digest(first.encode(), self.token.encode()):
-            return {**scope, "root_path": f"{root}/{first}"}
-        return scope if hmac.compare_digest(bearer.encode(), self.token.encode()) or path == "/healthz" else None
+    def _is_token(self, word: str) -> bool:
+        return self.token is not None and hmac.compare_digest(word.encode(), self.token.encode())
 
 
 def is_loopback(address: str) -> bool:
@@ -109,6 +105,17 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":  # no WebSocket
             return await self.app(scope, receive, send) if scope["type"] == "lifespan" else None
+        headers, count = Headers(scope=scope), 0
+
+        def check(size: int) -> None:
+            if size > self.limits.upload_bytes:
+                raise HTTPException(413, f"more than {self.limits.upload_bytes / 1e6:g} MB: send a smaller photo")
+
+        async def bounded() -> Message:
+            nonlocal count
+            message = await receive()
+            check(count := count + len(message.get("body", b"")))
+            return message
 
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -117,48 +124,14 @@ class Guard:
                 LOG.debug(one_line(f"{scope['method']} {path} {message['status']}"))
             await asyncio.wait_for(send(message), self.limits.send)
 
-        found = self._admitted(scope, Headers(scope=scope))
-        if isinstance(found, HTTPException):
-            return await JSONResponse({"error": found.detail}, found.status_code)(scope, receive, answer)
         try:
-            await self.app(found, self._bounded(receive), answer)
+            admitted = scope if self.access is None else self.access.admitted(scope, headers)
+            check(int(headers.get("content-length", 0)))
+            await self.app(admitted, bounded, answer)
+        except HTTPException as error:
+            await JSONResponse({"error": error.detail}, error.status_code)(scope, receive, answer)
         except asyncio.TimeoutError:
             LOG.debug("a client does not read what it asked for")  # its connection is closed
         except Exception:
             LOG.exception("this went wrong:")
             raise
-
-    def _admitted(self, scope: Scope, headers: Headers) -> Scope | HTTPException:
-        """The request as the app shall see it, or why it may not."""
-        admitted: Scope | None = scope
-        if self.access is not None and (line := self.access.refusal(headers)):
-            return HTTPException(403, line)
-        if self.access is not None and (admitted := self.access.admits(scope, headers)) is None:
-            return HTTPException(401, "this needs the token that the server said as it started")
-        length = int(headers.get("content-length", 0))
-        return self._too_large if length > self.limits.upload_bytes or admitted is None else admitted
-
-    @property
-    def _too_large(self) -> HTTPException:
-        return HTTPException(413, f"more than {self.limits.upload_bytes / 1e6:g} MB: send a smaller photo")
-
-    def _bounded(self, receive: Receive) -> Receive:
-        """Requests that come too slowly, or hold too much, end while they come."""
-        start, count, whole = time.monotonic(), 0, False
-
-        async def bounded() -> Message:
-            nonlocal count, whole
-            if whole:
-                return await receive()  # the end of the connection, whenever that is
-            try:
-                message = await asyncio.wait_for(receive(), self.limits.pause)
-            except asyncio.TimeoutError:
-                raise HTTPException(408, "the photo came too slowly") from None
-            count, whole = count + len(message.get("body", b"")), not message.get("more_body", False)
-            if count > self.limits.upload_bytes:
-                raise self._too_large
-            if time.monotonic() - start > self.limits.upload:
-                raise HTTPException(408, "the photo came too slowly")
-            return message
-
-        return bounded

@@ -9,12 +9,12 @@ import secrets
 import shutil
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from fastapi import HTTPException
 from pydantic import BaseModel, Field
 
 from spackle.errors import InputError, reason_in_a_line
@@ -25,9 +25,7 @@ from spackle.task_process import Event, TaskProcess, Work
 LOG = logging.getLogger("spackle.web")
 RECORD, NEW = "job.json", ".new-"  # a job's own file; how folders of uploads begin that are not whole yet
 ATTEMPTS = 2  # runs that a job may begin: one that takes the server down with it must not do so for ever
-ENDED = "the server ended twice while it worked on this photo"
-REMOVED = "this photo was removed"
-LINES = 50  # events that late listeners get
+ENDED_TWICE = "the server ended twice while it worked on this photo"
 LOOK_S = 60.0  # between two looks for results that are too old
 
 
@@ -39,17 +37,6 @@ class Keep(NamedTuple):
     waiting: int = 32  # jobs in the queue
 
 
-class SceneTask(NamedTuple):
-    """What a process does: a photo or a scene to show, or one more `file` of a scene that is done."""
-
-    source: Path
-    depth: Path | None
-    name: str  # for people; no file is ever called so
-    options: dict[str, Any]
-    results: Path  # the folder for what is made
-    file: str | None
-
-
 class SceneState(BaseModel):
     """A photo on its way to a scene."""
 
@@ -58,72 +45,55 @@ class SceneState(BaseModel):
     state: Literal["queued", "running", "done", "failed"] = "queued"
     stage: str | None = Field(default=None, description="What is done now.")
     share: float | None = Field(default=None, description="How much of the stage is done, 0 to 1, where it is known.")
+    line: str | None = Field(default=None, description="What was said last.")
     error: str | None = Field(default=None, description="Why it failed, in a line.")
     created: float = Field(default_factory=time.time, description="Seconds since 1970.")
     ended: float | None = None
 
 
 class Job(SceneState):
-    """What the server alone knows of it; RECORD holds all but the last two values."""
+    """What the server alone knows of it; RECORD holds all but the folder."""
 
     source: str  # below the job's folder, or elsewhere on this machine
     depth: str | None = None
     options: dict[str, Any] = {}
     attempts: int = 0
-    folder: Path = Field(Path(), exclude=True)
-    events: list[tuple[int, Event]] = Field(default=[], exclude=True)  # numbered in the order they came
+    folder: Path = Field(default=Path(), exclude=True)
 
     @property
     def results(self) -> Path:
-        """Of the last attempt: a process that outlives its server may still write into that of the one before."""
-        return self.folder / str(self.attempts)
+        return self.folder / "results"
 
     def save(self) -> None:
         write_json(self.model_dump(mode="json"), self.folder / RECORD, durable=True)
-
-    def tell(self, event: Event) -> None:
-        """Add {stage, done, total}, {line} or {state, error} for listeners; one stage replaces the other."""
-        number = self.events[-1][0] + 1 if self.events else 1
-        kept = [(k, old) for k, old in self.events if not ("stage" in event and "stage" in old)]
-        self.events = [*kept, (number, event)][-LINES:]  # in one step: listeners read without a lock
-        if "line" in event:
-            LOG.info(event["line"])
-        if "stage" in event:
-            self.stage, self.share = event["stage"], event["done"] / event["total"] if event["total"] else None
-
-
-class FullError(Exception):
-    """There is no place in the queue, and perhaps one in `seconds`."""
-
-    def __init__(self, seconds: int) -> None:
-        super().__init__(f"too many photos are waiting: try again in {seconds} seconds")
-        self.seconds = seconds
 
 
 class Jobs:
     """The jobs in a folder, and the processes that work on them.
 
+    A `Job` is never changed: whatever happens to it puts another in its place.
+
     Args:
         folder: holds a folder for each job; InputError where another server uses it.
-        work: does a `SceneTask` and tells how far it is.
-        workers: number of processes.
+        work: takes (job, file) and tells {stage, done, total} or {line}. Without a file it makes a scene of a photo;
+            with one it adds that file to a scene that is done.
+        workers: number of processes for photos; one more adds files.
         keep: what the folder may hold.
     """
 
     def __init__(self, folder: Path, work: Work, workers: int, keep: Keep) -> None:
-        self.folder, self.keep, self.closing = folder, keep, False
+        self.folder, self.keep = folder, keep
         self._held = contextlib.ExitStack()
         self._held.enter_context(results_folder(folder, alone=True))
-        self._changed = threading.Condition()
+        self._lock, self._closed = threading.RLock(), threading.Event()
         self._jobs: dict[str, Job] = {}
-        self._queue: deque[tuple[Job, str | None]] = deque()
-        self._files: dict[tuple[str, str], Future[str | None]] = {}  # being made, by job and name
+        self._work, self._processes, self._of_thread = work, list[TaskProcess](), threading.local()
         self._running: dict[str, TaskProcess] = {}  # by job
-        self._receiving, self._pace = 0, 10.0  # photos; seconds that a job took
+        self._workers, self._receiving, self._pace = workers, 0, 10.0  # photos; seconds that a job took
+        self._photos, self._files = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
+        self._photos.submit(self._process)  # loads while the first photo comes
         self._take_up()
-        self._threads = [threading.Thread(target=self._run, args=(work,), daemon=True) for _ in range(workers)]
-        for thread in self._threads:
-            thread.start()
+        threading.Thread(target=self._tidy_until_closed, daemon=True).start()
 
     def _take_up(self) -> None:
         """What an earlier server left waits again; uploads that were not whole go."""
@@ -132,24 +102,31 @@ class Jobs:
                 shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError, ValueError):
                 job = Job.model_validate_json((folder / RECORD).read_bytes())
-                job.folder = folder
-                self._jobs[job.id] = job
+                self._jobs[job.id] = job.model_copy(update={"folder": folder})
         for job in sorted(self._jobs.values(), key=lambda job: job.created):
             if job.state == "running" and job.attempts >= ATTEMPTS:
-                self._end(job, ENDED)
+                self._end(job.id, ENDED_TWICE)
             elif job.ended is None:
-                job.state = "queued"
-                self._queue.append((job, None))
+                self._change(job.id, state="queued")
+                self._photos.submit(self._run, job.id)
 
     def get(self, id: str) -> Job | None:
         return self._jobs.get(id)
 
+    def _change(self, id: str, **values: object) -> None:
+        with self._lock:
+            if id in self._jobs:  # it may have been removed
+                self._jobs[id] = self._jobs[id].model_copy(update=values)
+
     @contextlib.contextmanager
     def place(self) -> Iterator[Path]:
-        """Hold a place in the queue while a photo is received into the folder that is yielded; FullError."""
-        with self._changed:
-            if len(self._queue) + self._receiving >= self.keep.waiting:
-                raise FullError(max(1, round(self._pace / len(self._threads))))
+        """Hold a place in the queue while a photo is received into the folder that is yielded; 429 where it is full."""
+        with self._lock:
+            waiting = self._receiving + sum(job.state == "queued" for job in self._jobs.values())
+            if waiting >= self.keep.waiting:
+                seconds = str(max(1, round(self._pace / self._workers)))
+                line = f"too many photos are waiting: try again in {seconds} seconds"
+                raise HTTPException(429, line, {"Retry-After": seconds})
             self._receiving += 1
         folder = self.folder / f"{NEW}{secrets.token_hex(8)}"
         try:
@@ -157,131 +134,109 @@ class Jobs:
             yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)  # it has another name where it was added
-            with self._changed:
+            with self._lock:
                 self._receiving -= 1
 
     def add(self, folder: Path, name: str, source: str, depth: str | None, options: dict[str, Any]) -> Job:
-        """The job of what lies in a folder of `place`; `source` may lie elsewhere."""
+        """The job of what lies in a folder of `place`; `source` and `depth` may lie elsewhere."""
         id = folder.name.removeprefix(NEW)
         job = Job(id=id, name=name, source=source, depth=depth, options=options, folder=folder)
         job.save()
-        job.folder = folder.rename(self.folder / id)
-        with self._changed:
-            self._jobs[id] = job
-            self._queue.append((job, None))
-            self._changed.notify()
+        self._jobs[id] = job = job.model_copy(update={"folder": folder.rename(self.folder / id)})
+        self._photos.submit(self._run, id)
         return job
 
     def make(self, job: Job, file: str) -> Future[str | None]:
-        """One more file of a scene that is done, before the jobs that wait: None, or why it could not be made."""
-        with self._changed:
-            if (job.id, file) not in self._files:
-                self._files[job.id, file] = Future()
-                self._queue.appendleft((job, file))
-                self._changed.notify()
-            return self._files[job.id, file]
+        """One more file of a scene that is done: None, or why it could not be made."""
+        return self._files.submit(lambda: self._process().do((job, file), lambda event: None))
 
-    def remove(self, job: Job) -> None:
+    def remove(self, id: str) -> None:
         """Forget a job and its files; the process that works on it is killed."""
-        with self._changed:
-            self._jobs.pop(job.id, None)
-            self._queue = deque(entry for entry in self._queue if entry[0] is not job)
-            for key in [key for key in self._files if key[0] == job.id]:
-                self._files.pop(key).set_result(REMOVED)
-            if process := self._running.pop(job.id, None):
+        with self._lock:
+            job = self._jobs.pop(id, None)
+            if process := self._running.pop(id, None):
                 process.kill()
-        shutil.rmtree(job.folder, ignore_errors=True)
-        job.tell({"state": "failed", "error": REMOVED})
+        if job:
+            shutil.rmtree(job.folder, ignore_errors=True)
 
     def close(self) -> None:
         """Kill the processes; jobs go on when a server next takes up the folder."""
-        with self._changed:
-            self.closing = True
-            self._changed.notify_all()
-            for process in self._running.values():
+        with self._lock:
+            self._closed.set()
+            for process in self._processes:
                 process.kill()
-        for thread in self._threads:
-            thread.join()
+        for pool in (self._photos, self._files):
+            pool.shutdown(cancel_futures=True)
         self._held.close()
 
-    def _run(self, work: Work) -> None:
-        """The thread of a process: hand it one task after the other, and start another where it died."""
-        process = TaskProcess(work)
-        while (entry := self._next()) is not None:
-            if not process.alive:
-                process = TaskProcess(work)
-            self._do(process, *entry)
-        process.kill()
+    def _process(self) -> TaskProcess:
+        """The calling thread's own; another where it died."""
+        process: TaskProcess | None = getattr(self._of_thread, "process", None)
+        with self._lock:
+            if process is None or not (process.alive or self._closed.is_set()):
+                self._processes = [each for each in self._processes if each.alive]
+                self._of_thread.process = process = TaskProcess(self._work)
+                self._processes.append(process)
+        return process
 
-    def _next(self) -> tuple[Job, str | None] | None:
-        while True:
-            with self._changed:
-                if self.closing:
-                    return None
-                if self._queue:
-                    return self._queue.popleft()
-                self._changed.wait(LOOK_S)
-            self.tidy()
-
-    def _do(self, process: TaskProcess, job: Job, file: str | None) -> None:
-        with self._changed:
-            if self.closing or job.id not in self._jobs:
+    def _run(self, id: str) -> None:
+        """Hand a photo to the thread's process, until the scene is there."""
+        process, start = self._process(), time.monotonic()
+        with self._lock:
+            if self._closed.is_set() or id not in self._jobs:
                 return
-            self._running[job.id] = process
-        start, depth = time.monotonic(), None if job.depth is None else job.folder / job.depth
+            self._change(id, state="running", attempts=self._jobs[id].attempts + 1)
+            self._running[id], job = process, self._jobs[id]
         try:
-            if file is None:
-                job.state, job.attempts = "running", job.attempts + 1
-                shutil.rmtree(job.results, ignore_errors=True)
-                job.results.mkdir()
-                job.save()
-            task = SceneTask(job.folder / job.source, depth, job.name, job.options, job.results, file)
-            error = process.do(task, job.tell)
+            shutil.rmtree(job.results, ignore_errors=True)
+            job.results.mkdir()
+            job.save()
+            error = process.do((job, None), lambda event: self._tell(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be kept here: {reason_in_a_line(problem)}"
-        with self._changed:
-            ours = self._running.pop(job.id, None) is process
-            if file is not None and (made := self._files.pop((job.id, file), None)):
-                made.set_result(error)
-        if file is None and ours and not self.closing:
+        self._running.pop(id, None)
+        if not self._closed.is_set():
             self._pace = time.monotonic() - start
-            self._end(job, error)
-            self.tidy()
+            self._end(id, error)
 
-    def _end(self, job: Job, error: str | None) -> None:
+    def _tell(self, id: str, event: Event) -> None:
+        if "line" in event:
+            LOG.info(event["line"])
+            self._change(id, line=event["line"])
+        else:
+            total = event["total"]
+            self._change(id, stage=event["stage"], share=event["done"] / total if total else None)
+
+    def _end(self, id: str, error: str | None) -> None:
         """Keep a job's end on the disk, and then tell it; the photo goes."""
-        end = {
-            "state": "failed" if error else "done",
-            "error": error,
-            "ended": time.time(),
-            "stage": None,
-            "share": None,
-        }
-        with contextlib.suppress(InputError):  # the disk is full: it is said here, and done again by the next server
-            job.model_copy(update=end).save()
-            for file in (job.source, job.depth):
-                if file is not None and not os.path.isabs(file):
-                    (job.folder / file).unlink(missing_ok=True)
-        for name, value in end.items():
-            setattr(job, name, value)
+        with self._lock:
+            if (job := self._jobs.get(id)) is None:
+                return
+            end = {"state": "failed" if error else "done", "error": error, "ended": time.time()}
+            ended = job.model_copy(update={**end, "stage": None, "share": None})
+            with contextlib.suppress(InputError):  # the disk is full: the next server does it again
+                ended.save()
+                for file in (job.source, job.depth):
+                    if file is not None and not os.path.isabs(file):
+                        (job.folder / file).unlink(missing_ok=True)
+            self._jobs[id] = ended
         if error:
             LOG.error("error: %s", error)
-        job.tell({"state": job.state, "error": error})
+
+    def _tidy_until_closed(self) -> None:
+        while not self._closed.wait(LOOK_S):
+            with contextlib.suppress(OSError):  # a file that is written just now
+                self.tidy()
 
     def tidy(self) -> None:
         """Remove what is too old, and the oldest while the folder is too large."""
-        ended = [(job.ended, _size(job.folder), job) for job in [*self._jobs.values()] if job.ended]
+        ended = [
+            (job.ended, sum(file.stat().st_size for file in job.folder.rglob("*")), job.id)
+            for job in [*self._jobs.values()]
+            if job.ended
+        ]
         total = sum(size for _, size, _ in ended)
-        for when, size, job in sorted(ended, key=lambda each: each[0]):
+        for when, size, id in sorted(ended):
             if when + self.keep.seconds < time.time() or total > self.keep.size:
                 total -= size
-                self.remove(job)
-
-
-def _size(folder: Path) -> int:
-    """Bytes of the files below a folder; what is written just now counts nothing."""
-    total = 0
-    for file in folder.rglob("*"):
-        with contextlib.suppress(OSError):
-            total += file.stat().st_size
-    return total
+                self.remove(id)

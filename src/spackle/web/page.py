@@ -29,8 +29,6 @@ BYTES = 20  # planes: 9 of centres, 3 of scales, 4 of rotations, 3 of colours, 1
 SMALLEST_SCALE, LARGEST_SCALE = 1e-7, 1e5  # an outlier beyond must not cost the others their precision
 BLOCK = 1 << 16  # so many Gaussians at a time stay in the cache
 
-TEXT = {"index.html": "html", "viewer.js": "javascript", "viewer.css": "css", "licenses.txt": "plain"}
-EXAMPLES = ("coffee.jpg", "cat.jpg")
 STYLE = '<link rel="stylesheet" href="viewer.css">'
 SCRIPT = '<script src="viewer.js" defer></script>'
 
@@ -141,12 +139,6 @@ def as_json(value: object) -> bytes:
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text.encode("ascii")
-
-
-def page_files() -> dict[str, tuple[str, bytes]]:
-    """What a server hands out: URL path to content type and bytes; "/" is the page."""
-    kinds = {name: f"text/{kind}; charset=utf-8" for name, kind in TEXT.items()} | dict.fromkeys(EXAMPLES, "image/jpeg")
-    return {"/" if name == "index.html" else f"/{name}": (kind, page_file(name)) for name, kind in kinds.items()}
 
 
 def single_html(scene: PageScene) -> bytes:

@@ -1,12 +1,8 @@
-"""The app on a socket of its own, in a thread, with clients that may be slow or silent."""
+"""A server for the app, whose clients may be slow or silent."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import socket
-import threading
-from collections.abc import Iterator
 from typing import Any
 
 import uvicorn
@@ -17,31 +13,21 @@ CONNECTIONS = 512  # at a time; more are refused
 SILENT_S = 10.0  # that a connection may wait for the whole head of a request, or before it takes what is sent
 
 
-@contextlib.contextmanager
-def serving(app: FastAPI, listener: socket.socket, silent: float = SILENT_S) -> Iterator[None]:
-    """Answer at a bound socket during the block; then the app's processes end, and listeners are told."""
-    config = uvicorn.Config(
-        app,
-        http=type("Protocol", (PatientProtocol,), {"silent": silent}),
-        ws="none",
-        loop="asyncio",
-        lifespan="off",
-        log_config=None,
-        log_level="critical",
-        server_header=False,
-        proxy_headers=False,
-        limit_concurrency=CONNECTIONS,
-        timeout_graceful_shutdown=1,
+def server_of(app: FastAPI, silent: float = SILENT_S) -> uvicorn.Server:
+    """`run(sockets=[listener])` answers until Ctrl-C or SIGTERM; then the app's processes end."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http=type("Protocol", (PatientProtocol,), {"silent": silent}),
+            ws="none",
+            log_config=None,
+            log_level="critical",
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=CONNECTIONS,
+            timeout_graceful_shutdown=1,  # for those who watch a photo
+        )
     )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, args=([listener],), daemon=True, name="server")
-    thread.start()
-    try:
-        yield
-    finally:
-        app.state.jobs.close()
-        server.should_exit = True
-        thread.join()
 
 
 class PatientProtocol(H11Protocol):

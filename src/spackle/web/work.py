@@ -7,9 +7,9 @@ import dataclasses
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from PIL import Image, ImageOps
 from pydantic import BaseModel, ConfigDict, Field
@@ -18,7 +18,7 @@ from rich.console import Console
 from spackle.bases.depth_map import DepthKind
 from spackle.bases.lite import LiteBase
 from spackle.bases.settings import AUTO, ROUGH, BaseSettings
-from spackle.camera_path import MAX_DISPARITY, TRAJECTORIES, TrajectoryKind
+from spackle.camera_path import MAX_DISPARITY, OVERSCAN, TRAJECTORIES, TrajectoryKind
 from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.formats import save_video
@@ -30,7 +30,7 @@ from spackle.render import get_renderer
 from spackle.scene import Scene
 from spackle.task_process import Tell
 from spackle.views import MAX_FRAMES, PATH_FRAMES, PathOptions
-from spackle.web.jobs import SceneTask
+from spackle.web.jobs import Job
 from spackle.web.page import as_json, single_html
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
@@ -48,6 +48,7 @@ class SceneOptions(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     base: str | None = Field(None, max_length=80, description="One of the server's bases; the server's own where null.")
+    depth_kind: DepthKind = Field("auto", description="What the numbers of the depth map are.")
     disparity: float | None = Field(None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large.")
     trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
     frames: int = Field(PATH_FRAMES, ge=1, le=MAX_FRAMES, description="Frames of the video, 30 a second.")
@@ -58,19 +59,13 @@ class SceneOptions(BaseModel):
     keep_frame: bool = Field(False, description="Keep a uniform frame around the picture.")
     files: list[FileName] = Field(MADE, description="What is made before the job is done.")
 
-    @property
-    def lens(self) -> dict[str, float | None]:
-        return {"focal_px": self.focal_px, "focal_mm": self.focal_mm, "fov": self.fov}
-
 
 @dataclasses.dataclass
 class SceneWork:
-    """Does tasks, and keeps the last base loaded."""
+    """Does jobs, and keeps the last base loaded."""
 
     base: BaseSettings = dataclasses.field(default_factory=BaseSettings)
-    disparity: float | None = None
-    keep_frame: bool = False
-    depth_kind: DepthKind = "auto"  # how depth maps are read
+    usual: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of jobs that do not say otherwise
     verbose: bool = False
     opened: Pipeline | None = None
 
@@ -79,83 +74,77 @@ class SceneWork:
         """What a client may name: this one, auto, and those that need no download."""
         return list(dict.fromkeys([self.base.name, AUTO, *BaseSettings().files]))
 
-    def __call__(self, task: SceneTask, tell: Tell) -> None:
+    def __call__(self, task: tuple[Job, str | None], tell: Tell) -> None:
         """InputError for a photo, a depth map or a scene that cannot be used; no line of it holds a path of ours."""
-        options, teller = SceneOptions.model_validate(task.options), Teller(task, tell, self.verbose)
-        ply, wanted = task.results / "scene.ply", [task.file] if task.file else options.files
+        job, file = task
+        options, teller = SceneOptions.model_validate({**self.usual, **job.options}), Teller(job, tell, self.verbose)
+        ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
         try:
-            if task.file is None and is_scene(task.source):
-                scene = Scene.load(task.source, focal_px=options.focal_px, fov=options.fov)
-                scene.save(ply)
-                self._show(scene, task, "", teller)
-            elif task.file is None:
-                note = self._complete(task, options, teller)
-                self._show(Scene.load(ply), task, note, teller)
-            for file in wanted:
-                if not (task.results / file).exists():
-                    self._make(file, Scene.load(ply), task, options, teller)
+            if file is None:
+                if is_scene(source):
+                    Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(ply)
+                else:
+                    note = self._complete(job, options, teller)
+                scene = Scene.load(ply)
+                with teller.stage("page"):
+                    page = scene.page(job.name, note)
+                    for name, data in {**page.files, PAGE: as_json(page.description)}.items():
+                        write_whole(job.results / name, data)
+            else:
+                scene = Scene.load(ply)
+            for name in options.files if file is None else [file]:
+                if not (job.results / name).exists():
+                    with teller.stage(name):
+                        self._make(job.results / name, scene, job, options)
         except InputError as error:
             raise InputError(teller.cleaned(str(error))) from error
 
-    def _complete(self, task: SceneTask, options: SceneOptions, teller: Teller) -> str:
+    def _complete(self, job: Job, options: SceneOptions, teller: Teller) -> str:
         """A photo to the files of `predict_photo`; what a person should know of the scene."""
-        disparity = self.disparity if options.disparity is None else options.disparity
-        path = PathOptions(options.trajectory, disparity, frames=options.frames)
         settings = self.base
-        if task.depth is not None:
-            kind = self.depth_kind
-            settings = dataclasses.replace(settings, name=AUTO, depth=task.depth, depth_kind=kind, checkpoint=None)
+        if job.depth is not None:
+            depth, kind = job.folder / job.depth, options.depth_kind
+            settings = dataclasses.replace(settings, name=AUTO, checkpoint=None, depth=depth, depth_kind=kind)
         elif options.base not in (None, settings.name):
             settings = dataclasses.replace(settings, name=options.base, checkpoint=None)
+        path = PathOptions(options.trajectory, options.disparity, frames=options.frames)
         chosen = Options(settings, path, FillOptions(fill=options.fill))
         if self.opened is None or self.opened.options.base != settings:
             self.opened = None  # before another network is loaded
             self.opened = Pipeline.open(chosen)
         pipeline = dataclasses.replace(self.opened, options=chosen)
-        keep, film = options.keep_frame or self.keep_frame, "video.mp4" in options.files
-        predict_photo(task.source, task.results, pipeline, teller, lens=options.lens, keep_frame=keep, render=film)
-        (task.results / "base.ply").unlink()
-        report = json.loads((task.results / REPORT).read_text(encoding="utf-8"))
+        lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
+        keep, film = options.keep_frame, "video.mp4" in options.files
+        predict_photo(job.folder / job.source, job.results, pipeline, teller, lens=lens, keep_frame=keep, render=film)
+        (job.results / "base.ply").unlink()
+        report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
         return ROUGH if report["base"]["name"] == LiteBase.name else ""
 
-    def _show(self, scene: Scene, task: SceneTask, note: str, teller: Teller) -> None:
-        """Write what the page draws."""
-        with teller.stage("page"):
-            page = scene.page(task.name, note)
-            for name, data in {**page.files, PAGE: as_json(page.description)}.items():
-                write_whole(task.results / name, data)
-
-    def _make(self, file: str, scene: Scene, task: SceneTask, options: SceneOptions, teller: Teller) -> None:
-        target = task.results / file
-        if file == REPORT:
-            raise InputError(f"{task.name}: has no report: it was a scene already")
-        with teller.stage(file) as step:
-            if file.endswith(".mp4"):
-                kind = target.stem if target.stem in TRAJECTORIES else options.trajectory
-                cameras, renderer = scene.path(kind, None, options.frames), get_renderer(self.base.device)
-                frames = (step(k, len(cameras)) or view.rgb for k, view in enumerate(scene.frames(cameras, renderer)))
-                save_video(frames, target)
-            elif file.endswith(".html"):
-                note = json.loads((task.results / PAGE).read_bytes())["note"]
-                write_whole(target, single_html(scene.page(task.name, note)))
-            else:
-                scene.export(target)
+    def _make(self, target: Path, scene: Scene, job: Job, options: SceneOptions) -> None:
+        if target.name == REPORT:
+            raise InputError(f"{job.name}: has no report: it was a scene already")
+        if target.suffix == ".mp4":
+            kind = next((kind for kind in TRAJECTORIES if kind == target.stem), options.trajectory)
+            cameras = (camera.zoomed(1 + OVERSCAN) for camera in scene.path(kind, frames=options.frames))
+            save_video((view.rgb for view in scene.frames(cameras, get_renderer(self.base.device))), target)
+        elif target.suffix == ".html":
+            note = json.loads((job.results / PAGE).read_bytes())["note"]
+            write_whole(target, single_html(scene.page(job.name, note)))
+        else:
+            scene.export(target)
 
 
 class Teller(Reporter):
-    """Tells the server what a terminal would get."""
+    """Tells the server what a terminal would get, with the photo's own name in place of a path of this machine."""
 
-    def __init__(self, task: SceneTask, tell: Tell, verbose: bool) -> None:
+    def __init__(self, job: Job, tell: Tell, verbose: bool) -> None:
         super().__init__(verbose, Console(file=io.StringIO(), force_terminal=False))
-        self._task, self._tell = task, tell
+        self._job, self._tell = job, tell
 
     def cleaned(self, line: str) -> str:
-        """With the photo's own name, and no path of this machine."""
-        task = self._task
-        line = line.removesuffix(f" -> {task.results}")
-        for path in (task.source, task.depth, task.results):
-            line = line if path is None else line.replace(f"{path.parent}{os.sep}", "")
-        return line.replace(task.source.name, task.name)
+        job = self._job
+        line = line.removesuffix(f" -> {job.results}").replace(f"{job.folder}{os.sep}", "")
+        return line.replace(job.source, job.name)
 
     def log(self, line: str) -> None:
         self._tell({"line": self.cleaned(line)})
