@@ -5,9 +5,6 @@ BIN := $(VENV)/bin
 # The pinned versions need Python 3.11; with 3.10 pip chooses.
 PINNED := $(shell $(PYTHON) -c "import sys; print('--constraint constraints.txt' * (sys.version_info >= (3, 11)))")
 PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
-# Numba keeps compiled kernels here between runs.
-export NUMBA_CACHE_DIR ?= $(CURDIR)/.numba_cache
-
 .PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench reproduce viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
@@ -67,14 +64,14 @@ docs: pyproject.toml
 	test -x build/docs/bin/mkdocs || { $(PYTHON) -m venv build/docs && \
 		build/docs/bin/pip install --quiet 'mkdocs-material>=9.6' 'mkdocstrings[python]>=1' 'typer>=0.29' 'rich>=13' ruff; }
 	NO_MKDOCS_2_WARNING=1 PYTHONPATH=src build/docs/bin/mkdocs build --quiet --strict
+	@echo "The site: $(CURDIR)/build/site/index.html"
 
 # The viewer's page: needs node, which nothing else does; what it builds is committed.
 viewer:
 	cd web && npm ci --no-audit --no-fund && node build.mjs
 
 clean-cache:
-	rm -rf .numba_cache
 	find src -name '*.nb[ci]' -delete
 
 clean:
-	rm -rf $(VENV) .numba_cache demo-output reproduction build dist
+	rm -rf $(VENV) demo-output reproduction build dist

@@ -51,7 +51,7 @@ def write_inputs(folder: Path) -> None:
 
 def commands(folder: Path) -> dict[str, list[str]]:
     """Name of the output folder to the words of the command."""
-    photo = ["predict", "-i", f"{folder}/photo.png"]
+    photo = ["predict", f"{folder}/photo.png"]
     depth = ["--depth", f"{folder}/depth.npy"]
     return {
         "demo": ["demo"],

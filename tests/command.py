@@ -22,7 +22,7 @@ import pytest
 from spackle import cli
 
 SHORT = ("--frames", "3")
-FILES = {"base.ply", "scene.ply", "video.mp4", "report.json"}
+FILES = {"scene.ply", "video.mp4", "report.json"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ def shortened(options: Sequence[object]) -> tuple[object, ...]:
 
 def predicted(photo: Path, depth: Path, out: Path, *options: object) -> Run:
     """`spackle predict` that has to succeed, three frames long."""
-    result = run("predict", "-i", photo, "--depth", depth, "-o", out, *shortened(options))
+    result = run("predict", photo, "--depth", depth, "-o", out, *shortened(options))
     assert result.code == 0, result.err
     return result
 

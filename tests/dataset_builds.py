@@ -30,7 +30,7 @@ def write_inputs(place: Path, count: int = 5, width: int = 72, height: int = 54)
 
 
 def words_of(place: Path, output: Path, *more: object) -> list[object]:
-    inputs = ["--photos", place / "photos", "--depth", place / "depth"]
+    inputs = [place / "photos", "--depth", place / "depth"]
     return ["dataset", "build", *inputs, "-o", output, *SHORT, *more]
 
 

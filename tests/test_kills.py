@@ -32,7 +32,7 @@ def predict(place: Path) -> Words:
 
 def dataset(place: Path) -> Words:
     write_inputs(place, 6)
-    return ["dataset", "build", "--photos", place / "photos", "--depth", place / "depth", *SHORT, "-o"]
+    return ["dataset", "build", place / "photos", "--depth", place / "depth", *SHORT, "-o"]
 
 
 def evaluate(place: Path) -> Words:

@@ -37,20 +37,22 @@ def predict_photo(
     *,
     lens: Mapping[str, float | None],
     keep_frame: bool = False,
+    keep_base: bool = False,
     render: bool = True,
     request: str | None = None,
 ) -> None:
-    """One photo to `folder`: base.ply, scene.ply, a video if it is to `render`, report.json, and views/ with --cameras.
+    """One photo to `folder`: scene.ply, a video if it is to `render`, report.json, and views/ with --cameras.
 
-    `lens` and `keep_frame` are as `load_photo` takes them; the report holds the digest `request`. The files take their
-    places once all are whole. InputError for a photo, a depth map or a folder that cannot be used.
+    With `keep_base` also base.ply, the photo's own Gaussians. `lens` and `keep_frame` are as `load_photo` takes them;
+    the report holds the digest `request`. The files take their places once all are whole. InputError for a photo, a
+    depth map or a folder that cannot be used.
     """
     reporter, options = reporter.restarted(), pipeline.options
     with reporter.stage("load"):
         photo = load_photo(path, keep_frame=keep_frame or options.give_geometry, **lens)
     video_file = f"video{options.path.video.suffix}"
     with contextlib.ExitStack() as folders:
-        files = ["base.ply", "scene.ply", REPORT, *([video_file] if render else [])]
+        files = [*(["base.ply"] if keep_base else []), "scene.ply", REPORT, *([video_file] if render else [])]
         folders.enter_context(results_folder(folder, files, alone=True))
         stills = range(len(pipeline.given_views or []))
         if stills:
@@ -61,7 +63,8 @@ def predict_photo(
         scene, views = done.scene, done.views
         new = folders.enter_context(whole_set(folder, REPORT))
         with reporter.stage("write"):
-            for file, part in (("base.ply", scene.base), ("scene.ply", scene.gaussians)):
+            parts = {"scene.ply": scene.gaussians} | ({"base.ply": scene.base} if keep_base else {})
+            for file, part in parts.items():
                 save_ply(part, new / file, camera=scene.camera, base_count=len(scene.base), disparity=scene.disparity)
         video = None
         if render:

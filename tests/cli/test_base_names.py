@@ -58,7 +58,7 @@ def build(tmp_path: Path, *words: object) -> Run:
     """`spackle dataset build` of one photo."""
     write_photo(tmp_path / "photos" / "a.png")
     options = ("--views", 2, "--inpainter", "none", "--threads", 1, "-o", tmp_path / "out")
-    return run("dataset", "build", "--photos", tmp_path / "photos", *options, *words)
+    return run("dataset", "build", tmp_path / "photos", *options, *words)
 
 
 def succeeds(result: Run) -> None:
@@ -107,7 +107,7 @@ def test_an_evaluation_of_lite_and_of_a_model(
 ) -> None:
     for base, weights in (("lite", sha256(shipped)), ("hf:me/small", None)):
         out = tmp_path / base
-        root = ("--dataset", "middlebury", "--root", stereo, "-o", out, "--precision", "fp32")
+        root = ("--dataset", "middlebury", stereo, "-o", out, "--precision", "fp32")
         words = ("--methods", "base", "--metrics", "none", "--disparity", "0.3")
         succeeds(run("evaluate", *root, *words, "--base", base))
         said = json.loads((out / "config.json").read_text())["base"]
@@ -118,7 +118,7 @@ def test_an_evaluation_of_lite_and_of_a_model(
 
 
 def test_results_that_must_name_their_base_refuse_auto(tmp_path: Path, stereo: Path) -> None:
-    root = ("--dataset", "middlebury", "--root", stereo, "-o", tmp_path / "out", "--base", "auto")
+    root = ("--dataset", "middlebury", stereo, "-o", tmp_path / "out", "--base", "auto")
     for result in (
         build(tmp_path, "--base", "auto"),
         build(tmp_path, "--base", "auto", "--depth", tmp_path / "photos"),
@@ -153,7 +153,7 @@ def test_a_folder_is_done_again_when_weights_come_or_go(
 
     def again(*options: object) -> tuple[str, list[str]]:
         """The base of what is made now, and the warnings that it is rougher."""
-        succeeds(result := predict(tmp_path, "-i", photos, *options))
+        succeeds(result := predict(tmp_path, photos, *options))
         name: str = report_of(tmp_path / "out" / "a")["base"]["name"]
         warned = [line for line in result.lines if "was made by sharp" in line]
         return "done already" if "done already" in result.err else name, warned
@@ -191,7 +191,7 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
         (depth, 0.07, "moves 0.07 of 0.3: 11.9% of the widest view is invented; `--disparity 0.3` for more"),
         ((), 0.14, "moves 0.14 of 0.15: "),
     ):
-        result = predict(tmp_path, "-i", photo, *options)
+        result = predict(tmp_path, photo, *options)
         report = report_of(tmp_path / "out" / "photo")
         assert (report["disparity"], report["disparity_source"]) == (far, "photo" if said else "--disparity")
         assert said in result.err
@@ -200,7 +200,7 @@ def test_disparity_of_the_person_else_of_the_photo(tmp_path: Path) -> None:
     scene = spackle.predict(photo, residual="none")
     assert scene.disparity == 0.14
     assert torch.equal(scene.path()[20].position, scene.path(disparity=0.14)[20].position)
-    succeeds(predict(tmp_path, "-i", photo))
+    succeeds(predict(tmp_path, photo))
     files = [tmp_path / f"{name}.mp4" for name in ("as it is", "said")]
     for file, options in zip(files, ((), ("--disparity", 0.14)), strict=True):
         succeeds(run("render", tmp_path / "out" / "photo" / "scene.ply", "-o", file, "--frames", 3, *options))
@@ -217,20 +217,20 @@ def test_results_after_short_memory_are_tried_again(
     install(made, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase if when == "load" else StandIn, when, hungry)
-        result = predict(tmp_path, "-i", photos)
+        result = predict(tmp_path, photos)
         assert [line for line in result.lines if "not enough memory" in line] == result.lines[:1]
-        refuses(predict(tmp_path, "-i", photos, "--base", "sharp"), "not enough memory for SHARP")
+        refuses(predict(tmp_path, photos, "--base", "sharp"), "not enough memory for SHARP")
     for name in "ab":
         report = report_of(tmp_path / "out" / name)
         assert (report["base"]["name"], report["request"]) == ("lite", None)
-    assert "done already" not in predict(tmp_path, "-i", photos).err
+    assert "done already" not in predict(tmp_path, photos).err
     assert report_of(tmp_path / "out" / "b")["base"]["name"] == "sharp"
 
 
 def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
     tmp_path: Path, made: dict[str, Path], photos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refuses(predict(tmp_path, "-i", photos, "--base", "lite", "-c", made["sharp"]), made["sharp"])
+    refuses(predict(tmp_path, photos, "--base", "lite", "-c", made["sharp"]), made["sharp"])
     sharp = install(made, tmp_path)
 
     def change(path: Path, **options: Any) -> StandIn:
@@ -238,5 +238,5 @@ def test_a_base_that_cannot_be_loaded_stops_a_folder_at_once(
         return StandIn("sharp")
 
     monkeypatch.setattr(SharpBase, "load", change)
-    refuses(predict(tmp_path, "-i", photos), "changed while this was running")
+    refuses(predict(tmp_path, photos), "changed while this was running")
     assert not (tmp_path / "out").exists()

@@ -25,7 +25,7 @@ def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path)
     commands = [point for point in entry_points(group="console_scripts") if point.name == "spackle"]
     assert [point.load() for point in commands] == [cli.run]
     missing = tmp_path / "missing.png"
-    for options, code in ((["--version"], 0), (["predict", "-i", str(missing), "-o", str(tmp_path / "out")], 2)):
+    for options, code in ((["--version"], 0), (["predict", str(missing), "-o", str(tmp_path / "out")], 2)):
         done = subprocess.run([*COMMAND, *options], capture_output=True, text=True, check=False, timeout=300)
         assert (done.returncode, len((done.stdout + done.stderr).splitlines())) == (code, 1)
         assert (str(missing) if code else spackle.__version__) in done.stdout + done.stderr
@@ -130,7 +130,7 @@ def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:
     assert report == {"folder": str(tmp_path / "out" / "photo"), **report_of(tmp_path / "out" / "photo")}
     assert "torn.png" in bad["error"]
     assert json.loads(again.out.splitlines()[0])["done_already"] is True
-    result = run("predict", "-i", photos / "torn.png", "-o", tmp_path / "out", "--json")
+    result = run("predict", photos / "torn.png", "-o", tmp_path / "out", "--json")
     assert (result.code, len(result.lines)) == (2, 1)
     assert "torn.png" in json.loads(result.out)["error"]
     scene = tmp_path / "out" / "photo" / "scene.ply"

@@ -51,14 +51,15 @@ def pixels(path: Path) -> np.ndarray:
 def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) -> None:
     folder, result = plain
     assert (result.out, "\x1b" in result.err) == ("", False)
-    assert all(line.startswith("photo.png: ") for line in result.lines)
-    assert "aux Gaussians" in result.lines[-1]
+    assert all(line.startswith("photo.png: ") for line in result.lines[:-1])
+    assert "aux Gaussians" in result.lines[-2]
+    look = f"Look at {folder / 'video.mp4'}, or into the scene: spackle view {folder / 'scene.ply'}"
+    assert result.lines[-1] == look
     assert (names_in(folder), names_in(folder.parent)) == (FILES, {"photo"})
     report = report_of(folder)
-    first, whole = (read_ply(folder / name) for name in ("base.ply", "scene.ply"))
-    assert (whole.names, whole.body[: len(first.body)]) == (first.names, first.body)  # rule 1
-    assert f"spackle_base {first.count}" in whole.comments
-    base, merged = first.count, whole.count
+    whole = read_ply(folder / "scene.ply")
+    base, merged = report["base"]["gaussians"], whole.count
+    assert f"spackle_base {base}" in whole.comments
     known = {"name": "rgbd", "chosen": "--depth", "gaussians": base, "depth_filled": 0.0, "usual_disparity": 0.3}
     assert report["base"].items() > known.items()
     assert report["aux"] == {"gaussians": merged - base, "share": pytest.approx((merged - base) / base)}
@@ -78,8 +79,8 @@ def test_predict_writes_a_scene_a_video_and_a_report(plain: tuple[Path, Run]) ->
 
 
 def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]) -> None:
-    predicted(*pair, tmp_path, "--residual", "none", "--no-render", "--fov", 90)
-    assert names_in(tmp_path / "photo") == FILES - {"video.mp4"}
+    predicted(*pair, tmp_path, "--residual", "none", "--no-render", "--fov", 90, "--keep-base")
+    assert names_in(tmp_path / "photo") == FILES - {"video.mp4"} | {"base.ply"}
     report, bare = report_of(tmp_path / "photo"), read_ply(tmp_path / "photo" / "scene.ply")
     assert (report["focal_source"], report["focal_px"]) == ("--fov", WIDTH / 2)
     row = bare.row(0)
@@ -88,11 +89,13 @@ def test_a_second_run_replaces_the_first(tmp_path: Path, pair: tuple[Path, Path]
     assert ("video" in report["seconds"], report["video"]) == (False, None)
     assert bare == read_ply(tmp_path / "photo" / "base.ply")
     assert all(view["after"] == view["before"] > 0 for view in report["hole_area_ratio"])
-    predicted(*pair, tmp_path, "--trajectory", "swipe", "--disparity", "0.5")
+    predicted(*pair, tmp_path, "--trajectory", "swipe", "--disparity", "0.5", "--keep-base")
     report = report_of(tmp_path / "photo")
     assert (report["views"], [view["view"] for view in report["hole_area_ratio"]]) == ("swipe", ["-0.5", "+0.5"])
     assert all(view["after"] < 0.01 < view["before"] for view in report["hole_area_ratio"])
-    assert names_in(tmp_path / "photo") == FILES
+    first, whole = (read_ply(tmp_path / "photo" / name) for name in ("base.ply", "scene.ply"))
+    assert (whole.names, whole.body[: len(first.body)]) == (first.names, first.body)  # rule 1
+    assert names_in(tmp_path / "photo") == FILES | {"base.ply"}
 
 
 def test_cameras_completes_exactly_the_given_views(tmp_path: Path, pair: tuple[Path, Path]) -> None:
@@ -119,7 +122,7 @@ def test_cameras_completes_exactly_the_given_views(tmp_path: Path, pair: tuple[P
 
 def test_view_mode_completes_each_view_on_its_own(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     views = camera_file(tmp_path / "views.json", rights=[0.1, 0.4, 0.2], sizes=[(64, 48), (64, 48), (33, 21)])
-    predicted(*pair, tmp_path / "out", "--cameras", views, "--mode", "view", "--no-render")
+    predicted(*pair, tmp_path / "out", "--cameras", views, "--mode", "view", "--no-render", "--keep-base")
     folder = tmp_path / "out" / "photo"
     assert pixels(folder / "views" / "0002.png").shape == (21, 33, 3)
     report = report_of(folder)
@@ -155,7 +158,7 @@ def test_weights_and_texture_are_named_and_change_the_scene(
         report = report_of(tmp_path / "photo")
         note = {"note": "no trained weights: the seeds alone filled the holes"} if named == "seeds" else {}
         assert report["residual"] == {"weights": named, "fill": texture, **note}
-        assert (tmp_path / "photo" / "base.ply").read_bytes() == (plain[0] / "base.ply").read_bytes()
+        assert read_ply(tmp_path / "photo" / "scene.ply").row(0) == read_ply(plain[0] / "scene.ply").row(0)
         requests.append(report["request"])
         scenes.append((tmp_path / "photo" / "scene.ply").read_bytes())
     assert scenes[0] == (plain[0] / "scene.ply").read_bytes()
@@ -187,7 +190,7 @@ def test_odd_file_names(tmp_path: Path, name: str) -> None:
     (folder,) = (tmp_path / "out" / "deep").iterdir()
     assert folder.name == (name if name.startswith(".") else Path(name).stem)  # none leads out of the output
     assert names_in(folder) == FILES - {"video.mp4"}
-    assert all(name.replace("\n", " ") in line for line in result.lines)
+    assert all(name.replace("\n", " ") in line for line in result.lines[:-1])
 
 
 def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
@@ -202,16 +205,27 @@ def test_a_bad_photo_of_a_folder_stops_nothing_else(tmp_path: Path) -> None:
         write_depth(depths / name)
     write_depth(depths / "a.jpg.npy", metres(far=9))
     write_depth(depths / "f.npy", np.zeros((HEIGHT, WIDTH), np.float32))
-    result = run("predict", "-i", photos, "--depth", depths, "-o", tmp_path / "out", *SHORT)
+    result = run("predict", photos, "--depth", depths, "-o", tmp_path / "out", *SHORT)
     assert result.code == 1, result.err
     assert names_in(tmp_path / "out") == {"a.jpg", "a.png", "a.jpg.png", "b"}  # none collide
     for name in names_in(tmp_path / "out"):
         assert names_in(tmp_path / "out" / name) == FILES
         far = 9 if name.startswith("a.jpg") else 6
-        assert read_ply(tmp_path / "out" / name / "base.ply").row(0)["z"] == pytest.approx(far, rel=1e-3)
+        assert read_ply(tmp_path / "out" / name / "scene.ply").row(0)["z"] == pytest.approx(far, rel=1e-3)
     errors = [line for line in result.lines if line.startswith("error: ")]
     assert all(bad in line for bad, line in zip(("c.png", "d.png", "e.png", "f.npy"), errors, strict=True))
     assert result.lines[-1] == "4 of 8 photos failed"
+
+
+def test_several_photos_a_folder_and_a_pattern_share_a_run(tmp_path: Path) -> None:
+    names = ("a.png", "more/b.jpg", "wild1.png", "wild2.png")
+    photos, out = [write_photo(tmp_path / name) for name in names], tmp_path / "out"
+    result = run("predict", photos[0], tmp_path / "more", tmp_path / "w*[0-9].png", "--base", "lite", "-o", out, *SHORT)
+    assert (result.code, names_in(out)) == (0, {"a", "b", "wild1", "wild2"}), result.err
+    scene = f"Look at {out / 'NAME' / 'video.mp4'}, or into the scene: spackle view {out / 'NAME' / 'scene.ply'}"
+    assert result.lines[-1] == scene
+    refuses(run("predict", photos[1], write_photo(tmp_path / "other" / "b.jpg"), "-o", out), "has the same name")
+    refuses(run("predict", photos[0], tmp_path / "a.mp4", "-o", out), "a.mp4: is a clip: give it alone")
 
 
 def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> None:
@@ -256,10 +270,10 @@ def test_what_is_changed_or_damaged_in_a_folder_is_redone(tmp_path: Path) -> Non
 def test_two_runs_never_share_a_folder(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     out = tmp_path / "out"
     with results_folder(out / "photo", alone=True):
-        refuses(run("predict", "-i", pair[0], "--depth", pair[1], "-o", out, *SHORT), out / "photo", "another run")
+        refuses(run("predict", pair[0], "--depth", pair[1], "-o", out, *SHORT), out / "photo", "another run")
         predicted(write_photo(tmp_path / "other.png"), pair[1], out)  # beside it is room
     with results_folder(out, alone=True):
-        refuses(run("predict", "-i", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT), out, "another run")
+        refuses(run("predict", pair[0].parent, "--depth", pair[1], "-o", out, *SHORT), out, "another run")
     assert names_in(out) == {"other"}
     (out / ".lock").touch()  # of a killed run
     predicted(pair[0].parent, pair[1], out)
@@ -277,7 +291,7 @@ def test_missing_depth_and_a_map_of_another_size_are_taken(tmp_path: Path) -> No
 def test_a_frame_is_cut_off_unless_geometry_is_given(tmp_path: Path) -> None:
     photo, out = tmp_path / "a.png", tmp_path / "out"
     Image.fromarray(np.pad(picture(), ((6, 7), (3, 4), (0, 0)))).save(photo)
-    lite = ("predict", "-i", photo, "-o", out, "--base", "lite", "--no-render", *SHORT)
+    lite = ("predict", photo, "-o", out, "--base", "lite", "--no-render", *SHORT)
     cut = run(*lite)
     assert "a.png: a frame (4, 7, 5, 8 pixels: left, top, right, bottom) is cut off; --keep-frame keeps it" in cut.err
     cut_off = {"left": 4, "top": 7, "right": 5, "bottom": 8}  # the outermost pixels are mixed

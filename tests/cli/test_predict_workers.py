@@ -21,7 +21,7 @@ from spackle.cli.photos import Predictor
 from spackle.errors import InputError
 from spackle.folders import check_mark, mark, results_folder
 
-FILES = {"base.ply", "scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
+FILES = {"scene.ply", "report.json", "video.gif"}  # x264 may encode otherwise each time
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +68,12 @@ def test_two_workers_give_the_same_files_as_one_by_one_and_go_on(place: Path, tm
     about = [[f"{name}.png" in line for line in done.lines].index(True) for name in order]
     assert about == [0, *(i + 1 for i, line in enumerate(done.lines[:-2]) if line.startswith("photos: "))]
     (out / "c" / "report.json").unlink()
-    times = {name: (out / name / "base.ply").stat().st_mtime_ns for name in "ac"}
+    times = {name: (out / name / "scene.ply").stat().st_mtime_ns for name in "ac"}
     again = predict(place, out, "--workers", 2)
     assert [line for line in again.lines if "done already" in line] == [
         "a.png: done already (--overwrite does it again)"
     ]
-    assert [(out / name / "base.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [False, True]
+    assert [(out / name / "scene.ply").stat().st_mtime_ns > times[name] for name in "ac"] == [False, True]
     assert list(content(out)) == list(content(place / "alone"))
 
 

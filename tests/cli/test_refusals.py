@@ -43,7 +43,6 @@ BOTH = [
     ("--cameras views.json --disparity 0.3", "--disparity 0.3"),
     ("--cameras views.json --trajectory rotate_forward", "--trajectory rotate-forward"),
     ("--cameras views.json --frames 9", "--frames 9"),
-    ("-i depth.npy", "depth.npy"),
 ]
 PREDICT = [
     *((f"--focal-px {value}", "--focal-px") for value in ("-50", "nan", "1e39", "50 --fov 60")),
@@ -111,7 +110,8 @@ def test_options_that_cannot_be(place: Path, command: str, options: str, says: s
 
 def test_an_input_has_to_be_named(tmp_path: Path) -> None:
     refuses(run("predict"), "PHOTO")
-    refuses(run("render", "-o", tmp_path / "out"), "SCENE.ply")
+    refuses(run("render", "-o", tmp_path / "out"), "SCENE")
+    refuses(run("predict", "https://example.com/a.jpg"), "a.jpg: an address, not a file: download it first")
     refuses(run("predict", write_photo(tmp_path / "a.png"), "--base", "rgbd", "-o", tmp_path / "out"), "--depth")
 
 

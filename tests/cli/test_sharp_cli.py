@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from command import FILES, SHORT, names_in, report_of, run
-from photos import picture, read_ply, write_photo
+from photos import picture, write_photo
 from PIL import Image
 from sharp_weights import gaussians_of, tiny_weights, write_tiny
 from stand_in import QUICK
@@ -28,12 +28,9 @@ def test_a_photo_alone_becomes_a_scene_a_video_and_a_report(
     tmp_path: Path, weights: Path, size: tuple[int, int]
 ) -> None:
     Image.fromarray(picture()).resize(size).save(tmp_path / "photo.png")
-    result = run(
-        "predict", "-i", tmp_path / "photo.png", "-o", tmp_path / "out", *SHORT, "--base", "sharp", "-c", weights
-    )
+    result = run("predict", tmp_path / "photo.png", "-o", tmp_path / "out", *SHORT, "--base", "sharp", "-c", weights)
     assert result.code == 0, result.err
     assert names_in(tmp_path / "out" / "photo") == FILES
-    assert read_ply(tmp_path / "out" / "photo" / "base.ply").count == gaussians_of(TINY)
     report = report_of(tmp_path / "out" / "photo")
     native = pick_dtype("auto", torch.device("cpu")) == torch.bfloat16
     expected = {"name": "sharp", "chosen": "--base sharp", "gaussians": gaussians_of(TINY)}
@@ -48,7 +45,7 @@ def test_other_weights_do_a_folder_again_but_other_speed_does_not(
 ) -> None:
     write_photo(tmp_path / "photos" / "a.png")
     weights = write_tiny(tmp_path / "w.pt")
-    arguments = ("predict", "-i", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
+    arguments = ("predict", tmp_path / "photos", "-o", tmp_path / "out", "--base", "sharp", "-c", weights, *QUICK)
     assert run(*arguments).code == 0
     with monkeypatch.context() as patch:
         patch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
@@ -68,7 +65,7 @@ def test_the_network_is_not_loaded_for_what_cannot_be(
     write_photo(tmp_path / "a.png")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(SharpBase, "load", lambda *args, **options: pytest.fail("loaded"))
-    assert run("predict", "-i", wrong[0], "-o", *wrong[1:], "--base", "sharp", "-c", weights, *QUICK).code == 2
+    assert run("predict", wrong[0], "-o", *wrong[1:], "--base", "sharp", "-c", weights, *QUICK).code == 2
 
 
 @pytest.mark.parametrize("suffix", [".pt", ".safetensors"])

@@ -146,7 +146,7 @@ def test_predict_completes_what_both_eyes_see(tmp_path: Path, pair: tuple[Path, 
     # A path that stays where it is: all holes are those that the eyes see.
     common = ("predict", pair[0], "--depth", pair[1], "--frames", 3, "--disparity", 0)
     assert run(*common, "-o", tmp_path / "one").code == 0
-    wide = ("--stereo", "sbs", "--ipd", 0.8, "--format", "webm", "--fps", 12, "--size", "32x24")
+    wide = ("--stereo", "sbs", "--ipd", 0.8, "--format", "webm", "--fps", 12, "--size", "32x24", "--keep-base")
     assert run(*common, "-o", tmp_path / "two", *wide).code == 0
     one, two = (report_of(tmp_path / name / "photo") for name in ("one", "two"))
     assert (one["video"]["file"], one["video"]["stereo"]) == ("video.mp4", None)

@@ -153,14 +153,14 @@ def test_coco_annotations_name_the_photos(place: Path, tmp_path: Path) -> None:
     names = ["4.png", "gone.jpg", "0.png", "lost.jpg", "4.png"]
     file.write_text(json.dumps({"images": [{"file_name": name, "id": 1} for name in names]}))
     options = ["--depth", place / "depth", *SHORT, "--views", 2, "-o", tmp_path / "out"]
-    assert "gone.jpg, lost.jpg" in run("dataset", "build", "--photos", file, *options).err
+    assert "gone.jpg, lost.jpg" in run("dataset", "build", file, *options).err
     assert [sample.photo for _, sample in load_manifest(tmp_path / "out").samples] == ["0.png", "4.png"]
     moved = shutil.move(file, tmp_path / "coco.json")
-    assert run("dataset", "build", "--photos", moved, "--images", place / "photos", *options).code == 0
+    assert run("dataset", "build", moved, "--images", place / "photos", *options).code == 0
     wrong = [[{"file_name": name}] for name in ("", "../a.png", "/etc/passwd", "no.jpg")]
     for images in ([], [{}], None, *wrong):
         moved.write_text(json.dumps({"images": images}))
-        refuses(run("dataset", "build", "--photos", moved, *options), "coco.json")
+        refuses(run("dataset", "build", moved, *options), "coco.json")
 
 
 def test_a_subset_depends_on_the_seed_alone(place: Path) -> None:
@@ -230,7 +230,7 @@ def test_sharp_needs_no_depth_and_a_path_is_spelled_either_way(tmp_path: Path) -
     weights = write_tiny(tmp_path / "tiny.safetensors")
     options = ["--base", "sharp", "-c", weights, "--views", 2, "--inpainter", "none", "-o", tmp_path / "out"]
     for spelling in ("rotate_forward", "rotate-forward"):  # the same build, which is done the second time
-        done = run("dataset", "build", "--photos", tmp_path / "photos", *options, "--trajectory", spelling)
+        done = run("dataset", "build", tmp_path / "photos", *options, "--trajectory", spelling)
         assert done.code == 0, done.err
     config = load_manifest(tmp_path / "out").config
     assert (config["base"]["name"], config["views"]["trajectory"]) == ("sharp", "rotate-forward")

@@ -100,7 +100,7 @@ BAD: dict[str, Callable[[Path], object]] = {  # by what is said of them
 @pytest.mark.parametrize("said", BAD)
 def test_a_bad_clip_is_one_line(tmp_path: Path, said: str) -> None:
     BAD[said](tmp_path / "bad.mp4")
-    refuses(run("predict", "-i", tmp_path / "bad.mp4", "-o", tmp_path / "out"), "bad.mp4", said)
+    refuses(run("predict", tmp_path / "bad.mp4", "-o", tmp_path / "out"), "bad.mp4", said)
     assert not (tmp_path / "out").exists()
 
 
@@ -113,7 +113,7 @@ def depths(folder: Path, count: int) -> Path:
 def test_a_clip_becomes_one_of_the_same_times_and_sound(tmp_path: Path) -> None:
     write_clip(tmp_path / "a.mp4", moving(5), ticks=[0, 1, 2, 5, 6], sound="aac")
     done = run(
-        *("predict", "-i", tmp_path / "a.mp4", "-o", tmp_path / "out", "--depth", depths(tmp_path / "d", 5)),
+        *("predict", tmp_path / "a.mp4", "-o", tmp_path / "out", "--depth", depths(tmp_path / "d", 5)),
         *("--residual", "seeds", "--trajectory", "rotate", "--disparity", 0.1),
     )
     assert done.code == 0, done.err
@@ -133,7 +133,7 @@ def test_a_clip_becomes_one_of_the_same_times_and_sound(tmp_path: Path) -> None:
 
 def test_a_frame_that_fails_is_named_and_nothing_is_left(tmp_path: Path) -> None:
     clip, depth = write_clip(tmp_path / "a.mp4", moving(3)), depths(tmp_path / "d", 1)
-    done = run("predict", "-i", clip, "-o", tmp_path / "out", "--depth", depth, "--residual", "none")
+    done = run("predict", clip, "-o", tmp_path / "out", "--depth", depth, "--residual", "none")
     assert done.code == 2
     assert "a.mp4/000001" in done.lines[-1]
     assert not (tmp_path / "out").exists()
@@ -153,5 +153,5 @@ def test_what_a_clip_cannot_have_is_one_line(tmp_path: Path, option: str, monkey
     if option == "no cv2":
         monkeypatch.setitem(sys.modules, "cv2", None)
         words, says = [], "pip install 'spackle-nvs[opencv]'"
-    refuses(run("predict", "-i", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out", *words), says)
+    refuses(run("predict", write_clip(tmp_path / "a.mp4", moving(2)), "-o", tmp_path / "out", *words), says)
     assert not (tmp_path / "out").exists()

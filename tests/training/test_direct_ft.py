@@ -121,11 +121,11 @@ def test_a_run_leaves_weights_that_predict_pictures_and_a_report(place: Path, wh
     with Image.open(whole / "pictures" / "0000004.png") as sheet:
         assert sheet.size == (3 * WIDTH, 2 * HEIGHT)
     write_photo(tmp_path / "photo.png")
-    options = ("-i", tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
+    options = (tmp_path / "photo.png", "--base", "sharp", "--no-render", "--residual", "none", "--focal-px", 60)
     done = run("predict", *options, "-o", tmp_path, "-c", whole / "best.safetensors")
     assert done.code == 0, done.err
     assert report_of(tmp_path / "photo")["base"]["weights"] == "best.safetensors"
-    assert read_ply(tmp_path / "photo" / "base.ply").count > 0
+    assert read_ply(tmp_path / "photo" / "scene.ply").count > 0
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ def test_a_photo_is_completed_as_predict_completes_it(
     monkeypatch.setattr("tempfile.tempdir", None)
     photo, depth = write_pair(tmp_path / "first")
     given = ("--depth", depth, "--depth-kind", "metric", "--fov", "50")
-    assert run("predict", "-i", photo, *given, "-o", tmp_path / "out", "--no-render").code == 0
+    assert run("predict", photo, *given, "-o", tmp_path / "out", "--no-render").code == 0
     report = report_of(tmp_path / "out" / "photo")
     seen: list[dict[str, Any]] = []
 

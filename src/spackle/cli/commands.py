@@ -15,13 +15,11 @@ from spackle.cli.options import (
     DeviceOption,
     FovOption,
     HostOption,
-    InputOption,
     JsonOption,
     KeepFrameOption,
     PrecisionName,
     SharpOption,
     VerboseOption,
-    given_input,
     sharp_speed,
     with_path_options,
 )
@@ -33,10 +31,9 @@ if TYPE_CHECKING:  # torch takes seconds to load
 @with_path_options
 def predict(
     *,
-    photo: Annotated[
-        Path | None, typer.Argument(metavar="PHOTO", help="A photo, a clip, or a folder of photos.", show_default=False)
-    ] = None,
-    given: InputOption = None,
+    photos: Annotated[
+        list[Path], typer.Argument(metavar="PHOTO...", help="Photos and folders of photos, or a clip; *.jpg, too.")
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="OUT", help="Results go to OUT/PHOTO_NAME/.")
     ] = Path("out"),
@@ -91,6 +88,9 @@ def predict(
         ),
     ] = "auto",
     render: Annotated[bool, typer.Option(help="Write a video.")] = True,
+    keep_base: Annotated[
+        bool, typer.Option("--keep-base", hidden=True, help="Write base.ply, too: what the photo shows.")
+    ] = False,
     path: PathOptions,
     mode: Annotated[
         Literal["scene", "view"],
@@ -101,12 +101,10 @@ def predict(
     focal_mm: Annotated[float | None, typer.Option(help="Focal length in mm, 35 mm equivalent.")] = None,
     fov: FovOption = None,
     keep_frame: KeepFrameOption = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="In a folder: do again what is done already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Of many photos: do again what is done.")] = False,
     workers: Annotated[
         int,
-        typer.Option(
-            hidden=True, help="In a folder: photos at once, each in a process that holds the base's network itself."
-        ),
+        typer.Option(hidden=True, help="Photos at once, each in a process that holds the base's network itself."),
     ] = 1,
     threads: Annotated[
         int | None,
@@ -122,7 +120,7 @@ def predict(
     as_json: JsonOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Turn photos into completed 3D scenes: scene.ply, base.ply, video.mp4 and report.json each.
+    """Turn photos into completed 3D scenes: scene.ply, video.mp4 and report.json each.
 
     A photo alone is enough. A depth map, or what `spackle weights get depth` or `sharp` fetches, gives better geometry.
     """
@@ -136,18 +134,15 @@ def predict(
     settings = BaseSettings(base, depth, *reading, checkpoint, precision, device=device, **speed)
     scene = Options(settings, path, FillOptions(residual, fill, mode))
     lens = {"focal_px": focal_px, "focal_mm": focal_mm, "fov": fov}
-    options = PredictOptions(scene, lens, render, keep_frame, overwrite, workers, threads, ray)
-    if predict_all(given_input("PHOTO", photo, given), output, options, Reporter(verbose, as_json=as_json)):
+    options = PredictOptions(scene, lens, render, keep_base, keep_frame, overwrite, workers, threads, ray)
+    if predict_all(photos, output, options, Reporter(verbose, as_json=as_json)):
         raise typer.Exit(1)
 
 
 @with_path_options
 def render(
     *,
-    scene: Annotated[
-        Path | None, typer.Argument(metavar="SCENE.ply", help="A 3D Gaussian scene.", show_default=False)
-    ] = None,
-    given: InputOption = None,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
@@ -159,8 +154,7 @@ def render(
     from spackle.cli.saved_scene import render_scene
     from spackle.progress import Reporter
 
-    file = given_input("SCENE.ply", scene, given)
-    render_scene(file, output, path, focal_px, device, Reporter(verbose, as_json=as_json))
+    render_scene(scene, output, path, focal_px, device, Reporter(verbose, as_json=as_json))
 
 
 def export(

@@ -13,7 +13,6 @@ from spackle.cli.options import (
     PrecisionOption,
     TrajectoryName,
     VerboseOption,
-    given_input,
 )
 
 dataset = typer.Typer(help="Photos to views with holes and completed targets, to train on.", no_args_is_help=True)
@@ -26,12 +25,8 @@ DatasetArgument = Annotated[str, typer.Argument(metavar="DATASET", help="A folde
 def dataset_build(
     *,
     photos: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.", show_default=False
-        ),
-    ] = None,
-    given: Annotated[Path | None, typer.Option("--photos", hidden=True)] = None,
+        Path, typer.Argument(metavar="FOLDER|COCO.json", help="Photos, with subfolders; or COCO annotations.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder; a build in it goes on.")],
     images: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where a COCO JSON's photos lie; default: beside it.")
@@ -96,7 +91,7 @@ def dataset_build(
         threads=threads,
         shard_size=shard_size,
     )
-    if build_dataset(given_input("FOLDER", photos, given), output, options, Reporter(verbose)) == "stopped":
+    if build_dataset(photos, output, options, Reporter(verbose)) == "stopped":
         raise typer.Exit(INTERRUPTED)
 
 

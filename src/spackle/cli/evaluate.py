@@ -15,7 +15,6 @@ from spackle.cli.options import (
     PrecisionOption,
     SharpOption,
     VerboseOption,
-    given_input,
     sharp_speed,
 )
 from spackle.errors import InputError
@@ -33,7 +32,6 @@ _DATASET = typer.Option(
 Folder = Annotated[
     Path | None, typer.Argument(metavar="FOLDER", help="Where the dataset was unpacked.", show_default=False)
 ]
-Root = Annotated[Path | None, typer.Option("--root", hidden=True)]  # as the folder was given once
 BaseName = Annotated[str, typer.Option(help="sharp, moge, depth, lite, hf:NAME, or rgbd with the dataset's own depth.")]
 Checkpoint = Annotated[Path | None, typer.Option("-c", "--checkpoint", help="Weights of the base.")]
 Residual = Annotated[
@@ -58,7 +56,6 @@ def evaluate(
     context: typer.Context,
     dataset: Annotated[str, _DATASET],
     folder: Folder = None,
-    root: Root = None,
     protocol: Annotated[str, typer.Option(help="large-view (wide moves) or near-view (second photos).")] = "large-view",
     methods: Annotated[
         str,
@@ -103,10 +100,10 @@ def evaluate(
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
 
-    source, numbers = _sorted_words(context, folder, root, disparity)
+    source, numbers = _sorted_words(context, folder, disparity)
     options = EvaluateOptions(
         dataset=dataset,
-        root=given_input("FOLDER", source, root),
+        root=source,
         protocol=protocol,
         methods=split_words(methods),
         disparities=parse_disparities(numbers),
@@ -163,7 +160,6 @@ def bench(
     context: typer.Context,
     dataset: Annotated[str, _DATASET],
     folder: Folder = None,
-    root: Root = None,
     disparity: Disparity = "0.3,0.4,0.5",
     side: Side = None,
     base: BaseName = "sharp",
@@ -189,10 +185,10 @@ def bench(
     from spackle.evaluation.setup import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter
 
-    source, numbers = _sorted_words(context, folder, root, disparity)
+    source, numbers = _sorted_words(context, folder, disparity)
     options = EvaluateOptions(
         dataset=dataset,
-        root=given_input("FOLDER", source, root),
+        root=source,
         methods=TIMED,
         disparities=parse_disparities(numbers),
         side=side,
@@ -212,17 +208,15 @@ def _has_disparities(context: typer.Context) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def _sorted_words(
-    context: typer.Context, folder: Path | None, root: Path | None, disparity: str
-) -> tuple[Path | None, str]:
+def _sorted_words(context: typer.Context, folder: Path | None, disparity: str) -> tuple[Path, str]:
     """The folder, and the disparities with numbers that follow as words; InputError for a word that belongs nowhere."""
     words = [*([] if folder is None else [str(folder)]), *context.args]
     listed = _has_disparities(context)
     others = [word for word in words if not (listed and NUMBER.fullmatch(word))]
-    if not others and root is None:
-        others = words[:1]  # a folder may be named by a number
-    if len(others) > (root is None):
+    others = others or words[:1]  # a folder may be named by a number
+    if not others:
+        raise InputError("FOLDER missing: name it after the command")
+    if len(others) > 1:
         raise InputError(f"{others[-1]}: a word of no option: lists are given with commas: --methods A,B")
-    for word in others:
-        words.remove(word)
-    return Path(others[0]) if others else None, ",".join((disparity, *words))
+    words.remove(others[0])
+    return Path(others[0]), ",".join((disparity, *words))

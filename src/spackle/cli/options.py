@@ -21,7 +21,6 @@ INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 TrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
-InputOption = Annotated[Path | None, typer.Option("-i", "--input", hidden=True)]  # as the argument was given once
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
 DeviceOption = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")]
 FovOption = Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")]
@@ -64,7 +63,7 @@ def _help_all(context: typer.Context, asked: bool) -> None:
     if asked:
         for parameter in context.command.params:
             if isinstance(parameter, TyperOption):
-                parameter.hidden = parameter.name == "given"
+                parameter.hidden = False
         print(context.get_help())
         raise typer.Exit()
 
@@ -72,16 +71,6 @@ def _help_all(context: typer.Context, asked: bool) -> None:
 HelpAllOption = Annotated[
     bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show this with all options.")
 ]
-
-
-def given_input(name: str, argument: Path | None, option: Path | None) -> Path:
-    """A command's input, as an argument or by -i; InputError for none, or both."""
-    if argument is not None and option is not None:
-        raise InputError(f"{option}: {argument} is given already: leave one of them out")
-    path = argument or option
-    if path is None:
-        raise InputError(f"{name} missing: name it after the command")
-    return path
 
 
 def sharp_speed(words: Sequence[str] | None) -> dict[str, Any]:

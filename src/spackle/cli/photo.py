@@ -17,9 +17,10 @@ class PredictOptions:
     scene: Options
     lens: Mapping[str, float | None]  # `focal_px`, `focal_mm` and `fov`, as `load_photo` takes them
     render: bool = True  # write a video
+    keep_base: bool = False  # write base.ply
     keep_frame: bool = False  # a uniform frame around a photo is part of it
-    overwrite: bool = False  # in a folder, do again what is done already
-    workers: int = 1  # processes that share a folder's photos
+    overwrite: bool = False  # of many photos, do again what is done already
+    workers: int = 1  # processes that share the photos
     threads: int | None = None  # of each
     ray: str | None = None  # the cluster where they are; this machine where None
 

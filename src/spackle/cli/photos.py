@@ -1,10 +1,12 @@
-"""`spackle predict`: a photo, a clip or a folder, by this process or by workers. Read `predict_all`."""
+"""`spackle predict`: photos, folders or a clip, by this process or by workers. Read `predict_all`."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import os
+import shlex
 import subprocess
 import sys
 from collections import Counter
@@ -20,6 +22,7 @@ from spackle._numba import is_compiled
 from spackle.bases.depth_map import calibrations_beside, find_depth
 from spackle.bases.open import BaseError
 from spackle.camera import Camera
+from spackle.cli.clip import FILES as CLIP_FILES
 from spackle.cli.clip import clip_options, predict_clip
 from spackle.cli.photo import PredictOptions
 from spackle.clips.files import is_clip
@@ -51,22 +54,27 @@ class NamedPhoto(NamedTuple):
     name: str
 
 
-def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: Reporter) -> int:
-    """Work through a photo, a clip or a folder of photos; returns the number of photos that failed.
+def predict_all(given: Sequence[Path], output: Path, options: PredictOptions, reporter: Reporter) -> int:
+    """Work through a clip, or photos and folders of photos; returns the number of photos that failed.
 
     InputError for an option, a clip or a single photo that cannot be used.
     """
-    named = find_photos(photos)
+    named = find_photos(given)
     workers = _workers_for(options, len(named))
-    if is_clip(photos):
+    single = len(given) == len(named) == 1 and not os.path.isdir(given[0])
+    if clips := [photo.path for photo in named if is_clip(photo.path)]:
+        if not single:
+            raise InputError(f"{clips[0]}: is a clip: give it alone, as each of its frames needs the one before")
         pipeline = Pipeline.open(clip_options(options))
-        check_file(photos, "clip")
+        check_file(clips[0], "clip")
+        folder = output / named[0].name
         with results_folder(output), compiled_ahead(pipeline.renderer, reporter.log):
-            predict_clip(photos, output / named[0].name, pipeline, options.lens, reporter)
+            predict_clip(clips[0], folder, pipeline, options.lens, reporter)
+        reporter.log(f"Look at {folder / CLIP_FILES[0]}")
         return 0
     pipeline = options.open()
-    if single := not os.path.isdir(photos):
-        check_file(photos, "photo")
+    if single:
+        check_file(named[0].path, "photo")
     shared = _shared_digest(options, pipeline)
     with (
         cluster(workers) as ray,
@@ -84,21 +92,38 @@ def predict_all(photos: Path, output: Path, options: PredictOptions, reporter: R
             failed = _predict_by_workers(ray, workers, open_predictor, list(left), len(named), reporter)
     if failed:
         reporter.log(f"{failed} of {len(named)} photos failed")
+    else:
+        folder = output / (named[0].name if single else "NAME")
+        video = f"{folder / f'video{options.scene.path.video.suffix}'}, or " if options.render else ""
+        reporter.log(f"Look at {video}into the scene: spackle view {shlex.quote(str(folder / 'scene.ply'))}")
     return failed
 
 
-def find_photos(path: Path) -> list[NamedPhoto]:
-    """A photo, or a folder's photos by name, each with the name of its results; InputError for a folder without any."""
-    if not os.path.isdir(path):
-        return [NamedPhoto(path, path.stem if path.stem.strip(".") else path.name)]  # "...png" has the stem ".."
-    photos = files_in(path, PHOTO_SUFFIXES)
-    if not photos:
-        raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+def find_photos(given: Sequence[Path]) -> list[NamedPhoto]:
+    """Photos, and those of folders by name, each with the name of its results.
+
+    A name that is no file may be a pattern, where no shell has resolved it. InputError for a folder without photos,
+    and for two photos whose results would have the same name.
+    """
+    photos: list[Path] = []
+    for path in given:
+        found = files_in(path, PHOTO_SUFFIXES) if os.path.isdir(path) else [path]
+        if not found:
+            raise InputError(f"{path}: no photos in this folder (looked for {', '.join(PHOTO_SUFFIXES)})")
+        pattern = not os.path.lexists(path) and sorted(map(Path, glob.glob(str(path))))
+        photos += pattern or found
     # a.jpg and a.png must not write over each other, nor over a.jpg.png.
     stems = Counter(photo.stem.casefold() for photo in photos)
-    names = {photo.name.casefold() for photo in photos}
-    ambiguous = {stem for stem, count in stems.items() if count > 1 or stem in names}
-    return [NamedPhoto(photo, photo.name if photo.stem.casefold() in ambiguous else photo.stem) for photo in photos]
+    names = Counter(photo.name.casefold() for photo in photos)
+    if twice := [photo for photo in photos if names[photo.name.casefold()] > 1]:
+        raise InputError(f"{twice[1]}: {twice[0]} has the same name: give them in two runs, with an -o of its own each")
+
+    def name(photo: Path) -> str:
+        stem = photo.stem.casefold()
+        plain = stems[stem] == 1 and stem not in names and photo.stem.strip(".")  # "...png" has the stem ".."
+        return photo.stem if plain else photo.name
+
+    return [NamedPhoto(photo, name(photo)) for photo in photos]
 
 
 def _workers_for(options: PredictOptions, photos: int) -> Workers:
@@ -224,6 +249,7 @@ class Predictor:
                 reporter,
                 lens=options.lens,
                 keep_frame=options.keep_frame,
+                keep_base=options.keep_base,
                 render=options.render,
                 request=self.request(photo),
             )
@@ -244,7 +270,7 @@ def _shared_digest(options: PredictOptions, pipeline: Pipeline) -> str:
     base = dataclasses.replace(base, name=name, depth=None, calib=None, checkpoint=None, windows=None, compiled=False)
     path = dataclasses.replace(path, cameras=None, path=None)
     choices: list[object] = [dataclasses.asdict(base), dataclasses.asdict(path), fill.weights, fill.texture, fill.mode]
-    choices += [options.lens, options.render, options.keep_frame]
+    choices += [options.lens, options.render, options.keep_base, options.keep_frame]
     prints = {kind: fingerprint(file, kind) for kind, file in _shared_files(options.scene).items()}
     return digest_of([spackle.__version__, choices, pipeline.base.fingerprints, prints])
 

@@ -158,10 +158,10 @@ def weights_list(as_json: JsonOption = False) -> None:
         file, state = folder / entry.file, "not here"
         if os.path.isfile(file):  # its size alone is checked, which takes no time
             size = os.path.getsize(file)
-            state = f"{decimal(size)}, whole" if size == entry.bytes else f"damaged, or your own: {size:,} bytes"
-        facts = {"name": entry.name, "state": state, "file": file, "licence": entry.licence}
+            state = "whole" if size == entry.bytes else f"damaged, or your own: {size:,} bytes"
+        facts = {"name": entry.name, "state": state, "file": file, "bytes": entry.bytes, "licence": entry.licence}
         reporter.result({**facts, "purpose": entry.purpose})
         if not as_json:
-            print(f"{entry.name:9} {state:18} {entry.file} ({entry.licence})")
+            print(f"{entry.name:9} {state:9} {decimal(entry.bytes):>8}  {entry.licence:20} {entry.purpose}")
     if not as_json:
         print(f"in {folder} (SPACKLE_WEIGHTS names another)")

@@ -116,7 +116,6 @@ class SceneWork:
         lens = options.model_dump(include={"focal_px", "focal_mm", "fov"})
         keep, film = options.keep_frame, "video.mp4" in options.files
         predict_photo(job.folder / job.source, job.results, pipeline, teller, lens=lens, keep_frame=keep, render=film)
-        (job.results / "base.ply").unlink()
         report = json.loads((job.results / REPORT).read_text(encoding="utf-8"))
         return ROUGH if report["base"]["name"] == LiteBase.name else ""
 
