@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The pinned versions need Python 3.11; with 3.10 pip chooses.
 PINNED := $(shell $(PYTHON) -c "import sys; print('--constraint constraints.txt' * (sys.version_info >= (3, 11)))")
 PIP := $(BIN)/pip install --disable-pip-version-check --quiet $(PINNED)
-.PHONY: demo test fuzz test-wheel test-slow wheel docs lint types check bench reproduce viewer clean clean-cache
+.PHONY: demo test fuzz test-wheel test-slow wheel dist test-install docs lint types check release-check bench reproduce viewer clean clean-cache
 
 $(VENV)/.demo: pyproject.toml constraints.txt
 	@echo "Installing Spackle and what it needs into $(VENV), once: some minutes, and about 400 MB of downloads."
@@ -34,6 +34,23 @@ wheel: $(VENV)/.demo
 	rm -rf dist
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
 
+# Wheel and sdist as they are published, checked, by tools in an environment of their own.
+dist:
+	rm -rf dist
+	test -x build/publish/bin/twine || { $(PYTHON) -m venv build/publish && \
+		build/publish/bin/pip install --quiet --disable-pip-version-check build twine; }
+	build/publish/bin/python -m build --quiet
+	build/publish/bin/twine check --strict dist/*
+
+# The wheel of `make dist` in an environment that holds nothing else.
+test-install:
+	rm -rf build/empty
+	$(PYTHON) -m venv build/empty
+	./install_torch.sh build/empty/bin/pip install --disable-pip-version-check --quiet $(PINNED)
+	build/empty/bin/pip install --disable-pip-version-check --quiet $(PINNED) dist/*.whl
+	cd build/empty && bin/python -c "import spackle; [getattr(spackle, name) for name in spackle.__all__]"
+	cd build/empty && bin/spackle --version
+
 # Damaged files for every reader, N of each; what fails is written to fuzz-failures/, which --replay takes.
 N ?= 5000
 fuzz: $(VENV)/.installed
@@ -50,6 +67,10 @@ types: $(VENV)/.installed
 	$(BIN)/mypy
 
 check: lint types test
+
+# All that can run on one machine before a tag.
+release-check: check docs dist test-install reproduce
+	@echo "This may be released: see CONTRIBUTING.md for the tag."
 
 bench: $(VENV)/.installed
 	$(BIN)/python benchmarks/suite.py --only renderer,video -o bench-suite

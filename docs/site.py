@@ -17,6 +17,8 @@ ROOT = Path(__file__).parents[1]
 ELSEWHERE = {
     "architecture.md": "ARCHITECTURE.md",
     "contributing.md": "CONTRIBUTING.md",
+    "changelog.md": "CHANGELOG.md",
+    "security.md": "SECURITY.md",
     "comfyui.md": "integrations/comfyui/README.md",
     "weights.md": "src/spackle/weights/README.md",
 }
