@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from spackle.errors import InputError, reading, reason_in_a_line
-from spackle.files import LEFTOVER, check_writable, sha256_of
+from spackle.files import LEFTOVER, check_writable, fingerprint, sha256_of
 
 LOCK, NEW = ".lock", ".new"
 
@@ -171,6 +171,13 @@ def as_recorded(folder: Path, report: str, records: object) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return True
+
+
+def photo_digest(path: Path) -> str:
+    """What a photo holds; of a missing one "none": it has its turn later."""
+    with contextlib.suppress(InputError):
+        return fingerprint(path, "photo")
+    return "none"
 
 
 def remove_half_written(*folders: Path, files: Sequence[str] | None = None) -> None:

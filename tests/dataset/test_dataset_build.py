@@ -22,7 +22,7 @@ from photos import metres, picture, write_depth
 from PIL import Image
 from sharp_weights import write_tiny
 
-from spackle.dataset import ViewDataset
+from spackle.dataset import DatasetFiles
 from spackle.dataset import build as building
 from spackle.dataset.build import Made, Maker
 from spackle.dataset.photos import PhotoFile, choose, find_photos
@@ -64,7 +64,7 @@ def test_a_killed_build_goes_on_and_ends_the_same(
     assert names_in(out) == left
     assert "not finished" in run("dataset", "verify", out).err
     with pytest.raises(InputError, match="not finished"):
-        ViewDataset(out)
+        DatasetFiles(out)
     (out / "parts" / f".000003.{'0' * 12}.tar").write_bytes(b"half")
     assert build(place, out).code == 0
     assert content(out) == content(whole)
@@ -243,7 +243,8 @@ def test_training_takes_each_view_once_and_judges_by_other_photos(whole: Path, c
         parts = [find_sources(recipe, get_renderer(), validation=judges) for judges in (False, True)]
         return recipe, [source for (source,) in parts]
 
-    rng, views, found = np.random.default_rng(0), list(ViewDataset(whole)), list[list[tuple[str, int]]]()
+    files, rng, found = DatasetFiles(whole), np.random.default_rng(0), list[list[tuple[str, int]]]()
+    views = [photo.view(number) for photo in map(files.__getitem__, range(5)) for number in range(photo.views)]
     for source in sources(whole)[1]:
         samples = [source.view(rng, number) for number in range(source.views or 0)]
         pairs = itertools.product(samples, views)

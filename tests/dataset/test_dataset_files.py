@@ -20,12 +20,11 @@ from PIL import Image
 from scenes import psnr
 from torch.utils.data import DataLoader
 
-from spackle.dataset import DatasetFiles, DatasetView, ViewDataset
+from spackle.dataset import DatasetFiles
 from spackle.dataset.sample import END, decode_alpha, decode_depth, encode_alpha, encode_depth
 from spackle.dataset.shards import load_manifest
 from spackle.errors import InputError
 from spackle.folders import digest_of
-from spackle.gaussians import Gaussians
 from spackle.render import get_renderer
 from spackle.residual import hole_mask
 
@@ -39,20 +38,19 @@ def test_a_shard_is_a_plain_tar_that_webdataset_reads(whole: Path) -> None:
     groups = list(webdataset.WebDataset([str(path) for path in sorted(whole.glob("*.tar"))], shardshuffle=False))
     assert [group["__key__"] for group in groups] == [f"{number:06d}" for number in range(5)]
     for number, group in enumerate(groups):
-        own = DatasetFiles(whole).group(number)
+        own = DatasetFiles(whole)[number]
         assert {f"{own.key}.{n}": data for n, data in group.items() if not n.startswith("__")} == dict(own.files)
         pictures = {f"{k:02d}.{kind}.png" for k in range(VIEWS) for kind in ("rgb", "target", "mask", "alpha", "depth")}
         assert {n for n in group if not n.startswith("__")} == {"json", "photo.png", "base.safetensors", *pictures}
 
 
 def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
-    group = DatasetFiles(whole).group(0)
+    group = DatasetFiles(whole)[0]
+    assert len(group.base) == group.facts["base"]["gaussians"]
     assert 0.1 <= group.facts["trajectory"]["disparity"] <= 0.6
     for index, view in enumerate(group.facts["views"]):
-        sample = group.view(index, with_base=True)
-        assert isinstance(sample.base, Gaussians)
-        assert len(sample.base) == group.facts["base"]["gaussians"]
-        drawn = get_renderer().render(sample.base, sample.camera)
+        sample = group.view(index)
+        drawn = get_renderer().render(group.base, sample.camera)
         assert psnr(drawn.rgb, sample.rendering.rgb) > 55
         assert float((drawn.alpha - sample.rendering.alpha).abs().max()) < 0.01
         assert torch.equal(sample.mask, hole_mask(sample.rendering.alpha))
@@ -61,7 +59,6 @@ def test_views_are_read_as_they_were_drawn(whole: Path, place: Path) -> None:
         if bool(sample.mask.any()):  # no hole is left black
             assert float(sample.target[sample.mask].amax(-1).min()) > 0.2
     first = group.view(0)
-    assert first.base is None
     assert torch.equal(first.camera.world_to_camera, torch.eye(4))
     stored = torch.from_numpy(np.array(Image.open(place / "photos" / "0.png"))).float() / 255
     assert torch.equal(first.photo, stored)
@@ -94,8 +91,8 @@ def test_verify_finds_cut_shards_and_a_changed_manifest(copy: Path) -> None:
     assert done.code == 1
     for words in ("sample 000001 (2.png) is damaged", "shard-000001.tar: not there", "bytes instead of"):
         assert words in done.err
-    with pytest.raises(InputError, match="000001"):
-        list(ViewDataset(copy))
+    with pytest.raises(InputError, match=r"shard-000001\.tar: not there"):
+        DatasetFiles(copy)[2]
     manifest = copy / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"0.png"', '"9.png"'))
     refuses(run("dataset", "verify", copy), f"{manifest}: damaged")
@@ -114,12 +111,7 @@ def resealed(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_text(json.dumps(content | {"sha256": digest_of(content)}))
 
 
-FIELDS: list[tuple[str, object]] = [
-    *(("size", value) for value in ("1", -1, 1.5, True, 10**400)),
-    *(("file", name) for name in (["a"], "../photos.tar", "shard-000000.tar\n")),
-    *(("holes", value) for value in ("ab", [2.0], [0.1])),
-    ("key", "../a"), ("photo", 3), ("sha256", None), ("passed_over", [[]]), ("more", 1),
-]  # fmt: skip
+FIELDS = [("size", "1"), ("size", -1), ("file", "../photos.tar"), ("holes", [2.0]), ("holes", [0.1]), ("key", "../a")]
 
 
 @pytest.mark.parametrize(("name", "value"), FIELDS)
@@ -145,11 +137,8 @@ def member(name: str, content: bytes = b"", **fields: Any) -> bytes:
     "data",
     [
         member("000000.json", type=tarfile.SYMTYPE, linkname="/etc/passwd"),
-        member("000000.json", type=tarfile.GNUTYPE_SPARSE),
         member("000000.json", size=1 << 40),
-        member("000000.json", size=-512),
         member("000000.json", b"[" * 10_000),
-        member("000000.json", b'{"photo": {"name": "a"}, "trajectory": {"kind": "a"}, "views": [{}]}'),
         bytes(512),
         b"no tar",
     ],
@@ -165,7 +154,7 @@ def test_odd_members_are_refused_though_all_digests_fit(copy: Path, data: bytes)
     (copy / "shard-000000.tar").write_bytes(data + END)
     resealed(copy, change)
     with pytest.raises(InputError, match="sample 000000: not a photo of a dataset"):
-        DatasetFiles(copy).group(0)
+        DatasetFiles(copy)[0]
 
 
 def test_info_and_preview(whole: Path, tmp_path: Path) -> None:
@@ -177,48 +166,10 @@ def test_info_and_preview(whole: Path, tmp_path: Path) -> None:
         assert sheet.size == (3 * 72, 2 * 3 * 54)
 
 
-def names_of(samples: list[DatasetView]) -> list[tuple[str, int]]:
-    return [(sample.key, sample.index) for sample in samples]
-
-
-def test_ranks_and_workers_read_every_view_once(whole: Path) -> None:
-    every = [(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)]
-    assert names_of(list(ViewDataset(whole))) == every
-    for shuffle in (0, 7):
-        for ranks in (1, 3, 7):
-            parts = [list(ViewDataset(whole, shuffle=shuffle, rank=r, ranks=ranks)) for r in range(ranks)]
-            assert sorted(name for part in parts for name in names_of(part)) == every
-    loaders = [DataLoader(ViewDataset(whole, rank=r, ranks=2), batch_size=None, num_workers=2) for r in range(2)]
-    assert sorted(name for loader in loaders for name in names_of(list(loader))) == every
-    with pytest.raises(ValueError, match="rank"):
-        ViewDataset(whole, rank=2, ranks=2)
-
-
-def test_damage_is_skipped_named_and_counted_on_request(copy: Path, caplog: pytest.LogCaptureFixture) -> None:
-    good = names_of(list(ViewDataset(copy, on_error="skip")))
-    assert len(good) == 5 * VIEWS
-    (copy / "shard-000001.tar").unlink()  # photos 2 and 3
-    path = copy / "shard-000000.tar"
-    data = bytearray(path.read_bytes())
-    data[3000] ^= 1  # of photo 0
-    path.write_bytes(data)
-    for shuffle in (0, 7):
-        caplog.clear()
-        dataset = ViewDataset(copy, on_error="skip", shuffle=shuffle)
-        assert sorted(names_of(list(dataset))) == [name for name in good if name[0] in ("000001", "000004")]
-        assert dataset.skipped == len(caplog.messages) == 3
-        assert sum("shard-000001.tar: not there" in line for line in caplog.messages) == 2
-        assert sum("sample 000000 (0.png) is damaged" in line for line in caplog.messages) == 1
-
-
-def test_the_order_depends_on_seed_and_epoch_alone(whole: Path) -> None:
-    def order(seed: int, epoch: int) -> list[tuple[str, int]]:
-        dataset = ViewDataset(whole, shuffle=8, seed=seed)
-        dataset.set_epoch(epoch)
-        return names_of(list(dataset))
-
-    assert order(0, 0) == order(0, 0)
-    assert len({tuple(order(seed, epoch)) for seed in (0, 1) for epoch in (0, 1)}) == 4
+def test_a_loader_of_torch_reads_every_view_once(whole: Path) -> None:
+    loader = DataLoader(DatasetFiles(whole), batch_size=None, shuffle=True, num_workers=2)
+    found = [(photo.key, photo.view(index).index) for photo in loader for index in range(photo.views)]
+    assert sorted(found) == [(f"{photo:06d}", view) for photo in range(5) for view in range(VIEWS)]
 
 
 def test_an_address_is_read_by_fsspec(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +177,7 @@ def test_an_address_is_read_by_fsspec(whole: Path, monkeypatch: pytest.MonkeyPat
     memory = fsspec.filesystem("memory")
     for path in whole.iterdir():
         memory.pipe(f"/there/{path.name}", path.read_bytes())
-    assert names_of(list(ViewDataset("memory://there"))) == names_of(list(ViewDataset(whole)))
+    assert DatasetFiles("memory://there")[4].files == DatasetFiles(whole)[4].files
     assert run("dataset", "verify", "memory://there").code == 0
     refuses(run("dataset", "info", "nothing://there"), "nothing://there/manifest.json")
     monkeypatch.setitem(sys.modules, "fsspec", None)

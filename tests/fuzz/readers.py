@@ -181,9 +181,10 @@ def _read_dataset(folder: Path) -> None:
     list(problems(folder, load_manifest(folder), lambda done, total: None))
     files = DatasetFiles(folder)
     for place in range(len(files)):
-        group = files.group(place)
+        group = files[place]
         for index in range(group.views):
-            group.view(index, with_base=True)
+            group.view(index)
+        _ = group.base
 
 
 def _checkpoint(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """The pseudo-supervised dataset (paper, appendix): photos to views with holes and completed targets, in shards."""
 
 from spackle.dataset.sample import DatasetView, PhotoGroup
-from spackle.dataset.shards import DatasetFiles, ViewDataset
+from spackle.dataset.shards import DatasetFiles
 
-__all__ = ["DatasetFiles", "DatasetView", "PhotoGroup", "ViewDataset"]
+__all__ = ["DatasetFiles", "DatasetView", "PhotoGroup"]

@@ -17,11 +17,11 @@ from spackle.bases.settings import NETWORKS, BaseSettings
 from spackle.camera_path import MAX_DISPARITY, DepthRange, TrajectoryKind
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.sample import pack_sample
-from spackle.dataset.shards import NAME, Manifest, load_manifest, shard_name, write_shard
+from spackle.dataset.shards import NAME, Manifest, load_manifest, write_shard
 from spackle.dataset.views import COMPLETIONS, complete_views, draw_path, path_cameras, render_views
 from spackle.errors import InputError, check_name, reading
 from spackle.files import fingerprint, write_whole
-from spackle.folders import differences, digest_of, make_folder, remove_half_written, results_folder
+from spackle.folders import differences, digest_of, make_folder, photo_digest, remove_half_written, results_folder
 from spackle.image import load_photo, resize_photo
 from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter, inpainter_class
 from spackle.progress import Reporter, asked_to_stop, counted, timed
@@ -198,11 +198,7 @@ class Maker:
 
     def inputs(self, photo: PhotoFile) -> list[str]:
         """Digests of a photo and of its depth map on this machine."""
-        try:
-            content = fingerprint(photo.path, "photo")
-        except InputError:
-            content = "none"
-        return [content, *self.options.inputs_of(photo)]
+        return [photo_digest(photo.path), *self.options.inputs_of(photo)]
 
     def make(self, photo: PhotoFile) -> Made:
         """A photo's sample; BaseError if no photo can give one."""
@@ -323,13 +319,14 @@ class _Build:
         if number in self.shards or not self.missing.isdisjoint(indices):
             return
         parts = [(self.photos[i].key, self._part(i)) for i in indices if i not in self.problems]
+        name = f"shard-{number:06d}.tar"
         skipped = [self._portable(self.photos[i].name, self.problems[i]) for i in indices if i in self.problems]
         with timed("write", self.seconds):
-            self.shards[number] = write_shard(parts, self.output / shard_name(number), skipped)
+            self.shards[number] = write_shard(parts, self.output / name, skipped)
             self._save(complete=False)
             for _, path in parts:
                 path.unlink(missing_ok=True)
-        self.reporter.detail(f"  {shard_name(number)}: {len(parts)} photos, {decimal(self.shards[number].size)}")
+        self.reporter.detail(f"  {name}: {len(parts)} photos, {decimal(self.shards[number].size)}")
 
     def _save(self, *, complete: bool) -> None:
         shards = tuple(self.shards[number] for number in sorted(self.shards))

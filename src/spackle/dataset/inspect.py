@@ -98,7 +98,7 @@ def preview_dataset(location: str, output: Path, photos: int, views: int, report
     if not len(files):
         raise InputError(f"{location}: holds no photos")
     with results_folder(output, (SHEET, VIDEO), alone=True):
-        groups = [files.group(index) for index in _spread(len(files), photos)]
+        groups = [files[index] for index in _spread(len(files), photos)]
         rows: list[list[Tensor]] = []
         for group in groups:
             chosen = [group.view(index) for index in _spread(group.views, views)]

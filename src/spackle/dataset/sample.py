@@ -50,7 +50,6 @@ class DatasetView:
     rendering: Rendering  # of the base: rgb [H, W, 3], depth [H, W], alpha [H, W]
     mask: Tensor  # [H, W] bool: uncovered
     target: Tensor  # [H, W, 3] sRGB, completed
-    base: Gaussians | None  # where the reader was asked for it
 
 
 def pack_sample(key: str, photo: Tensor, stack: ViewStack, targets: Tensor, facts: Mapping[str, Any]) -> bytes:
@@ -116,7 +115,7 @@ class PhotoGroup:
         """How many there are."""
         return len(self.holes)
 
-    def view(self, index: int, *, with_base: bool = False) -> DatasetView:
+    def view(self, index: int) -> DatasetView:
         """Decode one view; InputError where a file of it is missing or damaged."""
         with reading(f"{self.where}: view {index}", "cannot be read: {reason}"):
             facts = self.facts["views"][index]
@@ -132,7 +131,6 @@ class PhotoGroup:
                 rendering=Rendering(rgb, depth, decode_alpha(self._file(index, "alpha"))),
                 mask=torch.from_numpy(_pixels(self._file(index, "mask"), 2)) > 127,
                 target=target,
-                base=self.base if with_base else None,
             )
             for camera, pictures in (
                 (view.camera, (rgb, depth, view.rendering.alpha, view.mask, target)),
@@ -144,13 +142,9 @@ class PhotoGroup:
 
     @functools.cached_property
     def base(self) -> Gaussians:
-        """The photo's Gaussians; of a damaged file any exception."""
-        return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
-
-    def only(self, index: int, *, with_base: bool = False) -> PhotoGroup:
-        """The files that one view needs, so the bytes of the others are free again."""
-        kept = (f"{self.key}.{index:02d}.", f"{self.key}.photo.", *([f"{self.key}.base."] if with_base else []))
-        return dataclasses.replace(self, files={n: data for n, data in self.files.items() if n.startswith(kept)})
+        """The photo's Gaussians; InputError where they are missing or damaged."""
+        with reading(f"{self.where}: Gaussians", "cannot be read: {reason}"):
+            return decode_gaussians(self.files[f"{self.key}.base.safetensors"])
 
     def _file(self, index: int, kind: str) -> bytes:
         return self.files[f"{self.key}.{index:02d}.{kind}.png"]

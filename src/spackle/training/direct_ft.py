@@ -151,7 +151,7 @@ class DirectFt(ViewTask):
     def batch(self, step: int | None, items: Sequence[int]) -> list[DatasetView]:
         """Views of one photo: in a step its own and others at random, for validation all; InputError for a bad file."""
         (item,) = items
-        group = self.files.group((self.validation if step is None else self.learned)[item])
+        group = self.files[(self.validation if step is None else self.learned)[item]]
         drawn = range(group.views) if step is None else drawn_views([self.recipe.run.seed, step, item], group.views)
         return [group.view(index) for index in drawn]
 
@@ -163,7 +163,7 @@ class DirectFt(ViewTask):
         """[H, W, 3] sRGB: of some photos their own view and the one with the largest hole, a row each."""
         rows: list[tuple[Tensor, ...]] = []
         for place in self.validation[:: max(1, 2 * self.validation_items // PICTURED)][: PICTURED // 2]:
-            group = self.files.group(place)
+            group = self.files[place]
             done = self.complete(network, [group.view(0), group.view(int(np.argmax(group.holes)))])
             rows += zip(done.base_rgb, done.rgb, done.target, strict=True)
         return sheet(rows, PICTURE_SIDE)

@@ -24,7 +24,6 @@ from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
-from spackle.dataset.sample import PhotoGroup
 from spackle.dataset.shards import DatasetFiles
 from spackle.errors import InputError, reading
 from spackle.files import files_in
@@ -43,6 +42,7 @@ NO_TARGETS = {  # inpainters whose pictures teach nothing
 }
 
 Draw = Callable[[np.random.Generator], tuple[Tensor, DepthMap, Camera]]  # a photo [H, W, 3] sRGB with depth
+View = Callable[[np.random.Generator], Sample]
 
 
 def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> list[Source]:
@@ -52,18 +52,17 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     """
     shares, sources = data.shares, list[Source]()
 
-    def add(name: str, share: float, folder: Path, files: Sequence[Path], view: Callable[..., Sample]) -> None:
+    def add(name: str, share: float, folder: Path, files: Sequence[Path], view: View) -> None:
         if share > 0:
             names = [file.relative_to(folder).as_posix() for file in files]
             sources.append(Source(share, lambda rng, index: view(rng), [name, *names]))
 
-    def reverse(draw: Draw) -> Callable[[np.random.Generator], Sample]:
+    def reverse(draw: Draw) -> View:
         return partial(random_reverse_view, draw=draw, disparity=data.disparity, renderer=renderer)
 
     if data.photos is not None:
         photos = find_files(data.photos, "data.photos", PHOTO_SUFFIXES, "photos")
-        draw: Draw = partial(composite_photo, photos=photos)
-        add("composites", shares.composites, data.photos, photos, reverse(draw))
+        add("composites", shares.composites, data.photos, photos, reverse(partial(composite_photo, photos=photos)))
     frames = [find_files(camera.folder, "data.rgbd", (".color.jpg",), "NAME.color.jpg") for camera in data.rgbd]
     for camera, files in zip(data.rgbd, frames, strict=True):
         share = shares.rgbd * len(files) / sum(map(len, frames))  # every frame counts alike
@@ -72,15 +71,21 @@ def find_sources(data: DataRecipe, renderer: Renderer, *, validation: bool) -> l
     if data.stereo is not None:
         scenes = [file.parent for file in find_files(data.stereo, "data.stereo", ("scene.json",), "scene.json")]
         add("stereo", shares.stereo, data.stereo, scenes, reverse(partial(left_photo, folders=scenes)))
-        view = partial(right_view, folders=scenes, renderer=renderer)
-        add("pairs", shares.pairs, data.stereo, scenes, view)
+        add("pairs", shares.pairs, data.stereo, scenes, partial(right_view, folders=scenes, renderer=renderer))
     if data.pseudo is not None and shares.pseudo > 0:
         dataset = open_pseudo(data.pseudo)
         split = divided_photos(dataset, data)
         places = [(photo, view) for photo in split[validation] for view in views_with_holes(dataset, photo)]
-        one = partial(pseudo_view, group=lru_cache(1)(dataset.group), places=places)  # its views follow on each other
+        photo_at = lru_cache(1)(dataset.__getitem__)  # its views follow on each other
+
+        def stored(rng: np.random.Generator, index: int) -> Sample:
+            """A view, rendering and all; InputError for a damaged file."""
+            photo = photo_at(places[index][0])
+            view = photo.view(places[index][1])
+            return Sample.of(photo.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
+
         names = ["pseudo", dataset.manifest.digest, *map(str, split[True])]
-        sources.append(Source(shares.pseudo, one, names, views=len(places)))
+        sources.append(Source(shares.pseudo, stored, names, views=len(places)))
     if not sources:
         raise InputError(
             "the recipe has no data: give data.photos=FOLDER, data.rgbd, data.stereo or data.pseudo, "
@@ -199,16 +204,6 @@ def divided_photos(files: DatasetFiles, data: DataRecipe) -> tuple[list[int], li
 def views_with_holes(files: DatasetFiles, photo: int) -> list[int]:
     """Those of a photo's views that have a hole."""
     return [view for view, hole in enumerate(files.samples[photo][1].holes) if hole > 0]
-
-
-def pseudo_view(
-    rng: np.random.Generator, index: int, group: Callable[[int], PhotoGroup], places: Sequence[tuple[int, int]]
-) -> Sample:
-    """The dataset's view at `places[index]` as it is stored, rendering and all; InputError for a damaged file."""
-    photo, number = places[index]
-    view = group(photo).view(number, with_base=True)
-    assert view.base is not None
-    return Sample.of(view.base, view.rendering, view.camera, view.photo_camera, view.photo, view.target)
 
 
 # Photos with depth --------------------------------------------------------------------------------
