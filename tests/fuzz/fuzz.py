@@ -10,6 +10,7 @@ import argparse
 import base64
 import ctypes
 import faulthandler
+import gc
 import json
 import multiprocessing
 import os
@@ -168,24 +169,28 @@ def bounded(name: str, files: Files) -> str | None:
     return problem
 
 
-def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, said: Path) -> None:
-    """Up to the first that fails: the file `case` then holds it, and `said` what was wrong."""
+def case_of(name: str, seeds: Sequence[Files], number: int) -> Files:
     from readers import sealed
 
+    rng = np.random.default_rng([zlib.crc32(name.encode()), number])
+    files = mutated(seeds[number % len(seeds)], rng)
+    return sealed(files) if rng.random() < 0.8 else files
+
+
+def run_cases(name: str, seeds: Sequence[Files], numbers: range, case: Path, said: Path) -> None:
+    """Up to the first that fails: the file `case` then holds it, and `said` what was wrong."""
     with open(said, "w") as file:
         os.dup2(file.fileno(), sys.stderr.fileno())
     bound_memory()
     for number in numbers:
-        rng = np.random.default_rng([zlib.crc32(name.encode()), number])
-        files = mutated(seeds[number % len(seeds)], rng)
-        files = sealed(files) if rng.random() < 0.8 else files
+        files = case_of(name, seeds, number)
         save(name, number, files, case)
         if problem := bounded(name, files):
             sys.exit(problem)
 
 
-def fuzz(name: str, count: int) -> int:
-    """How many cases of a reader failed: they are written to FAILURES, and what was wrong is printed."""
+def seeds_of(name: str) -> list[Files]:
+    """What a reader can read."""
     from readers import READERS, contents
 
     seeds: list[Files] = []
@@ -194,6 +199,32 @@ def fuzz(name: str, count: int) -> int:
             make(Path(place))
             seeds.append(contents(Path(place)))
         problem_of(name, seeds[-1])
+    return seeds
+
+
+def held(name: str, count: int) -> list[int]:
+    """Threads, open files and MB that this process has more of after so many cases, its garbage collector waiting."""
+    seeds, process = seeds_of(name), Path("/proc/self")
+    gc.disable()
+
+    def facts() -> list[int]:
+        pages = int((process / "statm").read_text().split()[1])
+        return [
+            len(os.listdir(process / "task")),
+            len(os.listdir(process / "fd")),
+            pages * resource.getpagesize() >> 20,
+        ]
+
+    before = facts()
+    for number in range(count):
+        if problem := problem_of(name, case_of(name, seeds, number)):
+            sys.exit(problem)
+    return [after - start for start, after in zip(before, facts(), strict=True)]
+
+
+def fuzz(name: str, count: int) -> int:
+    """How many cases of a reader failed: they are written to FAILURES, and what was wrong is printed."""
+    seeds = seeds_of(name)
     first = failed = 0
     with tempfile.TemporaryDirectory() as place:
         case, said = Path(place, "case.json"), Path(place, "said")
@@ -216,6 +247,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-n", type=int, default=300, help="cases of each reader")
     parser.add_argument("--readers", nargs="*", help="only these")
+    parser.add_argument("--held", action="store_true", help="print what one process then holds: threads, files, MB")
     parser.add_argument("--replay", type=Path, nargs="+", help="cases that were written here before")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -231,6 +263,10 @@ def main() -> int:
             problems.append(bounded(case["reader"], files))
             print(problems[-1] or "as it should be", flush=True)
         return any(problems)
+    if given.held:
+        for name in given.readers or READERS:
+            print(name, *held(name, given.n))
+        return 0
     return sum(fuzz(name, given.n) for name in given.readers or READERS) > 0
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import fuzz
 import numpy as np
+import pytest
 from PIL import Image
 
 
@@ -22,6 +23,13 @@ def run(*arguments: object) -> str:
 
 def test_damaged_files_are_refused_in_time_and_in_memory() -> None:
     assert run("-n", 300) == ""
+
+
+@pytest.mark.parametrize("count", [150, pytest.param(3000, marks=pytest.mark.slow)])
+def test_damaged_files_leave_no_thread_no_file_and_no_memory_behind(count: int) -> None:
+    for line in run("-n", count, "--held", "--readers", "clips", "pictures", "depth").splitlines():
+        threads, files, megabytes = map(int, line.split()[1:])
+        assert (threads, files, megabytes < 40) == (0, 0, True), line
 
 
 def gif(side: int) -> bytes:

@@ -18,6 +18,7 @@ import torch
 from av.audio.stream import AudioStream
 from av.container import InputContainer
 from av.stream import Disposition
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from torch import Tensor
 
@@ -67,7 +68,7 @@ def is_clip(path: Path) -> bool:
     if path.suffix.lower() != ".gif":
         return True
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             pictures = (packet for packet in container.demux(video=0) if packet.size)
             return next(pictures, None) is not None and next(pictures, None) is not None
     except (av.FFmpegError, ValueError, IndexError):
@@ -83,6 +84,15 @@ def read_clip(
     there are). InputError for what is no clip, or cut off, damaged, without a picture, or of unknown coding.
     """
     check_file(path, "clip")
+    try:
+        return _read_clip(path, first, progress)
+    except InputError as error:
+        line, cause = str(error), error.__cause__
+    # Another error: the first one's traceback holds the decoder, whose threads would stay as long as somebody has it.
+    raise InputError(line) from (cause and cause.with_traceback(None))
+
+
+def _read_clip(path: str | os.PathLike[str], first: int | None, progress: Callable[[int, int], None] | None) -> Clip:
     ticks: list[Fraction | None] = []
     frame = None
     with _opened(path) as (container, stream):
@@ -109,9 +119,10 @@ def clip_frames(clip: Clip) -> Iterator[Tensor]:
     """The frames of a clip, [H, W, 3] float32 sRGB in 0..1; InputError where the file has changed since it was read."""
     with _opened(clip.path) as (container, stream):
         aspect, count = stream.sample_aspect_ratio or Fraction(1), 0
+        reformatter = VideoReformatter()
         for frame in _decoded(clip.path, container, stream, len(clip)):
             count += 1
-            yield _picture(frame, aspect)
+            yield _picture(frame, aspect, reformatter)
     if count < len(clip):
         raise InputError(f"{clip.path}: has become shorter while it was read: start again")
 
@@ -120,7 +131,7 @@ def clip_frames(clip: Clip) -> Iterator[Tensor]:
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The file and its moving picture."""
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")  # a strict one stays open where it raises
     except (av.FFmpegError, ValueError) as error:
         reason = reason_in_a_line(error)
         raise InputError(f"{path}: not a video, or damaged at its beginning or end ({reason})") from error
@@ -169,13 +180,14 @@ def _decoded(
         )
 
 
-def _picture(frame: av.VideoFrame, aspect: Fraction) -> Tensor:
+def _picture(frame: av.VideoFrame, aspect: Fraction, reformatter: VideoReformatter) -> Tensor:
     """[H, W, 3] of a frame: FFmpeg converts from its matrix and range; then it is turned upright."""
     width, height = _square_size(frame, aspect)
     matrix = frame.colorspace
     if matrix == UNSPECIFIED:
         matrix = BT709 if frame.height >= HD_ROWS else BT601
-    rgb = frame.reformat(width=width, height=height, format="rgb24", src_colorspace=matrix).to_ndarray()
+    # Not `frame.reformat`: each frame would start threads of its own.
+    rgb = reformatter.reformat(frame, width, height, "rgb24", src_colorspace=matrix).to_ndarray()
     turned = np.ascontiguousarray(np.rot90(rgb, _quarters(frame)))
     return torch.from_numpy(turned).float().div_(255)
 
@@ -226,7 +238,9 @@ class _ClipEncoder(StreamEncoder):
         self._even = min(max(clip.rate.limit_denominator(1001), RATES[0]), RATES[1])
         super().__init__(H264, path, width, height, self._even, 1)
         self._clip = clip
-        self._input = av.open(str(clip.path)) if clip.audio in self._container.supported_codecs else None
+        self._input = None
+        if clip.audio in self._container.supported_codecs:
+            self._input = av.open(str(clip.path), metadata_errors="replace")
         self.sound = False
         if self._input is not None:
             source = self._input.streams.audio[0]

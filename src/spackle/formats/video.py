@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 from torch import Tensor
@@ -192,6 +193,7 @@ class StreamEncoder:
         stream = self._container.add_stream(kind.codec, rate=rate, options=kind.options)
         assert isinstance(stream, VideoStream)
         self._stream = stream
+        self._reformatter = VideoReformatter()
         stream.width, stream.height, stream.pix_fmt = width, height, kind.pixels
         if kind.pixels == "yuv420p":
             stream.width, stream.height = width + width % 2, height + height % 2
@@ -206,7 +208,8 @@ class StreamEncoder:
             rgb = np.pad(rgb, [(0, rgb.shape[0] % 2), (0, rgb.shape[1] % 2), (0, 0)], mode="edge")
             colors = {"src_colorspace": "ITU709", "dst_colorspace": "ITU709"}
             colors |= {"src_color_range": "JPEG", "dst_color_range": "MPEG"}
-        picture = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=self._kind.pixels, **colors)
+        picture = av.VideoFrame.from_ndarray(rgb, format="rgb24")
+        picture = self._reformatter.reformat(picture, format=self._kind.pixels, **colors)
         picture.pts, picture.time_base = self._count, 1 / self._rate
         self._write(self._stream.encode(picture))
         self._count += 1
