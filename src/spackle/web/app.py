@@ -8,7 +8,7 @@ import re
 import shutil
 from collections.abc import AsyncIterator
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -144,6 +144,8 @@ def create_app(
         if not path.is_file():
             if job.state != "done":
                 raise HTTPException(409, job.error or "this scene is not done yet")
+            if file in get_args(PagePart):
+                raise HTTPException(404, "there was no photo: it was a scene already")
             if error := await asyncio.shield(asyncio.wrap_future(jobs.make(job, file))):
                 raise HTTPException(404, error)
         return FileResponse(path, filename=PurePosixPath(job.name).stem + path.suffix)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -130,8 +131,8 @@ class Guard:
             await self.app(admitted, bounded, answer)
         except HTTPException as error:
             await JSONResponse({"error": error.detail}, error.status_code)(scope, receive, answer)
-        except asyncio.TimeoutError:
-            LOG.debug("a client does not read what it asked for")  # its connection is closed
+        except (asyncio.TimeoutError, ClientDisconnect):
+            LOG.debug("a client has gone, or does not read what it asked for")  # its connection is closed
         except Exception:
             LOG.exception("this went wrong:")
             raise
