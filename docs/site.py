@@ -22,8 +22,9 @@ ELSEWHERE = {
     "comfyui.md": "integrations/comfyui/README.md",
     "weights.md": "src/spackle/weights/README.md",
 }
-COMMANDS = ("predict", "view", "render", "export", "demo", "weights get", "weights list", "weights make", "train")
-COMMANDS += ("dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables", "bench")
+COMMANDS = ("predict", "view", "render", "export", "info", "demo", "weights get", "weights list", "weights make")
+COMMANDS += ("train", "dataset build", "dataset info", "dataset verify", "dataset preview", "evaluate", "tables")
+COMMANDS += ("bench",)
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 

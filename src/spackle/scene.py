@@ -17,8 +17,8 @@ from spackle.camera import Camera
 from spackle.camera_path import OVERSCAN, DepthRange, KeyframePath, TrajectoryKind
 from spackle.errors import renamed
 from spackle.files import Target, check_writable, write_bytes
-from spackle.formats.ply import PlyFile, save_ply
-from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of
+from spackle.formats.ply import save_ply
+from spackle.formats.scene_files import Encoder, SceneFile, at_origin, encoder_of, load_scene
 from spackle.formats.video import check_video, save_video
 from spackle.gaussians import Gaussians
 from spackle.image import focal_length
@@ -47,14 +47,14 @@ class Scene:
 
     @staticmethod
     def load(path: str | os.PathLike[str], *, focal_px: float | None = None, fov: float | None = None) -> Scene:
-        """Read a PLY of ours, of INRIA's or of SHARP's; InputError for another file.
+        """Read a PLY of ours, of INRIA's, of SHARP's or PlayCanvas's, an SPZ, SOG or .splat; InputError for another.
 
         Args:
             path: the file.
             focal_px: focal length in pixels; by default what is stored, else that of 30 mm.
             fov: horizontal field of view in degrees, in its place.
         """
-        return Scene.of_file(PlyFile(path).scene(), focal_px, fov)
+        return Scene.of_file(load_scene(Path(path)), focal_px, fov)
 
     @staticmethod
     def of_file(file: SceneFile, focal_px: float | None = None, fov: float | None = None) -> Scene:

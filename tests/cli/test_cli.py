@@ -10,15 +10,19 @@ import time
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import numpy as np
 import pytest
-from command import FILES, SHORT, Run, decode, names_in, predicted, report_of, run
+from clips import moving, write_clip
+from command import FILES, SHORT, Run, decode, names_in, predicted, refuses, report_of, run
 from photos import metres, write_depth, write_photo
+from PIL import Image
 
 import spackle
 from spackle import cli
 
 COMMAND = [sys.executable, "-m", "spackle"]
-COMMANDS = ["predict", "render", "view", "export", "demo", "train", "evaluate", "tables", "bench", "dataset", "weights"]
+COMMANDS = ["predict", "render", "view", "export", "info", "demo"]
+COMMANDS += ["train", "evaluate", "tables", "bench", "dataset", "weights"]
 
 
 def test_the_installed_command_and_python_m_spackle_are_this_one(tmp_path: Path) -> None:
@@ -116,6 +120,28 @@ def test_every_command_has_a_help() -> None:
     counts = [sum(line.startswith("  -") for line in lines) for lines in (first, everything)]
     assert counts[0] <= 20 < counts[1]
     assert len(run("--help").out.splitlines()) <= 24
+
+
+def test_info_says_what_a_file_is(tmp_path: Path, scene: Path, pair: tuple[Path, Path]) -> None:
+    spz, clip, depth = tmp_path / "a.spz", write_clip(tmp_path / "c.mp4", moving(3, 16, 24)), tmp_path / "mm.png"
+    assert run("export", scene, "-o", spz).code == 0
+    Image.fromarray((1000 * metres()).astype(np.uint16)).save(depth)
+    expected = {
+        scene: ("scene (.ply)", "base", "64×48, focal length 55.5 px, 60.0° wide", "--disparity 0.07", "spackle view"),
+        spz: ("scene (.spz)", "no border of base and aux", "none is stored", "spackle view"),
+        pair[0]: ("photo", "64×48", "(default 30 mm)", "none inside", f"spackle predict {pair[0]} -o out"),
+        pair[1]: ("depth map", "64×48", "2 m near, 6 m median, 6 m far", "0.0%", f"--depth {pair[1]}"),
+        depth: ("depth map", "2 m near"),
+        clip: ("clip", "24×16", "3, 10 a second", "none", "spackle predict"),
+    }
+    for path, parts in expected.items():
+        result = run("info", path)
+        assert (result.code, result.err) == (0, "")
+        assert all(part in result.out for part in parts), result.out
+    facts = [json.loads(line) for line in run("info", *expected, "--json").out.splitlines()]
+    assert [fact["file"] for fact in facts] == list(map(str, expected))
+    (tmp_path / "a.txt").write_text("hello")
+    refuses(run("info", tmp_path / "a.txt"), "a.txt", "not an image")
 
 
 def test_each_result_and_each_error_is_a_line_of_json(tmp_path: Path) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import io
 import math
 import os
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -23,11 +25,12 @@ from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats import load_ply, save_ply
 from spackle.formats.compressed_ply import morton_order
-from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_of
+from spackle.formats.scene_files import SCENE_ENCODERS, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LIMIT
 from spackle.gaussians import Gaussians, quat_to_matrix
 from spackle.progress import Reporter
 from spackle.render import CpuRenderer
+from spackle.scene import Scene
 
 CPU = CpuRenderer()
 BOX = box_before_wall(width=64, height=48, focal=54)
@@ -113,6 +116,36 @@ def test_extremes_come_back_as_well_as_the_format_can(kind: str, extreme: str) -
         unit = expected.quats.clone()
         unit[unit.norm(dim=1) == 0] = torch.tensor([1.0, 0, 0, 0])
         torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(unit), rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "glb"])
+@pytest.mark.parametrize("extreme", [None, *EXTREMES])
+def test_scenes_are_read_as_the_plainest_reader_does(tmp_path: Path, kind: str, extreme: str | None) -> None:
+    gaussians, path = random_gaussians(4 if extreme else 700), tmp_path / f"a.{kind}"
+    given = {name: torch.tensor(values) for name, values in EXTREMES.get(extreme or "", {}).items()}
+    path.write_bytes(encode(kind, dataclasses.replace(gaussians, **given), Camera.from_focal(50, 64, 48), 3))
+    found, expected = load_scene(path), read(kind, path.read_bytes())
+    for mine, plain in zip(found.gaussians.tensors, expected.tensors, strict=True):
+        torch.testing.assert_close(mine, plain, rtol=1e-4, atol=2e-5 + 1e-7 * float(plain.abs().max()))
+    known = (3, 50.0) if kind == "compressed.ply" else (None, None)
+    assert (found.base_count, found.camera and found.camera.focal[0]) == known
+    renamed = path.rename(tmp_path / "other.bin") if kind != "splat" else path  # the content decides
+    assert len(load_scene(renamed).gaussians) == len(gaussians)
+    assert Scene.load(renamed).to_bytes(kind) == Scene.load(renamed).to_bytes(kind)
+
+
+def test_other_programs_spz(tmp_path: Path) -> None:
+    """Version 2 has a byte for each of a rotation's xyz; harmonics above degree 0 follow the rest."""
+    quats = np.array([[0.5, 0.5, -0.5, 0.5], [1, 0, 0, 0], [0.6, 0, 0.8, 0]])
+    turns = np.round((quats[:, 1:] + 1) * 127.5).astype(np.uint8)
+    raw = struct.pack("<4sIIBBBB", b"NGSP", 2, 3, 1, 12, 1, 0) + bytes(27) + bytes([255] * 3 + [128] * 9 + [160] * 9)
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(raw + turns.tobytes() + bytes(3 * 9)))
+    found = load_scene(path).gaussians
+    flipped = torch.tensor(quats, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0, -1.0])
+    torch.testing.assert_close(quat_to_matrix(found.quats), quat_to_matrix(flipped), atol=0.02, rtol=0)
+    assert (found.scales == 1).all()
+    assert (found.opacities == 1).all()
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -317,7 +350,7 @@ def test_splat_transform_reads_the_scene(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["spz", "compressed.ply"])
-def test_gsply_reads_the_scene(kind: str, tmp_path: Path) -> None:
+def test_gsply_reads_the_scene_and_we_what_it_writes(kind: str, tmp_path: Path) -> None:
     """It compiles its reader when it is first used, and leaves SPZ's axes as they are."""
     gsply = pytest.importorskip("gsply")
     path = tmp_path / f"a.{kind}"
@@ -326,3 +359,5 @@ def test_gsply_reads_the_scene(kind: str, tmp_path: Path) -> None:
     means, quats, scales, opacities = map(torch.as_tensor, (raw.means, raw.quats, raw.scales, raw.opacities))
     flip = torch.tensor([1.0, 1.0, -1.0, -1.0]) if kind == "spz" else torch.ones(4)
     agree(Gaussians(means * flip[1:], quats * flip, scales.exp(), opacities.sigmoid(), means), expected, 0.01)
+    gsply.write_spz(path, raw) if kind == "spz" else gsply.plywrite(path, raw, compressed=True)
+    agree(load_scene(path).gaussians, expected, 0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import hashlib
 import io
 import json
@@ -39,6 +40,7 @@ from spackle.evaluation.case import load_case
 from spackle.evaluation.datasets import read_cases
 from spackle.folders import digest_of
 from spackle.formats import PlyFile, load_cameras, load_path, save_ply
+from spackle.formats.scene_files import SceneFile, encoder_of, load_scene
 from spackle.image import load_photo, resize_photo
 from spackle.network_file import read_tensors
 from spackle.training.checkpoint import Checkpoint, Progress, load_checkpoint, save_checkpoint
@@ -85,7 +87,7 @@ def _sealed(name: str, data: bytes) -> bytes:
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("depth.npy", data)
         return packed.getvalue()
-    return data
+    return gzip.compress(data, 1) if name.endswith(".spz") else data
 
 
 def _only(folder: Path) -> Path:
@@ -115,6 +117,16 @@ def _npz(folder: Path) -> None:
 def _ply(folder: Path) -> None:
     camera = Camera.from_focal(50, 64, 48)
     save_ply(random_gaussians(9), folder / "a.ply", camera=camera, base_count=4, disparity=0.3)
+
+
+def _encoded(kind: str) -> Maker:
+    """A scene in another format; `sealed` packs a .spz."""
+
+    def make(folder: Path) -> None:
+        data = encoder_of(path := folder / f"a.{kind}")(SceneFile(path, random_gaussians(300)))
+        path.write_bytes(gzip.decompress(data) if kind == "spz" else data)
+
+    return make
 
 
 def _read_ply(folder: Path) -> None:
@@ -244,6 +256,9 @@ READERS: dict[str, Reader] = {
         lambda folder: load_photo_depth(_only(folder)),
     ),
     "ply": Reader([_ply, *(_writes("a.ply", content) for content in (test_ply.SHARP, test_ply.ASCII))], _read_ply),
+    "scenes": Reader(
+        [*map(_encoded, ("spz", "splat", "sog", "compressed.ply"))], lambda folder: load_scene(_only(folder))
+    ),
     "cameras": Reader([_writes("a.json", json.dumps(CAMERAS))], lambda folder: load_cameras(_only(folder))),
     "keyframes": Reader([_writes("a.json", json.dumps(PATH))], lambda folder: load_path(_only(folder))),
     "calibrations": Reader([_calib, _described], lambda folder: load_depth(next(folder.glob("disp*")))),

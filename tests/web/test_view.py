@@ -149,7 +149,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> None:
     ("name", "content", "why"),
     [
         ("text.txt", b"hello", "not an image"),
-        ("written.spz", b"anything", "scene.ply"),  # a format that is written, not read
+        ("written.glb", b"anything", "scene.ply"),  # a format that is written, not read
         ("scene.jpg", b"ply\nformat ascii 1.0\nend_header\n", "not a Gaussian scene"),
         ("missing.jpg", None, "no such photo or scene"),
         ("behind.ply", None, "in front of the photo's camera"),

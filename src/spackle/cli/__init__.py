@@ -37,7 +37,7 @@ class Overview(TyperGroup):
         write = formatter.write  # type: ignore[attr-defined]
         rows = [(name, command) for name in self.list_commands(ctx) if (command := self.get_command(ctx, name))]
         indent = max(len(name) for name, _ in rows) + 4
-        write(f"{self.help}\n\n")
+        write(f"{self.help}\n")
         for line, meaning in EXAMPLES:
             write(f"  {line:<50}{meaning}\n")
         for title, wanted in (("Commands", False), ("Research", True)):
@@ -68,6 +68,7 @@ app.command(short_help="Look at a scene, or at a photo that becomes one")(comman
 app.command(short_help="The same for programs: an HTTP interface")(commands.serve)
 app.command(short_help="A saved scene to a video")(commands.render)
 app.command(short_help="A scene for other viewers, or as one page to send")(commands.export)
+app.command(short_help="What a scene, photo, depth map or clip is")(commands.info)
 app.command(short_help="The Middlebury Motorcycle, against its true second photo")(commands.demo)
 app.add_typer(weights.weights, name="weights", short_help="Weights that others publish: fetch them, list them")
 app.command(short_help="Train the residual or SHARP's decoder")(train.train)

@@ -158,7 +158,7 @@ def render(
 
 
 def export(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.ply", help="A 3D Gaussian scene.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
     output: Annotated[
         list[Path],
         typer.Option(
@@ -178,10 +178,22 @@ def export(
     export_scene(scene, output, Reporter(as_json=as_json))
 
 
+def info(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Scenes, photos, depth maps or clips.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Say what a file is: its size, range, Gaussians and camera, and what to do with it."""
+    from spackle.cli.info import show_info
+    from spackle.progress import Reporter
+
+    for file in files:
+        show_info(file, Reporter(as_json=as_json))
+
+
 def view(
     target: Annotated[
         Path | None,
-        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene (PLY), or a photo to complete; none: an empty page."),
+        typer.Argument(metavar="SCENE_OR_PHOTO", help="A scene, or a photo to complete; none: an empty page."),
     ] = None,
     base: Annotated[
         str, typer.Option(metavar="NAME", help="What turns photos into Gaussians, as `spackle predict` has it.")

@@ -21,8 +21,7 @@ from spackle.errors import InputError
 from spackle.files import check_writable, write_whole
 from spackle.folders import results_folder
 from spackle.formats import save_png, save_video
-from spackle.formats.ply import PlyFile
-from spackle.formats.scene_files import Encoder, SceneFile, encoder_of
+from spackle.formats.scene_files import Encoder, SceneFile, encoder_of, load_scene
 from spackle.formats.spz import LARGEST, spz_grid
 from spackle.formats.video import FORMATS
 from spackle.image import DEFAULT_FOCAL_MM, focal_length
@@ -41,7 +40,7 @@ PAGE: dict[str, Encoder] = {".html": lambda scene: single_html(page_of(Scene.of_
 def render_scene(
     scene: Path, output: Path, path: PathOptions, focal_px: float | None, device: str, reporter: Reporter
 ) -> None:
-    """Draw a PLY along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
+    """Draw a scene along a path: the video `output`, or in the folder `output` STEM.mp4 (with --cameras also PNGs).
 
     `focal_px`, in pixels of the video, replaces the stored lens. InputError for a file or option that cannot be used.
     """
@@ -56,7 +55,7 @@ def render_scene(
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()
-        loaded = PlyFile(scene).scene()
+        loaded = load_scene(scene)
         gaussians, reach = loaded.gaussians, loaded.disparity
         if given:
             cameras = given
@@ -133,7 +132,7 @@ def _photo_camera(file: SceneFile, size: tuple[int, int] | None, focal_px: float
 
 
 def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> None:
-    """Write a PLY in the formats that the outputs' names end in, each file whole or not at all.
+    """Write a scene in the formats that the outputs' names end in, each file whole or not at all.
 
     Raises InputError for a scene or name that cannot be used, and for a scene too large for a format.
     """
@@ -147,9 +146,8 @@ def export_scene(scene: Path, outputs: Sequence[Path], reporter: Reporter) -> No
                 raise InputError(f"{output}: named twice: give each output once")
         if os.path.realpath(scene) in map(str, targets):
             raise InputError(f"{scene}: is the scene itself, and would be lost: give the output another name")
-        file = PlyFile(scene)
-        loaded = file.scene()
-        if rest := sum(name.startswith("f_rest_") for element in file.elements for name, _ in element.fields):
+        loaded = load_scene(scene)
+        if rest := loaded.harmonics:
             reporter.log(
                 f"{scene}: {rest} spherical harmonics of each Gaussian are left out: its colour is that of degree 0"
             )
@@ -168,7 +166,7 @@ def _report_file(scene: SceneFile, output: Path, seconds: float, reporter: Repor
     factor = f"{before / size:.1f} times smaller than" if size < before else f"{size / before:.1f} times the size of"
     if 0.95 < size / before < 1.05:
         factor = "as large as"
-    reporter.log(f"{output}: {count:,} Gaussians, {decimal(size)}, {factor} the PLY, {seconds:.1f} s")
+    reporter.log(f"{output}: {count:,} Gaussians, {decimal(size)}, {factor} {scene.path.name}, {seconds:.1f} s")
     bits, far = spz_grid(scene.gaussians) if output.name.lower().endswith(".spz") else (0, 0)
     if far:
         reach = f"{LARGEST / 2**bits:,.0f} m"

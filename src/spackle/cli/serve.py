@@ -21,6 +21,7 @@ from spackle.bases.settings import AUTO, RGBD, BaseSettings
 from spackle.cli.saved_scene import page_of
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import check_file
+from spackle.formats.scene_files import scene_kind
 from spackle.image import load_photo
 from spackle.progress import Reporter, asked_to_stop
 from spackle.scene import Scene
@@ -29,9 +30,8 @@ from spackle.web import create_app
 from spackle.web.guard import Access
 from spackle.web.jobs import LOG, Jobs, Keep
 from spackle.web.server import server_of
-from spackle.web.work import PREVIEW, SceneWork, check_photo, is_scene
+from spackle.web.work import PREVIEW, SceneWork, check_photo
 
-WRITTEN_ONLY = (".spz", ".splat", ".sog", ".glb", ".html")
 LOOPBACK = "127.0.0.1"
 
 
@@ -68,7 +68,7 @@ def view(
         with listening(Path(folder), work, 1, Keep(), place, reporter) as (jobs, urls):
             if target is not None:
                 with jobs.place() as new:
-                    if not is_scene(target):
+                    if scene_kind(target) is None:
                         check_photo(target, name, new / PREVIEW)
                     depth = None if settings.depth is None else os.path.abspath(str(settings.depth))
                     options: dict[str, object] = {"base": settings.name, **lens, "files": []}
@@ -83,10 +83,8 @@ def checked(
     """What people call a photo or a scene; InputError before a page opens where it, or its depth, is no such file."""
     check_file(target, "photo or scene")
     settings.check()
-    if target.suffix.lower() in WRITTEN_ONLY:
-        raise InputError(f"{target}: {target.suffix} files are written, not read: give the scene.ply it was made of")
     with reporter.stage("load"):
-        if is_scene(target):
+        if scene_kind(target):
             if settings.depth is not None:
                 raise InputError(f"--depth {settings.depth}: {target.name} is a scene already: leave the option out")
             return str(page_of(Scene.load(target, **lens), target).description["name"])

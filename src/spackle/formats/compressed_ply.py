@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from spackle.formats.ply import ply_header
-from spackle.formats.scene_files import Columns, Floats, SceneFile, as_shares, smallest_three
+from spackle.formats.scene_files import (
+    Columns,
+    Floats,
+    SceneFile,
+    as_shares,
+    from_shares,
+    from_smallest_three,
+    smallest_three,
+)
 
 CHUNK = 256  # Gaussians that share bounds
 LARGEST_LOG_SCALE = 20  # what readers expect at most, in either direction
@@ -16,6 +26,7 @@ _CHUNK_NAMES = [
     *(f"{end}_{prefix}{axis}" for prefix in ("", "scale_") for end in ("min", "max") for axis in "xyz"),
     *(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
 ]
+PLACE_BITS, TURN_BITS, COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
 _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
@@ -39,11 +50,11 @@ def encode_compressed_ply(scene: SceneFile) -> bytes:
         places, chunks[:, 0:6] = _normalised(columns.means, starts)
         sizes, chunks[:, 6:12] = _normalised(scales, starts)
         colors, chunks[:, 12:18] = _normalised(columns.srgb, starts)
-        rows[:, 0] = _packed(places, (11, 10, 11))
+        rows[:, 0] = _packed(places, PLACE_BITS)
         largest, others = smallest_three(columns.quats)
-        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), (10, 10, 10))
-        rows[:, 2] = _packed(sizes, (11, 10, 11))
-        rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), (8, 8, 8, 8))
+        rows[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(as_shares(others), TURN_BITS)
+        rows[:, 2] = _packed(sizes, PLACE_BITS)
+        rows[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], axis=1), COLOR_BITS)
     header = ply_header(*tables, camera=scene.untilted_camera, base_count=scene.base_count)
     return header + chunks.tobytes() + rows.tobytes()
 
@@ -83,3 +94,38 @@ def _packed(shares: Floats, widths: tuple[int, ...]) -> NDArray[np.uint32]:
     for column, width in zip(shares.T, widths, strict=True):
         word = word << np.uint32(width) | np.round(column * np.float32(2**width - 1)).astype(np.uint32)
     return word
+
+
+def decode_compressed_ply(chunks: NDArray[Any], rows: NDArray[Any]) -> Columns:
+    """Gaussians of the two tables of a file, in its order; ValueError where these do not fit together."""
+    if missing := set(_CHUNK_NAMES[:12]) - set(chunks.dtype.names or ()):
+        raise ValueError(f"its chunks have no {min(missing)}")
+    if len(chunks) * CHUNK < len(rows):
+        raise ValueError(f"{len(chunks)} chunks for {len(rows)} vertices")
+    places, turns, sizes, colors = (np.array(rows[name], np.uint32) for name in _VERTEX_NAMES)
+    rgba = _unpacked(colors, COLOR_BITS)
+    srgb = _between(rgba[:, :3], chunks, _CHUNK_NAMES[12:]) if "min_r" in (chunks.dtype.names or ()) else rgba[:, :3]
+    return Columns(
+        _between(_unpacked(places, PLACE_BITS), chunks, _CHUNK_NAMES[0:6]),
+        from_smallest_three(turns >> np.uint32(30), from_shares(_unpacked(turns, TURN_BITS))),
+        _between(_unpacked(sizes, PLACE_BITS), chunks, _CHUNK_NAMES[6:12]),
+        rgba[:, 3],
+        np.clip(srgb, 0, 1),
+    )
+
+
+def _unpacked(words: NDArray[np.uint32], widths: tuple[int, ...]) -> Floats:
+    """Shares [N, k] of which `_packed` gives these words, whatever their higher bits."""
+    shifts = np.array([sum(widths[k + 1 :]) for k in range(len(widths))], np.uint32)
+    masks = np.array([2**width - 1 for width in widths])
+    codes = words[:, None] >> shifts & masks.astype(np.uint32)
+    shares: Floats = np.divide(codes, masks, dtype=np.float32)
+    return shares
+
+
+def _between(shares: Floats, chunks: NDArray[Any], names: list[str]) -> Floats:
+    """Values [N, 3] of shares of their chunk's bounds: three least, three greatest."""
+    bounds = np.stack([chunks[name] for name in names], axis=1).astype(np.float64)
+    low, high = np.split(bounds[np.arange(len(shares)) // CHUNK], 2, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is counted later
+        return (low + shares * (high - low)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Gaussians as PLY: INRIA's layout out, INRIA's and SHARP's in; a header is checked before any table is read."""
+"""Gaussians as PLY: INRIA's layout out; INRIA's, SHARP's and PlayCanvas's in, the header before any table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spackle.color import srgb_to_linear
 from spackle.errors import InputError, reading
 from spackle.files import atomic_path, check_file
 from spackle.formats.camera_files import checked_camera
-from spackle.formats.scene_files import SH_C0, Columns, SceneFile
+from spackle.formats.scene_files import SH_C0, Columns, SceneFile, function_named
 from spackle.gaussians import Gaussians
 
 MAX_HEADER_BYTES = 1 << 16
@@ -37,6 +37,7 @@ SMALLEST_OPACITY, LARGEST_OPACITY = 1e-12, 1 - 2.0**-24  # keep the logit finite
 BLOCK = 8192
 
 _READ = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _READ += ["rot_0", "rot_1", "rot_2", "rot_3"]
 _WRITTEN = [*_READ[:3], "nx", "ny", "nz", *_READ[3:]]
 _SLICES = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10), slice(10, 14)  # means, f_dc, opacity, scales, rot
@@ -158,6 +159,12 @@ class PlyFile:
                 for an opacity of 1.
         """
         vertex, extras = self._vertex(), self._extras()
+        if chunks := [element for element in self.elements if element.name == "chunk"]:
+            decode = function_named("spackle.formats.compressed_ply:decode_compressed_ply")
+            with reading(self.path, "the compressed tables cannot be read: {reason}: export the scene again"):
+                tables = (np.concatenate(list(self._blocks(element))) for element in (chunks[0], vertex))
+                gaussians: Gaussians = decode(*tables).gaussians()
+            return gaussians
         linear = bool(extras["color_space"].any()) if "color_space" in extras else "intrinsic" in extras
         parts = [torch.empty(vertex.count, columns.stop - columns.start) for columns in _SLICES]
         table, broken = np.zeros((len(_READ), BLOCK), np.float32), 0
@@ -220,7 +227,9 @@ class PlyFile:
 
     def scene(self) -> SceneFile:
         """All of it; InputError as above."""
-        return SceneFile(Path(self.path), self.gaussians(), self.camera(), self.base_count(), self.disparity())
+        rest = sum(name.startswith("f_rest_") for element in self.elements for name, _ in element.fields)
+        known = self.camera(), self.base_count(), self.disparity()
+        return SceneFile(Path(self.path), self.gaussians(), *known, harmonics=rest)
 
     def _parse(self, lines: list[str]) -> None:
         order = ""
@@ -274,7 +283,8 @@ class PlyFile:
         named = [element for element in self.elements if element.name == "vertex"]
         if len(named) != 1:
             raise InputError(f"{self.path}: holds {len(named)} elements called vertex: not a Gaussian scene")
-        missing = [name for name in _READ if name not in dict(named[0].fields)]
+        read = _PACKED if "packed_position" in dict(named[0].fields) else _READ
+        missing = [name for name in read if name not in dict(named[0].fields)]
         if missing:
             raise InputError(f"{self.path}: not a Gaussian scene: its vertices have no {', '.join(missing)}")
         if named[0].count == 0 or named[0].start < 0:

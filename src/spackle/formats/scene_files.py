@@ -1,4 +1,4 @@
-"""Scene files: what they store, and the formats that a scene is written in, by the end of a file's name."""
+"""Scene files: what they store, and the formats that a scene is written in and read from."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from spackle.camera import Camera
-from spackle.color import linear_to_srgb
-from spackle.errors import InputError
+from spackle.color import linear_to_srgb, srgb_to_linear
+from spackle.errors import InputError, reading
+from spackle.files import check_file
 from spackle.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
@@ -26,13 +28,14 @@ SMALLEST_QUAT = 1e-12  # a shorter quaternion has no direction
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """What a PLY holds."""
+    """What a scene's file holds; most formats have room for Gaussians alone."""
 
     path: Path
     gaussians: Gaussians
     camera: Camera | None = None  # the photo's
     base_count: int | None = None
     disparity: float | None = None  # how far it was completed
+    harmonics: int = 0  # numbers of each Gaussian above degree 0, which are left out
 
     @property
     def untilted_camera(self) -> Camera | None:
@@ -75,6 +78,17 @@ class Columns:
         srgb = linear_to_srgb(colors).numpy()
         return Columns(means.numpy(), unit.numpy(), log_scales, opacities.clamp(0, 1).numpy(), srgb)
 
+    def gaussians(self) -> Gaussians:
+        """The scene; ValueError where a Gaussian is not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns = self.means, self.quats, np.exp(self.log_scales), self.opacities, self.srgb
+        count = len(self.means)
+        finite = np.all([np.isfinite(column.reshape(count, -1)).all(axis=1) for column in columns], axis=0)
+        if broken := count - np.count_nonzero(finite):
+            raise ValueError(f"{broken} of {count} Gaussians are not finite")
+        means, quats, scales, opacities, srgb = (torch.from_numpy(np.array(column, np.float32)) for column in columns)
+        return Gaussians(means, quats, scales, opacities, srgb_to_linear(srgb))
+
     @property
     def harmonics(self) -> Floats:
         """[N, 3] coefficients of the constant spherical harmonic, which gives the sRGB colour."""
@@ -90,6 +104,9 @@ class Columns:
         return Columns(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
 
 
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # of a quaternion, beside each component
+
+
 def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Which component [N] of unit quaternions [N, 4] is largest, and the others [N, 3], in their order.
 
@@ -98,14 +115,32 @@ def smallest_three(quats: Floats) -> tuple[NDArray[np.int64], Floats]:
     """
     largest = np.abs(quats).argmax(axis=1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, np.float32(-1), np.float32(1))
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    return largest, np.take_along_axis(quats * sign, others, axis=1)
+    return largest, np.take_along_axis(quats * sign, OTHERS[largest], axis=1)
+
+
+def from_smallest_three(largest: NDArray[Any], others: Floats) -> Floats:
+    """Unit quaternions [N, 4] of which `smallest_three` gives these."""
+    quats = np.empty((len(others), 4), np.float32)
+    np.put_along_axis(quats, OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    np.put_along_axis(quats, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    return quats
 
 
 def as_shares(components: Floats) -> Floats:
     """Components of `smallest_three` as shares 0..1 of their range."""
     shares: Floats = np.clip(components * np.float32(0.5**0.5) + np.float32(0.5), 0, 1)
     return shares
+
+
+def from_shares(shares: Floats) -> Floats:
+    """Components of which `as_shares` gives these."""
+    return (shares - np.float32(0.5)) * np.float32(2**0.5)
+
+
+def fractions(codes: NDArray[Any], largest: int) -> Floats:
+    """Whole numbers up to `largest` as parts of it."""
+    return codes.astype(np.float32) / np.float32(largest)
 
 
 SPLAT_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -124,6 +159,15 @@ def encode_splat(scene: SceneFile) -> bytes:
     return rows.tobytes()
 
 
+def decode_splat(data: bytes) -> Columns:
+    """Gaussians of a .splat file; ValueError where it ends within one."""
+    rows = np.frombuffer(data, SPLAT_ROW)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(np.clip(rows["scales"], SMALLEST_SCALE, LARGEST_SCALE))
+    rgba = fractions(rows["rgba"], 255)
+    return Columns(rows["means"], fractions(rows["quats"], 128) - 1, log_scales, rgba[:, 3], rgba[:, :3])
+
+
 Encoder = Callable[[SceneFile], bytes]
 # The module and the function that encodes a format, imported when a file is first written in it. A new format is one
 # file and one line here; the first end that fits a name counts.
@@ -137,14 +181,52 @@ SCENE_ENCODERS = {
 }
 
 
+# What reads a format, as in SCENE_ENCODERS; .ply and .compressed.ply are read by `PlyFile`.
+SCENE_DECODERS = {
+    ".spz": "spackle.formats.spz:decode_spz",
+    ".splat": "spackle.formats.scene_files:decode_splat",
+    ".sog": "spackle.formats.sog:decode_sog",
+}
+SCENE_SUFFIXES = (".ply", *SCENE_DECODERS)
+STARTS = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"PK": ".sog"}  # a .splat has no beginning of its own
+WRITTEN_ONLY = (".glb", ".html")
+
+
+def scene_kind(path: Path) -> str | None:
+    """The suffix of the format that a file begins as or, for other content, is named as; None for no scene."""
+    check_file(path, "scene")
+    with open(path, "rb") as file:
+        start = file.read(4)
+    begun = next((suffix for magic, suffix in STARTS.items() if start.startswith(magic)), None)
+    return begun or next((end for end in (*SCENE_SUFFIXES, *WRITTEN_ONLY) if path.name.lower().endswith(end)), None)
+
+
+def load_scene(path: Path) -> SceneFile:
+    """Read a scene in any format of SCENE_SUFFIXES; InputError for another file, and for a damaged one."""
+    kind = scene_kind(path)
+    if kind in WRITTEN_ONLY:
+        raise InputError(f"{path}: {kind} files are written, not read: give the scene.ply that it was made of")
+    if kind not in SCENE_DECODERS:
+        ply: SceneFile = import_module("spackle.formats.ply").PlyFile(path).scene()
+        return ply
+    with reading(path, f"cannot be read as {kind}: {{reason}}: the file is damaged, or of another program"):
+        columns = function_named(SCENE_DECODERS[kind])(path.read_bytes())
+        if not len(columns.means):
+            raise ValueError("it holds no Gaussians")
+        return SceneFile(path, columns.gaussians())
+
+
+def function_named(name: str) -> Any:
+    """The function that a table names, of a module that is imported now."""
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)
+
+
 def encoder_of(path: Path, more: Mapping[str, Encoder] | None = None) -> Encoder:
     """What encodes a file of this name, of SCENE_ENCODERS and `more`; InputError for a name of no format."""
     encoders: dict[str, str | Encoder] = {**SCENE_ENCODERS, **(more or {})}
     for suffix, encoder in encoders.items():
         if path.name.lower().endswith(suffix):
-            if not isinstance(encoder, str):
-                return encoder
-            module, _, function = encoder.partition(":")
-            found: Encoder = getattr(import_module(module), function)
+            found: Encoder = function_named(encoder) if isinstance(encoder, str) else encoder
             return found
     raise InputError(f"{path}: which format? Give a name that ends in {', '.join(encoders)}")

@@ -12,9 +12,20 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from spackle.errors import InputError
-from spackle.formats.scene_files import Columns, Floats, SceneFile, as_shares, smallest_three
+from spackle.formats.scene_files import (
+    SH_C0,
+    Columns,
+    Floats,
+    SceneFile,
+    as_shares,
+    fractions,
+    from_shares,
+    from_smallest_three,
+    smallest_three,
+)
 
 LARGEST_SIDE = 16_380  # of a WebP picture, in fours
+LARGEST_MEMBER = 1 << 28  # bytes of a picture's file that are read
 CODES = 256  # entries of a codebook
 BINS = 1 << 16  # values that building a codebook tells apart
 EVEN = 0.25  # of the codes lie at equal distances
@@ -109,3 +120,43 @@ def _webp(rgba: NDArray[np.uint8], width: int) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels.reshape(height, width, 4)).save(buffer, "WEBP", **EFFORT)
     return buffer.getvalue()
+
+
+def decode_sog(data: bytes) -> Columns:
+    """Gaussians of a bundled SOG file of version 2; any error for a damaged one, ValueError for another version."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+
+        def member(name: str) -> bytes:
+            if archive.getinfo(name).file_size > LARGEST_MEMBER:
+                raise ValueError(f"{name} is too large")
+            return archive.read(name)
+
+        meta = json.loads(member("meta.json"))
+        if meta["version"] != 2:
+            raise ValueError(f"version {meta['version']}, not 2")
+        count = int(meta["count"])
+
+        def pixels(name: str) -> NDArray[np.uint8]:
+            """[N, 4], without what fills up the last row."""
+            with Image.open(io.BytesIO(member(name)), formats=["WEBP"]) as image:
+                if max(image.size) > LARGEST_SIDE or not 0 < count <= image.width * image.height:
+                    raise ValueError(f"{name} has {image.width}×{image.height} pixels for {count:,} Gaussians")
+                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+
+        (lower, upper), (scales,), (quats,), (sh0,) = (
+            [pixels(name) for name in meta[key]["files"]] for key in ("means", "scales", "quats", "sh0")
+        )
+    low, high = (np.array(meta["means"][end], np.float32).reshape(3) for end in ("mins", "maxs"))
+    logs = low + (high - low) * fractions(upper[:, :3] * np.uint32(256) + lower[:, :3], 65535)
+    largest = quats[:, 3].astype(np.int64) - 252
+    if largest.min() < 0:
+        raise ValueError("a rotation has no largest component")
+    log_scales, harmonics = (
+        np.array(meta[key]["codebook"], np.float32).reshape(CODES)[codes[:, :3]]
+        for key, codes in (("scales", scales), ("sh0", sh0))
+    )
+    with np.errstate(over="ignore"):  # what is not finite is counted later
+        means = np.copysign(np.expm1(np.abs(logs)), logs)
+    turns = from_smallest_three(largest, from_shares(fractions(quats[:, :3], 255)))
+    srgb = np.clip(harmonics * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+    return Columns(means, turns, log_scales, fractions(sh0[:, 3], 255), srgb)

@@ -1,4 +1,4 @@
-"""SPZ 3, Niantic's compressed format: 20 bytes a Gaussian, deflated."""
+"""SPZ, Niantic's compressed format, deflated: version 3 out, 20 bytes a Gaussian, versions 2 and 3 in."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spackle.errors import InputError
-from spackle.formats.scene_files import SH_C0, Columns, Floats, SceneFile, smallest_three
+from spackle.formats.scene_files import (
+    SH_C0,
+    Columns,
+    Floats,
+    SceneFile,
+    fractions,
+    from_smallest_three,
+    smallest_three,
+)
 from spackle.gaussians import Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
@@ -23,6 +31,7 @@ FEWEST_BITS, MOST_BITS = 1, 23  # of them behind the point
 NEAR_STEPS = 2048  # a near Gaussian's distance is at least so many steps of the grid
 NEAR_SHARE = 0.01  # of all Gaussians lie nearer than what counts as near
 COLOR_SCALE = 0.15  # colours are stored with room below 0 and above 1
+HARMONICS = (0, 9, 24, 45)  # numbers of a Gaussian above degree 0, by the degree
 GZIP, WINDOW = 16, 15
 EFFORT = 5  # 6 takes twice the time for 1 % less
 MAX_COUNT = 10_000_000  # what the format's own library reads
@@ -148,3 +157,33 @@ def _deflated(data: bytes) -> bytes:
     """One gzip member, always the same bytes for the same data."""
     deflater = zlib.compressobj(EFFORT, zlib.DEFLATED, GZIP + WINDOW, 9)
     return deflater.compress(data) + deflater.flush()
+
+
+def decode_spz(data: bytes) -> Columns:
+    """Gaussians of an SPZ file, y down, z forward; harmonics above degree 0 are left out.
+
+    ValueError, or zlib's error, for another version and a damaged file; no more is inflated than the header announces.
+    """
+    inflater = zlib.decompressobj(GZIP + WINDOW)
+    head = inflater.decompress(data, HEADER.size)
+    magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
+    if magic != MAGIC or version not in (2, 3) or degree >= len(HARMONICS) or count > MAX_COUNT:
+        raise ValueError(f"version {version} with {count:,} Gaussians and harmonics of degree {degree}")
+    widths = (9, 1, 3, 3, 4 if version == 3 else 3)  # bytes of `_sections`
+    body = inflater.decompress(inflater.unconsumed_tail, max(1, count * sum(widths)))
+    if len(body) != count * sum(widths):
+        raise ValueError(f"it ends after {len(body):,} bytes of {count:,} Gaussians")
+    cut = np.split(np.frombuffer(body, np.uint8), np.cumsum(widths)[:-1] * count)
+    places, alphas, colors, scales, turns = (part.reshape(count, -1) for part in cut)
+    fixed = np.pad(places.reshape(-1, 3), ((0, 0), (1, 0))).view("<i4").reshape(count, 3) >> 8
+    srgb = (fractions(colors, 255) - np.float32(0.5)) * np.float32(SH_C0 / COLOR_SCALE) + np.float32(0.5)
+    if version == 3:
+        words = turns.copy().view("<u4")
+        fields = words >> np.array([20, 10, 0], np.uint32)
+        sizes = (fields & 511).astype(np.float32) / np.float32(511 * 2**0.5)
+        xyzw = from_smallest_three(words[:, 0] >> 30, np.where(fields & 512, -sizes, sizes))
+    else:  # w is the component that follows from the others
+        xyzw = from_smallest_three(np.full(count, 3), fractions(turns, 255) * 2 - 1)
+    means, log_scales = (fixed / 2.0**bits).astype(np.float32), fractions(scales, 16) - 10
+    opacities = fractions(alphas[:, 0], 255)
+    return Columns(means, xyzw[:, [3, 0, 1, 2]], log_scales, opacities, np.clip(srgb, 0, 1)).flipped()

@@ -22,6 +22,7 @@ from spackle.camera_path import MAX_DISPARITY, OVERSCAN, TRAJECTORIES, Trajector
 from spackle.errors import InputError
 from spackle.files import write_whole
 from spackle.formats import save_video
+from spackle.formats.scene_files import scene_kind
 from spackle.image import PHOTO_SUFFIXES, read_image
 from spackle.photo_results import REPORT, predict_photo
 from spackle.pipeline import Fill, FillOptions, Options, Pipeline
@@ -81,7 +82,7 @@ class SceneWork:
         ply, source, note = job.results / "scene.ply", job.folder / job.source, ""
         try:
             if file is None:
-                if is_scene(source):
+                if scene_kind(source):
                     Scene.load(source, focal_px=options.focal_px, fov=options.fov).save(ply)
                 else:
                     note = self._complete(job, options, teller)
@@ -154,12 +155,6 @@ class Teller(Reporter):
         self._tell({"stage": name, "done": 0, "total": 0})
         with super().stage(name):
             yield lambda done, total: self._tell({"stage": name, "done": done, "total": total})
-
-
-def is_scene(path: Path) -> bool:
-    """Whether a file claims to be a scene, by its name or its first bytes."""
-    with open(path, "rb") as file:
-        return path.suffix.lower() == ".ply" or file.read(3) == b"ply"
 
 
 def check_photo(path: Path, name: str, preview: Path) -> None:
