@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import socket
 import struct
 import subprocess
@@ -300,6 +301,23 @@ def test_photos_wait_and_go_on_after_a_restart(tmp_path: Path) -> None:
             server.jobs.keep = Keep(seconds=0)
             server.jobs.tidy()
             assert {path.name for path in tmp_path.iterdir()} == {".lock"}
+
+
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_jobs_leave_no_thread_no_file_and_no_memory_behind(server: Served, count: int) -> None:
+    def done(photos: int) -> list[int]:
+        for k in range(photos):
+            id = server.send(name="bad.png" if k % 3 == 0 else "photo.png").json["id"]
+            assert server.events(id)[-1]["ended"]
+            assert server.ask(f"{SCENES}/{id}", "DELETE").status == 204
+        eventually(lambda: len(os.listdir("/proc/self/fd")) <= files)
+        return [len(os.listdir("/proc/self/task")), int(Path("/proc/self/statm").read_text().split()[1]) >> 8]
+
+    files = 1000
+    threads, megabytes = done(6)
+    files = len(os.listdir("/proc/self/fd"))
+    more, now = done(count)
+    assert (more <= threads, now < megabytes + 20) == (True, True), (threads, more, megabytes, now)
 
 
 def test_a_photo_at_work_can_be_removed(server: Served) -> None:

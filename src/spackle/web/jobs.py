@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import write_json
 from spackle.folders import results_folder
-from spackle.task_process import Event, TaskProcess, Work
+from spackle.task_process import DIED, Event, TaskProcess, Work
 
 LOG = logging.getLogger("spackle.web")
 RECORD, NEW = "job.json", ".new-"  # a job's own file; how folders of uploads begin that are not whole yet
@@ -194,6 +194,8 @@ class Jobs:
             error = process.do((job, None), lambda event: self._tell(id, event))
         except (OSError, InputError) as problem:
             error = f"{job.name}: cannot be kept here: {reason_in_a_line(problem)}"
+        if error == DIED:
+            self._closed.wait(1)  # who ends all processes of a service may have met this one before us
         self._running.pop(id, None)
         if not self._closed.is_set():
             self._pace = time.monotonic() - start
