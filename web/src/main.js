@@ -1,6 +1,6 @@
 // Starts the page: finds a scene, shows it, and takes further photos where there is a server.
 import { control } from "./controls.js";
-import { divider, fit, panel } from "./panel.js";
+import { divider, fit, panel, roomy, unfold } from "./panel.js";
 import * as source from "./source.js";
 import { KINDS, Viewer } from "./viewer.js";
 import { eyeOnPath, lookingAxes } from "./views.js";
@@ -9,6 +9,7 @@ const STAGES = {
   load: "Loading", prepare: "Reading the depth map", base: "Finding depth", complete: "Filling what the photo hides",
   write: "Almost there", measure: "Almost there", page: "Almost there",
 };
+const BASES = { auto: "the best that is here", sharp: "SHARP", moge: "MoGe-2", depth: "Depth Anything", lite: "lite: quick, and rough" };
 const element = (id) => document.getElementById(id);
 const viewer = started();
 let upload = null; // what the server takes, where there is one
@@ -25,7 +26,6 @@ if (viewer) {
 }
 
 function started() {
-  element("bar").classList.add("idle");
   const canvas = element("view");
   try {
     canvas.addEventListener("webglcontextlost", () => notice("The graphics stopped", "Reload the page to go on."));
@@ -43,11 +43,12 @@ async function first() {
   ({ upload } = await source.current());
   element("open").hidden = !upload;
   if (upload) element("file").accept = upload.suffixes.join(",");
-  element("choices").querySelector("select").replaceChildren(...(upload?.bases ?? []).map((name) => new Option(name)));
+  const bases = (upload?.bases ?? []).map((name) => new Option(BASES[name] ?? name, name));
+  element("choices").querySelector("[name=base]").replaceChildren(...bases);
   addEventListener("hashchange", () => chosen() && chosen() !== viewer.id && watch(chosen()));
   if (chosen()) return watch(chosen());
   for (const button of document.querySelectorAll("[data-example]")) button.firstChild.src = source.here(`/${button.dataset.example}`);
-  notice("Step into your photo", upload ? "Drop a photo here, or choose one, and look around in it." : "The address names no scene.");
+  notice("Step into your photo", upload ? `${matchMedia("(hover: hover)").matches ? "Drop a photo here, or choose one" : "Choose a photo"}, and look behind what stands in front.` : "The address names no scene.");
   element("notice").classList.add("empty");
 }
 
@@ -62,8 +63,9 @@ async function show({ description, layers }, id = null) {
   document.title = `${description.name} · Spackle`;
   element("frame").hidden = false;
   element("frame").classList.add("waiting");
-  element("bar").classList.remove("idle");
+  document.body.classList.remove("idle");
   fit(viewer);
+  if (roomy()) unfold(true);
   await viewer.stage.settled();
   element("frame").classList.remove("waiting");
   element("notice").hidden = true;
@@ -80,7 +82,7 @@ async function watch(id) {
   if (!stand.url) stand(source.file(id, "photo.jpg"));
   progress(null, null);
   try {
-    await source.follow(id, ({ stage, share, line }) => progress(stage, share, line));
+    await source.follow(id, ({ stage, share }) => progress(stage, share));
     await show(await source.load(id, (share) => progress("load", share)), id);
   } catch (error) {
     failed(error);
@@ -133,6 +135,7 @@ function uploads() {
     if (!dialog.open) take();
   };
   start.onclick = take;
+  dialog.querySelector("[name=depth]").onchange = ({ target }) => (element("kind").hidden = !target.files[0]);
   const holdsFile = (event) => upload && !working && event.dataTransfer?.types.includes("Files");
   addEventListener("dragover", (event) => {
     event.preventDefault();
@@ -161,11 +164,13 @@ async function example(name) {
   open(new File([photo], name, { type: photo.type }));
 }
 
-/** What the dialog says: {base, disparity, depth}. */
+/** What the dialog says: {base, disparity, depth, depth_kind}. */
 function choices() {
-  const form = new FormData(element("choices").querySelector("form"));
-  element("choices").querySelector("[name=depth]").value = ""; // it is of one photo
-  return Object.fromEntries(form);
+  const form = element("choices").querySelector("form");
+  const said = Object.fromEntries(new FormData(form));
+  form.elements.depth.value = ""; // it is of one photo
+  element("kind").hidden = true;
+  return said;
 }
 
 function notice(title, text, busy = false) {
@@ -180,10 +185,9 @@ function notice(title, text, busy = false) {
 }
 
 /** `share` in 0..1, or null where nobody knows. */
-function progress(stage, share, line = "") {
-  const box = element("notice");
-  notice(STAGES[stage] ?? stage ?? "Working on your photo", line ?? "", true);
-  const bar = box.querySelector("progress");
+function progress(stage, share) {
+  notice(STAGES[stage] ?? stage ?? "Working on your photo", "", true);
+  const bar = element("notice").querySelector("progress");
   if (share === null) bar.removeAttribute("value");
   else bar.value = share;
 }

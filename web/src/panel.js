@@ -1,7 +1,7 @@
 // The bar below the picture, what stands beside it, and the size of the picture.
 import { recorder, saveFile, savePicture } from "./save.js";
 
-const MOST_CROP = 0.62; // of the photo's width, or height, that a window of another shape still shows
+const ROOM = 230; // pixels beside the picture in which the controls may stay unfolded
 const element = (id) => document.getElementById(id);
 
 export function panel(viewer, say) {
@@ -42,10 +42,7 @@ export function panel(viewer, say) {
     press("record", false);
     say("");
   };
-  element("more").onclick = () => {
-    const open = element("bar").classList.toggle("open");
-    element("more").setAttribute("aria-expanded", open);
-  };
+  element("more").onclick = () => unfold(!element("bar").classList.contains("open"));
 
   /** Save what the server makes of the scene. */
   async function made(name, line) {
@@ -95,17 +92,26 @@ export function panel(viewer, say) {
   }
 }
 
-/** The picture, or the `photo` in its place, as large as there is room; a narrow window crops it a little, so that it is not a strip. */
+/** Show all controls where a small screen hides them, or hide them again. */
+export function unfold(open) {
+  element("bar").classList.toggle("open", open);
+  element("more").setAttribute("aria-expanded", open);
+}
+
+/** Whether the picture leaves the controls all the room that they need. */
+export function roomy() {
+  return element("area").clientHeight - element("frame").clientHeight > ROOM;
+}
+
+/** The picture, or the `photo` in its place, as large as there is room for all of it. */
 export function fit(viewer, photo = null) {
   const { width: W, height: H } = photo ?? viewer.description?.camera ?? {};
   if (!W) return;
   const { clientWidth: width, clientHeight: height } = element("area");
-  const shape = Math.min(Math.max(width / height, Math.min(W / H, Math.max((MOST_CROP * W) / H, 0.5))), W / H);
-  const frame = element("frame");
-  const w = Math.min(width, height * shape);
-  frame.style.width = `${Math.floor(w)}px`;
-  frame.style.height = `${Math.floor(w / shape)}px`;
-  viewer.resize(Math.floor(w), Math.floor(w / shape));
+  const scale = Math.min(width / W, height / H);
+  const [w, h] = [W, H].map((side) => Math.max(1, Math.floor(side * scale)));
+  Object.assign(element("frame").style, { width: `${w}px`, height: `${h}px` });
+  viewer.resize(w, h);
 }
 
 /** The line between the photo alone and the completed scene. */

@@ -118,30 +118,25 @@ export class Stage {
     this.renderer.setSize(width, height, false);
   }
 
-  /** The photo's lens on a canvas of this shape: the photo covers it, centred; then zoomed and shifted. */
-  lens(width, height) {
+  /** The photo's lens on a canvas of its shape, zoomed and shifted. */
+  lens() {
     const { K, width: W, height: H } = this.description.camera;
-    const cover = Math.max(width / W, height / H);
-    const sides = [(W * cover) / width, (H * cover) / height]; // the photo's sides in canvas sides, ≥ 1
     const { scale, x, y } = this.zoom;
-    const [sx, sy] = sides.map((side) => side * scale);
     const [cx, cy] = [(2 * K[0][2]) / W - 1, (2 * K[1][2]) / H - 1];
-    const [px, py] = [sx * cx + x, -sy * cy + y];
+    const [px, py] = [scale * cx + x, -scale * cy + y];
     // Depth is always 0: there is no depth buffer, and so neither a near hand nor a far sky is cut off.
     this.camera.projectionMatrix.set(
-      (2 * K[0][0] * sx) / W, 0, -px, 0,
-      0, (2 * K[1][1] * sy) / H, -py, 0,
+      (2 * K[0][0] * scale) / W, 0, -px, 0,
+      0, (2 * K[1][1] * scale) / H, -py, 0,
       0, 0, 0, 0,
       0, 0, -1, 0,
     );
-    return { sides, scale };
   }
 
   /** Keep the zoomed picture from leaving its frame. */
-  clampZoom(width, height) {
-    const { sides, scale } = this.lens(width, height);
-    this.zoom.x = clamp(this.zoom.x, sides[0] * scale - 1);
-    this.zoom.y = clamp(this.zoom.y, sides[1] * scale - 1);
+  clampZoom() {
+    const { scale, x, y } = this.zoom;
+    Object.assign(this.zoom, { x: clamp(x, scale - 1), y: clamp(y, scale - 1) });
   }
 
   pose() {
@@ -164,7 +159,7 @@ export class Stage {
   }
 
   drawTo(target, width, height) {
-    this.lens(width, height);
+    this.lens();
     this.pose();
     const [whole, bare] = this.targets;
     const split = this.split ?? 0;

@@ -161,7 +161,7 @@ export class Viewer extends EventTarget {
     const { zoom } = this.stage;
     zoom.x += x;
     zoom.y += y;
-    this.stage.clampZoom(this.canvas.width, this.canvas.height);
+    this.stage.clampZoom();
     this.changed();
   }
 
@@ -193,7 +193,6 @@ export class Viewer extends EventTarget {
     const [w, h] = [width, height].map((side) => Math.max(1, Math.round(side * ratio)));
     if (this.canvas.width !== w || this.canvas.height !== h) {
       this.stage.resize(w, h);
-      if (this.description) this.stage.clampZoom(w, h);
     }
     // At once, for a canvas that was resized is empty.
     if (this.description) this.stage.draw();
