@@ -44,6 +44,7 @@ from spackle.residual import hole_area_ratio
 from spackle.residual.architectures import UNet, shipped_network
 from spackle.scene_fill import FillContext, fill_view
 from spackle.training.losses import total_loss
+from spackle.training.recipe import LossRecipe
 from spackle.training.residual import complete_samples
 from spackle.training.samples import Sample
 
@@ -252,7 +253,7 @@ def training(options: argparse.Namespace) -> Iterator[str]:
         def step() -> None:
             done = complete_samples(network, crops, drawer)
             tensors = {name: tensor.to(device, non_blocking=True) for name, tensor in vars(done).items()}
-            total_loss(**tensors)[0].backward()  # type: ignore[no-untyped-call]
+            total_loss(**tensors, recipe=LossRecipe())[0].backward()  # type: ignore[no-untyped-call]
 
         return step
 

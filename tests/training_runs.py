@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -63,13 +62,6 @@ from spackle.training import train
 rate = train.learning_rate
 train.learning_rate = lambda step, optim: os.kill(os.getpid(), 9) if step == {number} else rate(step, optim)
 """
-
-
-def run_killed(arguments: Sequence[str], step: int) -> None:
-    """Run a command that is killed in a step, see `killed_at`."""
-    process = started(arguments, killed_at(step))
-    said = process.communicate()[1]
-    assert process.returncode == -signal.SIGKILL, said
 
 
 def run_two(arguments: Sequence[str], code: str = "") -> None:

@@ -310,7 +310,9 @@ def test_a_models_folder_counts_by_its_files(tmp_path: Path) -> None:
 def test_weights_are_apples_by_name_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / SHARP_FILE
     file.write_bytes(b"weights")
-    unknown = f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {SHARP_FILE}"
+    unknown = (
+        f"SHARP's architecture, from the photo alone, with the weights of {SHARP_FILE}, which Apple did not publish"
+    )
     assert BaseSettings("sharp", checkpoint=file).description == unknown
     publish(monkeypatch, "sharp", b"weights")
     assert BaseSettings("sharp", checkpoint=file).description == KINDS["sharp"][0]

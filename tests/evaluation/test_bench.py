@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import evaluation_data
+import numpy as np
 import pytest
-import torch
 from command import names_in, refuses, run
-from evaluation_data import write_boxes
 from scenes import box_before_wall
 from sharp_weights import gaussians_of, write_tiny
 
@@ -20,17 +19,16 @@ from spackle.bases.sharp.encoder import TINY
 from spackle.errors import InputError
 from spackle.evaluation import bench
 from spackle.evaluation.case import Points
+from spackle.evaluation.evaluate import EvaluateOptions, open_evaluation
 from spackle.evaluation.folder import load_run
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import PAPER, STAGES, Row
 from spackle.evaluation.rows import Run as Results
-from spackle.evaluation.setup import EvaluateOptions, open_evaluation
 from spackle.evaluation.tables import make_tables
 from spackle.render import get_renderer
 from spackle.residual.architectures import UNet, open_residual
 from spackle.scene_fill import FillContext, fill_view
 
-CPU = torch.device("cpu")
 EXPANDED = "tab:expanded_efficiency_gaussian_overhead"
 PAPER_LABELS = {table["label"] for table in PAPER["tables"]}  # all six
 STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rerender": 9.0}
@@ -38,7 +36,7 @@ STAGE_MS = {"base": 1000.0, "view": 400.0, "photo": 1.0, "completion": 4.0, "rer
 
 def cost(added: int = 20, factor: float = 1.0) -> dict[str, float]:
     """The figures of a view whose base path takes 1,400 ms and Spackle's part 14."""
-    runs = {name: [factor * ms / 1000 * late for late in (0.5, 1, 30)] for name, ms in STAGE_MS.items()}
+    runs = {name: np.array([0.5, 1, 30]) * factor * ms / 1000 for name, ms in STAGE_MS.items()}
     return {name: value for name, value in bench.view_figures(1000, added, runs) if not name.endswith("_run_ms")}
 
 
@@ -118,26 +116,16 @@ def test_costs_are_joined_over_datasets_and_with_large_views() -> None:
 
 def test_a_view_costs_what_a_completion_adds() -> None:
     prediction, renderer = box_before_wall().lift(), get_renderer()
-    context = FillContext(prediction.gaussians, prediction.camera, renderer)
-    view = large_views(prediction, (0.3,), 1280)[0]
-    found = bench.time_view([0.25, 0.5, 4.0], context, view, 3, CPU)
-    paper, spackle = (dict(found[name])["aux"] for name in bench.TIMED)
-    assert spackle == len(fill_view(context, view.camera).aux) > paper > 64
-    for stage in STAGES:
-        assert sum(name == f"{stage}_run_ms" and value > 0 for name, value in found["spackle"]) == 3
+    context, laps = FillContext(prediction.gaussians, prediction.camera, renderer), list[str]()
+    camera = large_views(prediction, (0.3,), 1280)[0].camera
+    paper, spackle = (len(bench.complete_in_laps(context, camera, laps.append, name)) for name in bench.TIMED)
+    assert spackle == len(fill_view(context, camera).aux) > paper > 64
+    assert {*laps} == {*STAGES} - {"base"}
+    laps.clear()
     opaque = dataclasses.replace(prediction.gaussians, scales=3 * prediction.gaussians.scales)
     closed = FillContext(opaque, prediction.camera, renderer)
-    whole = dict(bench.time_view([1.0], closed, view._replace(camera=prediction.camera), 1, CPU)["spackle"])
-    assert (whole["aux"], whole["rerender_run_ms"]) == (0, 0.0)  # a view without holes: no second render
-
-
-@pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two small scenes in Middlebury's folders."""
-    root = tmp_path_factory.mktemp("middlebury")
-    for seed, name in enumerate(("Ball", "Chair")):
-        write_boxes(root / name, seed)
-    return root
+    assert not len(bench.complete_in_laps(closed, prediction.camera, laps.append))
+    assert "rerender" not in laps  # a view without holes
 
 
 def test_points_suffice_and_the_first_prediction_does_not_count(scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,11 +155,11 @@ def test_from_files_to_tables(scenes: Path, tmp_path: Path) -> None:
     assert names_in(output) == {"rows.jsonl", "bench.md", "bench.tex", "config.json", "images"}
     found = load_run(output)
     assert found.about["parameters"]["residual"] == 8_023_153
-    assert (found.settings, found.measured) == (["0.3", "0.5"], ["Ball", "Chair"])
+    assert (found.settings, found.measured) == (["0.3", "0.5"], ["Ball", "Chair", "Door"])
     assert set(found.numbers("warm")) == {1}
     for setting in found.settings:
         for method in bench.TIMED:  # both ends of the swipe, as `evaluate` looks from
-            assert {len(found.numbers(f"{stage}_run_ms", setting, method)) for stage in STAGES} == {2 * 2 * 2}
+            assert {len(found.numbers(f"{stage}_run_ms", setting, method)) for stage in STAGES} == {3 * 2 * 2}
             bases = [base for base in found.numbers("base_gaussians") for _ in range(2)]
             added = zip(bases, found.numbers("aux", setting, method), strict=True)
             assert found.numbers("merged", setting, method) == [base + aux for base, aux in added]

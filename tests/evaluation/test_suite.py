@@ -10,18 +10,13 @@ import suite
 import torch
 from command import names_in
 from naive_renderer import naive_render
-from scenes import box_before_wall, same_bits
+from scenes import box_before_wall
 from sharp_weights import MICRO, gaussians_of, micro_network
-from suite_scenes import find_view, holed_scene, photo_scene
+from suite_scenes import photo_scene
 
 from spackle.bases.sharp import SharpBase
-from spackle.errors import InputError
-from spackle.evaluation.bench import complete_in_laps
 from spackle.image import Photo
 from spackle.render import CpuRenderer
-from spackle.residual import hole_area_ratio
-from spackle.residual.architectures import UNet
-from spackle.scene_fill import FillContext, fill_view
 
 SIDE = 64
 PEAKS = {suite.PRODUCT.format("fp32"): 1e6, suite.PRODUCT.format("bf16"): 4e6, suite.COPY: 2e6}
@@ -44,25 +39,6 @@ def test_the_renderers_section_and_the_naive_renderers_picture() -> None:
     assert whole.limit_ms == pytest.approx((count * 56 + SIDE * SIDE * 20) / 2e6)
 
 
-def test_a_view_is_found_by_its_share_of_holes_and_completed() -> None:
-    torch.manual_seed(0)
-    network = UNet().eval().requires_grad_(False)
-    base, camera = holed_scene(96)
-    assert hole_area_ratio(CpuRenderer().render(base, camera).alpha) == 0
-    disparity, view = find_view(base, camera, CpuRenderer())
-    assert 0 < disparity < 0.5
-    assert hole_area_ratio(CpuRenderer().render(base, view).alpha) == pytest.approx(0.05, rel=0.05)
-    with pytest.raises(InputError, match="no view"):
-        find_view(base, camera, CpuRenderer(), 0.999)
-    rows, facts = suite.completion_section(2, base, camera, CpuRenderer(), network)
-    assert all(len(row.values) == 2 and min(row.values) > 0 for row in rows)
-    assert (facts["disparity"], facts["holes"]) == (disparity, pytest.approx(0.05, rel=0.05))
-    context = FillContext(base, camera, CpuRenderer(), network)
-    whole = fill_view(context, view).aux
-    assert same_bits(complete_in_laps(context, view, lambda name: None), whole)
-    assert facts["added"] == len(whole) > 0
-
-
 def test_a_video_frame_by_frame_and_sharp_in_its_stages() -> None:
     section = suite.video_section(1, box_before_wall(width=64, height=48).lift, CpuRenderer(), None, frames=4)
     found = rows_of(section)
@@ -79,10 +55,12 @@ def test_a_video_frame_by_frame_and_sharp_in_its_stages() -> None:
 
 def test_sections_are_gathered_and_what_cannot_run_is_named(tmp_path: Path) -> None:
     words = ["-o", str(tmp_path / "out"), "--side", str(SIDE), "--runs", "1"]
-    suite.main([*words, "--only", "renderer,sharp"])
+    suite.main([*words, "--only", "renderer,completion,sharp"])
     assert names_in(tmp_path / "out") == {"suite.json", "suite.md"}
     found = json.loads((tmp_path / "out" / "suite.json").read_text())["sections"]
-    assert set(found) == {"limits", "renderer", "sharp"}
+    assert set(found) == {"limits", "renderer", "completion", "sharp"}
+    completion = found["completion"]["facts"]
+    assert (completion["holes"], completion["added"] > 0) == (pytest.approx(0.05, rel=0.05), True)
     assert "no weights" in found["sharp"]["facts"]["not run"]
     with pytest.raises(SystemExit):
         suite.main([*words, "--only", "rendrer"])

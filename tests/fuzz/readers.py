@@ -158,7 +158,7 @@ def _tree(name: str, *makers: Maker) -> Reader:
 
 def _text_model(folder: Path) -> None:
     """COLMAP's text files, as ETH3D has them."""
-    scene = eth3d(folder / "Truck", EYES[:2])
+    scene = eth3d(folder / "Truck")
     (scene / "dslr_calibration_undistorted").rename(scene / "sparse")
 
 
@@ -275,7 +275,7 @@ READERS: dict[str, Reader] = {
     ),
     "middlebury": _tree("middlebury", lambda folder: middlebury_2014(folder / "a")),
     "booster": _tree("booster", lambda folder: booster(folder / "a")),
-    "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a", EYES[:2])),
+    "wildrgbd": _tree("wildrgbd", lambda folder: wildrgbd(folder / "scenes" / "a")),
     "llff": _tree("llff", lambda folder: llff(folder / "fern", EYES[:2])),
     "colmap": _tree("tanks", lambda folder: tanks(folder / "Truck"), _text_model),
 }

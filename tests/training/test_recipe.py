@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from spackle.errors import InputError
-from spackle.training.losses import PAPER_WEIGHTS
 from spackle.training.recipe import OptimRecipe, Recipe, RgbdFolder, differences, load_recipe
 from spackle.training.train import ema_decay, learning_rate, samples_of_step
 from spackle.weights import published_weights
@@ -21,7 +20,7 @@ PLAIN = "loss: {features: none}"
 @pytest.mark.parametrize("name", ["cpu", "direct_ft", "paper", "reverse_view"])
 def test_packaged_recipes_have_the_papers_weights_but_cpu(name: str) -> None:
     recipe = load_recipe(Recipe, name, ["loss.features_path=weights"])
-    papers = {**PAPER_WEIGHTS, "color_blur": 0, "gram": 1}
+    papers = {"color": 10, "alpha": 0.5, "perceptual": 1, "preserve": 5, "color_blur": 0, "gram": 1}
     assert (vars(recipe.loss).items() >= papers.items()) == (name != "cpu")
     assert recipe.data.photos is not None or recipe.data.pseudo is not None
     assert recipe.loss.dilation == 21

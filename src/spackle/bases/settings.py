@@ -104,7 +104,9 @@ class BaseSettings:
         file = self.files.get("sharp")
         if file is None or published_as(file) is PUBLISHED["sharp"]:
             return KINDS[self.named.partition(":")[0]][0]
-        return f"a network of SHARP's shape, from the photo alone, by weights of unknown origin: {file.name}"
+        return (
+            f"SHARP's architecture, from the photo alone, with the weights of {file.name}, which Apple did not publish"
+        )
 
     @property
     def files(self) -> dict[str, Path]:

@@ -96,8 +96,8 @@ def evaluate(
 ) -> None:
     """Measure on a dataset, in the paper's protocols: rows.jsonl, tables.md, tables.tex, worst.png, best.png."""
     from spackle.bases.settings import BaseSettings
+    from spackle.evaluation.evaluate import EvaluateOptions, parse_disparities, split_words
     from spackle.evaluation.evaluate import evaluate as run
-    from spackle.evaluation.setup import EvaluateOptions, parse_disparities, split_words
     from spackle.progress import Reporter
 
     source, numbers = _sorted_words(context, folder, disparity)
@@ -150,7 +150,7 @@ def figures(
     rows: Annotated[int, typer.Option(min=1, max=100, help="Images in a figure, and at least one of each folder.")] = 6,
 ) -> None:
     """Draw the paper's figures of views: PDF, PNG, and captions in figures.tex."""
-    from spackle.evaluation.figures import make_figures
+    from spackle.evaluation.pictures import make_figures
     from spackle.progress import Reporter
 
     make_figures(results, rows, output, Reporter())
@@ -182,7 +182,7 @@ def bench(
     from spackle.bases.settings import BaseSettings
     from spackle.evaluation.bench import TIMED
     from spackle.evaluation.bench import bench as run
-    from spackle.evaluation.setup import EvaluateOptions, parse_disparities
+    from spackle.evaluation.evaluate import EvaluateOptions, parse_disparities
     from spackle.progress import Reporter
 
     source, numbers = _sorted_words(context, folder, disparity)

@@ -21,11 +21,11 @@ from spackle.bases.sharp.encoder import FULL
 from spackle.bases.sharp.network import SharpNetwork
 from spackle.camera import Camera
 from spackle.evaluation.case import Case, Viewpoint, load_case
+from spackle.evaluation.evaluate import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.folder import ROWS, measure_images, write_rows
 from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.protocols import large_views
 from spackle.evaluation.rows import BASE_PATH, EXTRA, NOTE, STAGES, Row
-from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
 from spackle.evaluation.tables import make_tables, write_tables
 from spackle.folders import results_folder
 from spackle.gaussians import Gaussians
@@ -105,46 +105,36 @@ def time_case(case: Case, evaluation: Evaluation, config: Mapping[str, Any], war
     latest: dict[str, BasePrediction] = {}
     # Compiling kernels is a small part of SHARP's first prediction on a processor, which takes a minute.
     counts = warm or (options.base.named == "sharp" and config["base"]["device"] == "cpu")
-    times = measure(
-        config["base_runs"], {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}, device, warm=counts
-    )
-    seconds, prediction = (times["", TOTAL] / MS).tolist(), latest["base"]
+    predict = {"": lambda _: latest.update(base=opened.predict(loaded.full)[0])}
+    seconds = measure(config["base_runs"], predict, device, warm=counts)["", TOTAL] / MS
+    prediction, none = latest["base"], np.zeros(config["runs"])
     context = evaluation.context(prediction)
     facts: dict[str, Any] = {"width": loaded.photo.width, "height": loaded.photo.height, "load": load}
     facts |= {"warm": int(warm or not counts), "base_gaussians": len(prediction.gaussians)}
     facts |= {f"{NOTE}{name}": value for name, value in prediction.notes.items()}
     rows = [Row(config["title"], case.name, "", "", "", metric, value) for metric, value in facts.items()]
+    added: dict[str, int] = {}
+
+    def complete(view: Viewpoint, method: str, lap: Lap) -> None:
+        added[method] = len(complete_in_laps(context, view.camera, lap, method))
+
     for view in large_views(prediction, options.disparities, options.max_side):
-        for method, figures in time_view(seconds, context, view, config["runs"], device).items():
+        times = measure(config["runs"], {method: partial(complete, view, method) for method in TIMED}, device)
+        for method, count in added.items():
+            # A method may lack a stage, and a view without holes is not rendered again.
+            stages = {name: times.get((method, name), none) / MS for name in STAGES} | {"base": seconds}
             row = Row(config["title"], case.name, view.setting, view.name, method, "", None)
+            figures = view_figures(len(context.base), count, stages)
             rows += [row._replace(metric=metric, value=value) for metric, value in figures]
     return rows
 
 
-def time_view(
-    base_s: Sequence[float], context: FillContext, view: Viewpoint, runs: int, device: torch.device
-) -> dict[str, list[tuple[str, float]]]:
-    """A view's figures by each method of `TIMED`, on `device`; the base took `base_s` seconds."""
-    added: dict[str, int] = {}
-
-    def complete(method: str, lap: Lap) -> None:
-        added[method] = len(complete_in_laps(context, view.camera, lap, method))
-
-    times = measure(runs, {method: partial(complete, method) for method in TIMED}, device)
-    none = np.zeros(runs)  # of a stage that a method has not, or a view without holes, which is not rendered again
-    figures = {}
-    for method, count in added.items():
-        stages = {name: (times.get((method, name), none) / MS).tolist() for name in STAGES if name != "base"}
-        figures[method] = view_figures(len(context.base), count, {"base": base_s, **stages})
-    return figures
-
-
-def view_figures(base: int, added: int, seconds: Mapping[str, Sequence[float]]) -> list[tuple[str, float]]:
+def view_figures(base: int, added: int, seconds: Mapping[str, Values]) -> list[tuple[str, float]]:
     """Every figure of the tables that comes of a view's Gaussians and of the seconds of each run of `STAGES`.
 
     Counts, milliseconds (medians of runs), shares (not percent), views a second; and each run's milliseconds.
     """
-    stages = {name: MS * statistics.median(seconds[name]) for name in STAGES}
+    stages = {name: MS * float(np.median(seconds[name])) for name in STAGES}
     before, extra = (sum(stages[name] for name in names) for names in (BASE_PATH, EXTRA))
     figures = {
         "aux": added,
@@ -159,7 +149,7 @@ def view_figures(base: int, added: int, seconds: Mapping[str, Sequence[float]]) 
         "spackle_fps": MS / (before + extra),
         **{f"{name}_stage_ms": ms for name, ms in stages.items()},
     }
-    each = [(f"{name}_run_ms", MS * value) for name, values in seconds.items() for value in values]
+    each = [(f"{name}_run_ms", MS * value) for name, values in seconds.items() for value in values.tolist()]
     return [*figures.items(), *each]
 
 
@@ -234,7 +224,7 @@ def complete_in_laps(context: FillContext, camera: Camera, lap: Lap, method: str
     before = context.renderer.render(context.base, camera)
     lap("view")
     renderer = _LappedRenderer(context.renderer, lambda stage: lap(stage if prepared else "photo"))
-    fill = make_method(method, dataclasses.replace(context, renderer=renderer))([camera])
+    fill = make_method(method, [camera], dataclasses.replace(context, renderer=renderer))
     lap("photo")
     prepared = True
     aux = fill(camera, before).aux

@@ -4,31 +4,246 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+import spackle
 from spackle.bases import BasePrediction
-from spackle.errors import InputError
-from spackle.evaluation.case import Case, LoadedCase, load_case
+from spackle.bases.lift import RgbdBase
+from spackle.bases.open import OpenedBase, open_base, open_loaded
+from spackle.bases.settings import NETWORKS, BaseSettings
+from spackle.camera_path import MAX_DISPARITY
+from spackle.device import pick_device, pick_dtype
+from spackle.errors import InputError, check_name
+from spackle.evaluation.case import Case, LoadedCase, known_depth, load_case
+from spackle.evaluation.datasets import DATASETS, read_cases
 from spackle.evaluation.folder import ROWS, from_root, image_file, load_run, measure_images, write_rows
-from spackle.evaluation.methods import make_method
-from spackle.evaluation.metrics import NOTICE
+from spackle.evaluation.methods import METHODS, make_method
+from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, NOTICE, OWN, open_metrics
 from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
-from spackle.evaluation.plots import check_matplotlib
-from spackle.evaluation.protocols import INPUT, Alignment, align, large_views, measure_views, to_base
-from spackle.evaluation.report import REPORT, make_report
-from spackle.evaluation.rows import NOTE, REMARK, Row
-from spackle.evaluation.setup import EvaluateOptions, Evaluation, open_evaluation
+from spackle.evaluation.protocols import INPUT, Alignment, Gauges, align, large_views, measure_views, to_base
+from spackle.evaluation.report import REPORT, check_matplotlib, make_report
+from spackle.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
 from spackle.evaluation.table import NOT_RUN
 from spackle.evaluation.tables import FILES, make_tables, write_tables
 from spackle.files import write_whole
-from spackle.folders import results_folder
+from spackle.folders import digest_of, results_folder
 from spackle.gaussians import Gaussians
+from spackle.image import MAX_SIDE
+from spackle.inpaint import INPAINTERS, Inpainter, InpainterOptions, get_inpainter
 from spackle.machine import hardware, versions
+from spackle.pipeline import FillOptions
 from spackle.progress import Reporter, counted
-from spackle.residual import hole_mask
+from spackle.render import Renderer, device_of, get_renderer
+from spackle.residual import ResidualNet, hole_mask
+from spackle.scene_fill import FillContext
+from spackle.training.losses import load_features
+from spackle.weights import weights_digest, weights_digests
+
+BASE = BaseSettings("sharp")
+LARGE_SIDE = 1280  # of the paper's large views: its added Gaussians are (1280 / 1536)² of HAR × grid at 1536
+MAX_DISPARITIES = 6  # columns of a table
+SECOND_VIEWS = ("all", "nearest")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateOptions:
+    """The choices of `spackle evaluate`."""
+
+    dataset: str
+    root: Path
+    protocol: str = "large-view"
+    methods: Sequence[str] = ("base", "paper", "spackle")
+    disparities: Sequence[float] = DISPARITIES  # of the large views
+    metrics: Sequence[str] | None = None  # the protocol's where None
+    base: BaseSettings = BASE  # the paper's; its precision and device are the residual's, too
+    residual: str | None = None  # a file, "seeds", or None for the shipped weights if any
+    direct_ft: Path | None = None  # weights of the method direct-ft
+    inpainter: str = "opencv"  # of the method inpaint2d
+    features: Path | None = None  # SqueezeNet's weights, for the metric distance
+    second_views: str = "all"  # of `SECOND_VIEWS`, that a photo is compared with in near-view
+    side: int | None = None  # long side of the views; the paper's where None: 1280 for large views, 1536 for near ones
+    limit: int | None = None  # so many images, spread over the dataset
+    download: bool = False  # pyiqa may fetch weights
+
+    @property
+    def near(self) -> bool:
+        return self.protocol == "near-view"
+
+    @property
+    def max_side(self) -> int:
+        """Long side of the views, in pixels."""
+        return self.side or (MAX_SIDE if self.near else LARGE_SIDE)
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """The metrics to measure, in the order of `METRICS`."""
+        named = DEFAULT_METRICS[self.protocol] if self.metrics is None else self.metrics
+        return tuple(name for name in METRICS if name in named)
+
+    @property
+    def device(self) -> torch.device:
+        """Where networks run."""
+        return pick_device(None if self.base.device == "auto" else self.base.device)
+
+    @property
+    def opened(self) -> BaseSettings:
+        """The base's settings, without a precision that is the residual's alone."""
+        alone = self.base.named in ("rgbd", "lite")
+        return dataclasses.replace(self.base, precision="auto") if alone else self.base
+
+    def check(self) -> None:
+        """InputError for an option that cannot be used, whatever the images."""
+        check_name("--dataset", self.dataset, DATASETS)
+        check_name("--protocol", self.protocol, DEFAULT_METRICS)
+        for method in self.methods:
+            check_name("--methods", method, METHODS)
+        check_name("--inpainter", self.inpainter, INPAINTERS)
+        check_name("--second-views", self.second_views, SECOND_VIEWS)
+        if self.second_views == "nearest" and not self.near:
+            raise InputError("--second-views nearest: large views have no second photos: add --protocol near-view")
+        for metric in self.metrics or ():
+            check_name("--metrics", metric, METRICS)
+            if METRICS[metric].truth and not self.near:
+                raise InputError(f"--metrics {metric}: needs a true second view: add --protocol near-view")
+        if not self.methods:
+            raise InputError(f"--methods: none is given: choose of {', '.join(METHODS)}")
+        self.opened.check(one=True)
+        if self.residual == "none":
+            raise InputError("--residual none: there would be nothing to evaluate: add --methods base instead")
+        if "direct-ft" in self.methods:
+            if self.base.name != "sharp":
+                raise InputError("--methods direct-ft: is a SHARP that was trained further: add --base sharp")
+            if self.direct_ft is None:
+                made = "which `spackle train --method direct-ft` made"
+                raise InputError(f"--methods direct-ft: no weights: give --direct-ft FILE, {made}")
+        elif self.direct_ft is not None:
+            raise InputError(f"--direct-ft {self.direct_ft}: no method takes it: add direct-ft to --methods")
+        if not 1 <= len(self.disparities) <= MAX_DISPARITIES:
+            raise InputError(f"--disparity: give one to {MAX_DISPARITIES} numbers, got {len(self.disparities)}")
+        for value in self.disparities:
+            if not 0 < value <= MAX_DISPARITY:  # NaN, too
+                raise InputError(f"--disparity {value:g}: must be above 0 and up to {MAX_DISPARITY:g}")
+        if len(set(self.disparities)) < len(self.disparities):
+            raise InputError("--disparity: the same number twice: leave one out")
+
+
+def split_words(text: str) -> tuple[str, ...]:
+    """ "a, b,c" as words; a word twice counts once."""
+    return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+
+
+def parse_disparities(text: str) -> tuple[float, ...]:
+    """ "0.3,0.4" or "0.3 0.4" as numbers; InputError for anything else."""
+    try:
+        return tuple(float(word) for word in split_words(",".join(text.split())))
+    except ValueError as error:
+        raise InputError(f"--disparity {text}: not numbers: give them with commas, such as 0.3,0.4,0.5") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """A dataset's cases, and what they share."""
+
+    options: EvaluateOptions
+    cases: Sequence[Case]
+    base: OpenedBase  # see `open`
+    direct: OpenedBase | None  # of the method direct-ft
+    network: ResidualNet | None
+    inpainter: Inpainter | None  # of the method inpaint2d
+    renderer: Renderer
+    gauges: Gauges
+    config: dict[str, Any]  # everything that decides renders, ready for JSON; nothing of where files lie
+    metrics: dict[str, str]  # of each wanted metric who measures it, or why nobody
+
+    def open(self, loaded: LoadedCase) -> OpenedBase:
+        """The base of a case: the network, or the case's own depth or points; InputError where it lacks those."""
+        network = self.options.base.network
+        return self.base if network else open_loaded(RgbdBase(known_depth(loaded.case)))
+
+    def context(self, prediction: BasePrediction) -> FillContext:
+        """A photo's base, and what fills the holes of its views."""
+        fill = self.renderer, self.network
+        return FillContext(prediction.gaussians, prediction.camera, *fill, precision=self.options.base.precision)
+
+
+def open_evaluation(options: EvaluateOptions) -> Evaluation:
+    """Check the options and load what all images share; networks of a base are loaded with the first image.
+
+    InputError for an option, a dataset, weights or a package that cannot be used.
+    """
+    options.check()
+    base, dataset, fill, wanted = options.base, DATASETS[options.dataset], FillOptions(options.residual), options.wanted
+    cases, limit = read_cases(dataset.name, options.root), options.limit
+    if limit is not None and limit < len(cases):  # evenly over their order
+        cases = [cases[(2 * k + 1) * len(cases) // (2 * limit)] for k in range(limit)]
+    every = options.near and options.second_views == "all"
+    cases = [
+        dataclasses.replace(case, seconds=tuple(s for s in case.seconds if every or (options.near and s.near)))
+        for case in cases
+    ]
+    if not cases:
+        raise InputError(f"{options.root}: {dataset.name}: no images: check the folder")
+    if not all(case.problem for case in cases):  # else each is named in its turn
+        if options.near and not any(case.seconds for case in cases):
+            raise InputError(f"{options.root}: {dataset.name}: has no second photos: take --protocol large-view")
+        if not base.network and not any(case.depth or case.points for case in cases):
+            problem = "has no depth of any kind, which --base rgbd takes"
+            raise InputError(f"{options.root}: {dataset.name}: {problem}: take {', '.join(NETWORKS)}")
+    network, direct, features, inpainter = fill.load(), None, None, None
+    if "inpaint2d" in options.methods:
+        inpainter = get_inpainter(options.inpainter, InpainterOptions(device=options.device.type))
+    if options.direct_ft is not None:
+        direct = open_base(dataclasses.replace(base, checkpoint=options.direct_ft))
+    if options.features is not None and "distance" in wanted:
+        features = load_features("squeezenet", options.features)
+    published = [name for name in wanted if name in DEFINITIONS]
+    metrics, states = open_metrics(published, options.device.type, options.download)
+    states = dict.fromkeys(wanted, OWN) | states
+    if "distance" in wanted:
+        states["distance"] = "not run: weights: give SqueezeNet's with --features FILE"
+        if options.features is not None:
+            states["distance"] = f"{OWN}, weights {weights_digest(options.features)[:16]}"
+    renderer = get_renderer(base.device)
+    precision = str(pick_dtype(base.precision, device_of(renderer))).removeprefix("torch.")
+    config: dict[str, Any] = {
+        "kind": "evaluate",
+        "spackle": spackle.__version__,
+        "dataset": dataset.name,
+        "title": dataset.title,
+        "terms": dataset.terms,
+        "images": {"count": len(cases), "limit": limit, "names": digest_of([case.name for case in cases])},
+        "protocol": options.protocol,
+        "side": options.max_side,
+        "disparities": None if options.near else list(options.disparities),
+        "second_views": options.second_views if options.near else None,
+        "base": {
+            "name": base.public_name,
+            "title": "SHARP" if base.named == "sharp" else base.public_name,
+            "says": base.description,
+            "weights": weights_digests(base.files),
+            "precision": base.precision,
+        },
+        "device": device_of(renderer).type,  # of the renderer, the residual and networks of bases
+        "methods": list(options.methods),
+        "residual": {
+            "weights": "seeds" if fill.file is None else "shipped" if options.residual is None else "given",
+            "sha256": None if fill.file is None else weights_digest(fill.file),
+            "precision": None if fill.file is None else precision,
+        },
+        "direct_ft": None if options.direct_ft is None else weights_digest(options.direct_ft),
+    }
+    if inpainter is not None:
+        weights = {name: weights_digest(file) for name, file in inpainter.files.items()}
+        config["inpainter"] = {"name": inpainter.name, "version": inpainter.version, "weights": weights}
+    gauges = Gauges(wanted, metrics, features)
+    return Evaluation(
+        options, cases, open_base(options.opened), direct, network, inpainter, renderer, gauges, config, states
+    )
 
 
 def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: bool = False) -> str:
@@ -101,6 +316,7 @@ def measure_case(
     else:
         views = large_views(prediction, options.disparities, options.max_side)
 
+    @cache
     def direct_ft() -> tuple[Gaussians, float]:
         """The other base, and what its cameras' paths are to be multiplied by."""
         assert evaluation.direct is not None
@@ -110,7 +326,8 @@ def measure_case(
         return other.gaussians, alignment.scale / _align(loaded, other, evaluation, False).scale
 
     context = evaluation.context(prediction)
-    methods = {name: make_method(name, context, evaluation.inpainter, direct_ft) for name in options.methods}
+    method = partial(make_method, context=context, inpainter=evaluation.inpainter, direct_ft=direct_ft)
+    methods = {name: partial(method, name) for name in options.methods}
     image = Row(str(evaluation.config["title"]), case.name, "", "", "", "", None)
     gauges = dataclasses.replace(evaluation.gauges, metrics=metrics)
     rows, pictures = measure_views(image, context, views, methods, gauges)

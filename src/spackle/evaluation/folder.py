@@ -20,8 +20,16 @@ from spackle.evaluation.case import Case
 from spackle.evaluation.metrics import METRICS, metric_name
 from spackle.evaluation.rows import PROBLEM, REMARK, Row, Run
 from spackle.evaluation.table import NOT_RUN
-from spackle.files import fingerprint, write_json, write_whole
-from spackle.folders import as_recorded, differences, digest_of, file_records, make_folder, remove_half_written
+from spackle.files import write_json, write_whole
+from spackle.folders import (
+    as_recorded,
+    differences,
+    digest_of,
+    file_records,
+    make_folder,
+    photo_digest,
+    remove_half_written,
+)
 from spackle.progress import Reporter, asked_to_stop
 
 CONFIG, ROWS, IMAGES = "config.json", "rows.jsonl", "images"
@@ -105,7 +113,7 @@ def measure_images(
     measurable = {name: state for name, state in (metrics or {}).items() if not state.startswith(NOT_RUN)}
     rows: list[Row] = []
     measured: list[dict[str, str]] = []  # of each image that gave figures, by whom
-    begun, digest = False, functools.cache(_photo_digest)  # a photo may be the second one of many
+    begun, digest = False, functools.cache(photo_digest)  # a photo may be the second one of many
     with reporter.stage("images") as step, asked_to_stop(alone=True) as stop:
         for index, case in enumerate(cases):
             if stop():
@@ -178,14 +186,6 @@ def _load_part(path: Path, inputs: str) -> tuple[list[Row], dict[str, str]] | No
         return [Row(*row) for row in content["rows"]], dict(content["metrics"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _photo_digest(path: Path) -> str:
-    """What a photo holds; a missing one has its turn later."""
-    try:
-        return fingerprint(path, "photo")
-    except InputError:
-        return "none"
 
 
 def problem_of(case: Case, error: InputError, root: Path) -> str:

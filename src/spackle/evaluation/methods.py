@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from spackle.camera import Camera
 from spackle.evaluation.rows import load_data
 from spackle.gaussians import Gaussians
 from spackle.inpaint import Inpainter, known_inverse_depth
+from spackle.render import Renderer
 from spackle.render.protocol import Rendering
 from spackle.residual import complete_view, hole_mask
 from spackle.residual.base_values import make_seeds
@@ -20,7 +22,7 @@ from spackle.residual.complete import compose
 from spackle.residual.network import find_rim, predict_deltas
 from spackle.residual.view_features import ViewFeatures
 from spackle.scene_fill import FillContext, fill_scene, fill_view
-from spackle.scene_fill.occlusion_guard import push_behind
+from spackle.scene_fill.occlusion_guard import OcclusionGuard, push_behind
 
 
 class MethodView(NamedTuple):
@@ -32,7 +34,6 @@ class MethodView(NamedTuple):
 
 
 Fill = Callable[[Camera, Rendering], MethodView]  # of a view and the base's rendering of it
-Method = Callable[[Sequence[Camera]], Fill]  # of all views of a setting, which a method may complete together
 
 
 class MethodFacts(NamedTuple):
@@ -49,116 +50,97 @@ RESIDUAL = ("paper", "spackle", "spackle-scene", "dense")  # methods that run th
 
 def make_method(
     name: str,
+    cameras: Sequence[Camera],
     context: FillContext,
     inpainter: Inpainter | None = None,
     direct_ft: Callable[[], tuple[Gaussians, float]] | None = None,
-) -> Method:
+) -> Fill:
     """A method of `METHODS` on a photo's base.
 
     Args:
         name: see `METHODS`.
+        cameras: all views of a setting, which a method may complete together.
         context: the base, and what fills its views' holes.
         inpainter: of inpaint2d.
-        direct_ft: of direct-ft, asked now: the photo by the other base, and that one's unit of length in this one's.
+        direct_ft: of direct-ft: the photo by the other base, and that one's unit of length in this one's.
     """
-    if name == "direct-ft":
-        assert direct_ft is not None
-        return _direct_ft(context, *direct_ft())
+    context = context.placed
+    guard = context.photo_guard() if name in ("spackle", "seeds", "dense") else None
+
+    def on_top(aux_of: Callable[[Camera, Rendering], Gaussians]) -> Fill:
+        """A view with aux Gaussians on top of the base."""
+
+        def fill(camera: Camera, before: Rendering) -> MethodView:
+            aux = aux_of(camera, before)
+            drawn = context.renderer.render([context.base, aux], camera) if len(aux) else before
+            return MethodView(drawn.rgb, drawn.alpha, aux)
+
+        return fill
+
+    if name == "base":
+        return on_top(lambda camera, before: Gaussians.empty())
+    if name == "paper":
+        return on_top(partial(_paper_aux, context))
+    if name == "dense":
+        return on_top(partial(_dense_aux, context, guard))
+    if name == "spackle-scene":
+        scene = fill_scene(context, cameras, exact=True).aux
+        return on_top(lambda camera, before: scene)
+    if name in ("spackle", "seeds"):  # each view by itself (paper, section 3.4)
+        return partial(_per_view, context if name == "spackle" else context.seeds_alone, guard)
     if name == "inpaint2d":
         assert inpainter is not None
-        return _inpaint_2d(inpainter)
-    methods: dict[str, Method] = {
-        "base": lambda cameras: lambda camera, before: MethodView(before.rgb, before.alpha, Gaussians.empty()),
-        "paper": lambda cameras: _paper(context.placed),
-        "spackle": lambda cameras: _per_view(context),
-        "spackle-scene": lambda cameras: _one_scene(context, cameras),
-        "seeds": lambda cameras: _per_view(context.seeds_alone),
-        "dense": lambda cameras: _dense(context),
-    }
-    return methods[name]
+        return partial(_inpaint_2d, inpainter)
+    assert direct_ft is not None
+    return partial(_direct_ft, context.renderer, *direct_ft())
 
 
-def _paper(context: FillContext) -> Fill:
-    """Aux Gaussians for each view, as eqs. 2 to 9 say."""
-    photo = context.photo
-
-    def fill(camera: Camera, before: Rendering) -> MethodView:
-        aux = complete_view(
-            context.base,
-            camera,
-            context.photo_camera,
-            context.renderer,
-            context.network,
-            threshold=context.threshold,
-            least=LEAST_AUX,
-            rendering=before,
-            photo=photo,
-            precision=context.precision,
-        )
-        return _drawn(context, aux, camera, before)
-
-    return fill
+def _paper_aux(context: FillContext, camera: Camera, before: Rendering) -> Gaussians:
+    """As eqs. 2 to 9 say."""
+    return complete_view(
+        context.base,
+        camera,
+        context.photo_camera,
+        context.renderer,
+        context.network,
+        threshold=context.threshold,
+        least=LEAST_AUX,
+        rendering=before,
+        photo=context.photo,
+        precision=context.precision,
+    )
 
 
-def _per_view(context: FillContext) -> Fill:
-    """Aux Gaussians for each view by itself (paper, section 3.4)."""
-    guard = context.photo_guard()
-
-    def fill(camera: Camera, before: Rendering) -> MethodView:
-        filled = fill_view(context, camera, [guard], before)
-        return MethodView(filled.rendering.rgb, filled.rendering.alpha, filled.aux)
-
-    return fill
+def _per_view(context: FillContext, guard: OcclusionGuard | None, camera: Camera, before: Rendering) -> MethodView:
+    assert guard is not None
+    filled = fill_view(context, camera, [guard], before)
+    return MethodView(filled.rendering.rgb, filled.rendering.alpha, filled.aux)
 
 
-def _one_scene(context: FillContext, cameras: Sequence[Camera]) -> Fill:
-    """One set of aux Gaussians for all views together."""
-    aux = fill_scene(context, cameras, exact=True).aux
-    return lambda camera, before: _drawn(context, aux, camera, before)
+@torch.no_grad()
+def _dense_aux(context: FillContext, guard: OcclusionGuard | None, camera: Camera, before: Rendering) -> Gaussians:
+    """One for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
+    assert guard is not None
+    network, photo_camera = context.network, context.photo_camera
+    features = ViewFeatures.of(before)
+    seeds, deltas = make_seeds(features, camera, photo_camera), None
+    if network is not None:
+        rim, _ = find_rim(features, seeds, camera, photo_camera, context.photo)
+        deltas = predict_deltas(network, features, seeds, rim, context.precision, dense=True).flatten(0, 1)
+    aux = compose(seeds.select(torch.ones_like(features.mask)), deltas, camera)
+    return push_behind(aux, camera.position, [guard])
 
 
-def _dense(context: FillContext) -> Fill:
-    """An aux Gaussian for every 2×2 cell, hole or not: the ablation of the mask-guided seeds (tab:mask_guided_init)."""
-    guard, network, photo_camera = context.photo_guard(), context.network, context.photo_camera
-
-    @torch.no_grad()
-    def fill(camera: Camera, before: Rendering) -> MethodView:
-        features = ViewFeatures.of(before)
-        seeds = make_seeds(features, camera, photo_camera)
-        deltas = None
-        if network is not None:
-            rim, _ = find_rim(features, seeds, camera, photo_camera, context.photo)
-            deltas = predict_deltas(network, features, seeds, rim, context.precision, dense=True).flatten(0, 1)
-        aux = compose(seeds.select(torch.ones_like(features.mask)), deltas, camera)
-        return _drawn(context, push_behind(aux, camera.position, [guard]), camera, before)
-
-    return fill
-
-
-def _drawn(context: FillContext, aux: Gaussians, camera: Camera, before: Rendering) -> MethodView:
-    """A view with aux Gaussians on top of the base."""
-    drawn = context.renderer.render([context.base, aux], camera) if len(aux) else before
-    return MethodView(drawn.rgb, drawn.alpha, aux)
-
-
-def _inpaint_2d(inpainter: Inpainter) -> Method:
+def _inpaint_2d(inpainter: Inpainter, camera: Camera, before: Rendering) -> MethodView:
     """The base's render with its hole inpainted as a flat picture."""
-
-    def fill(camera: Camera, before: Rendering) -> MethodView:
-        hole = hole_mask(before.alpha)
-        flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
-        return MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)
-
-    return lambda cameras: fill
+    hole = hole_mask(before.alpha)
+    flat = (before.rgb, hole, known_inverse_depth(before.depth, hole))
+    return MethodView(inpainter.paint(*(image[None] for image in flat))[0], None, None)
 
 
-def _direct_ft(context: FillContext, base: Gaussians, unit: float) -> Method:
+def _direct_ft(renderer: Renderer, base: Gaussians, unit: float, camera: Camera, before: Rendering) -> MethodView:
     """The paper's naive decoupled framework: another base, trained on completed views, by itself."""
-
-    def fill(camera: Camera, before: Rendering) -> MethodView:
-        pose = camera.world_to_camera.clone()
-        pose[:3, 3] *= unit
-        drawn = context.renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
-        return MethodView(drawn.rgb, drawn.alpha, None)
-
-    return lambda cameras: fill
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] *= unit
+    drawn = renderer.render(base, dataclasses.replace(camera, world_to_camera=pose))
+    return MethodView(drawn.rgb, drawn.alpha, None)

@@ -63,11 +63,6 @@ def metric_name(figure: str) -> str | None:
     return name if name in METRICS else None
 
 
-def definitions(names: tuple[str, ...]) -> list[str]:
-    """A sentence for each metric."""
-    return [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
-
-
 def reduction(before: float, after: float) -> float:
     """1 − after / before, the relative decrease of the HAR (paper, eq. 11); NaN without any hole.
 

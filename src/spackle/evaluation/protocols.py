@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -16,7 +16,7 @@ from spackle.camera import Camera
 from spackle.camera_path import DepthRange, extremes
 from spackle.errors import InputError, reason_in_a_line
 from spackle.evaluation.case import Case, Points, Viewpoint
-from spackle.evaluation.methods import Method
+from spackle.evaluation.methods import Fill
 from spackle.evaluation.metrics import METRICS, Metric, psnr, ssim_average, ssim_map
 from spackle.evaluation.rows import REMARK, Row
 from spackle.image import working_size
@@ -197,9 +197,13 @@ def _of_bounds(bounds: tuple[float, float], z: Tensor) -> Alignment:
 
 @torch.no_grad()
 def measure_views(
-    image: Row, context: FillContext, viewpoints: Sequence[Viewpoint], methods: Mapping[str, Method], gauges: Gauges
+    image: Row,
+    context: FillContext,
+    viewpoints: Sequence[Viewpoint],
+    methods: Mapping[str, Callable[[Sequence[Camera]], Fill]],
+    gauges: Gauges,
 ) -> tuple[list[Row], dict[str, Tensor]]:
-    """Every method on every view of a base; views of one setting are a method's to see together.
+    """Every method on every view of a base; a method gets the cameras of one setting together.
 
     Returns:
         Rows, which take dataset and name from `image`; and pictures of the view with the largest hole, [H, W, 3]: its

@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 EMPTY = ""  # not run, or nothing that could be
 NOT_RUN = "not run"  # of a whole row
@@ -56,18 +55,13 @@ def mark_best(values: Sequence[float | None], texts: Sequence[str], lower: bool)
     return [f"{BEST}{text}{BEST}" if text == best else text for text in texts]
 
 
-def write_table(table: Table, form: Literal["md", "tex"], suffix: str = "") -> str:
-    """For a page of Markdown, or for LaTeX with the packages booktabs and graphicx, the label ending with `suffix`."""
-    return _markdown(table) if form == "md" else _latex(table, suffix)
-
-
 def groups(heads: Sequence[tuple[str, str]]) -> list[tuple[str, int]]:
     """The upper level: a name, and over how many columns it stands."""
     return [(name, len(list(columns))) for name, columns in itertools.groupby(heads, key=lambda head: head[0])]
 
 
-def _markdown(table: Table) -> str:
-    """A group's head is put before the heads of its columns."""
+def markdown(table: Table) -> str:
+    """For a page of Markdown; a group's head is put before the heads of its columns."""
     head = [f"{group}: {column}" if group else column for group, column in table.heads]
     lines = [f"**{table.title}** (`{table.label}`). {table.caption}", "", _row(head), "|" + "---|" * len(head)]
     lines += [_row(cells) for rows in table.bodies for cells in rows]
@@ -94,8 +88,8 @@ def tex(text: str) -> str:
     return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", safe)
 
 
-def _latex(table: Table, suffix: str) -> str:
-    """The notes stand below the table, so that its caption is short."""
+def latex(table: Table, suffix: str = "") -> str:
+    """For LaTeX with booktabs and graphicx, the label ending with `suffix`; the notes stand below the table."""
     shape = "l" * table.words + "c" * (len(table.heads) - table.words)
     lines = [r"\begin{table*}[t]", r"\centering", r"\scriptsize", rf"\caption{{{tex(table.caption)}}}"]
     lines += [

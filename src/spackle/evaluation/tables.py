@@ -14,7 +14,7 @@ import numpy as np
 
 from spackle.errors import InputError
 from spackle.evaluation.methods import METHODS, RESIDUAL
-from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, definitions, metric_name, reduction
+from spackle.evaluation.metrics import DEFINITIONS, METRICS, NOTICE, metric_name, reduction
 from spackle.evaluation.rows import (
     IMAGES,
     NEAR,
@@ -33,7 +33,7 @@ from spackle.evaluation.rows import (
     pivot,
     setting_title,
 )
-from spackle.evaluation.table import EMPTY, NOT_RUN, TEXTS, Cells, Table, mark_best, write_table
+from spackle.evaluation.table import EMPTY, NOT_RUN, TEXTS, Cells, Table, latex, mark_best, markdown
 from spackle.files import write_whole
 
 FILES = ("tables.md", "tables.tex")
@@ -90,10 +90,9 @@ def make_tables(runs: Sequence[Run], *, whole: bool = False) -> list[Table]:
 
 def write_tables(tables: Sequence[Table], folder: Path, files: Sequence[str] = FILES, suffix: str = "") -> None:
     """As a file of Markdown and one of LaTeX, whose labels end with `suffix`: a document may take in several."""
-    write_whole(folder / files[0], "\n".join(write_table(table, "md") for table in tables).encode())
+    write_whole(folder / files[0], "\n".join(map(markdown, tables)).encode())
     head = "% needs \\usepackage{booktabs,graphicx}\n"
-    texts = [write_table(table, "tex", suffix) for table in tables]
-    write_whole(folder / files[1], (head + "\n".join(texts)).encode())
+    write_whole(folder / files[1], (head + "\n".join(latex(table, suffix) for table in tables)).encode())
 
 
 def method_name(run: Run, method: str, title: str = "") -> str:
@@ -134,7 +133,7 @@ def _notes(spec: Mapping[str, Any], runs: Sequence[Run], cells: str) -> list[str
     for weights in dict.fromkeys(_weights(run) for run in runs):
         foreign = not weights.startswith("given")
         notes.append(NOTES["recipe"].format(residual=weights) if foreign else f"Residual: {weights}.")
-    notes += definitions(names)
+    notes += [f"{METRICS[name].title[:-2]}: {METRICS[name].definition}." for name in names]
     for run in runs:
         state = run.about.get("metrics", {})
         idle = [name for name in names if str(state.get(name, "")).startswith(NOT_RUN)]

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from spackle.errors import InputError, reason_in_a_line
 from spackle.files import atomic_path
-from spackle.folders import NEW
 from spackle.training.recipe import AnyRecipe, differences
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint.previous.pt"
@@ -101,52 +100,31 @@ def load_checkpoint(folder: Path, log: Log) -> Checkpoint | None:
     return None
 
 
-def find_run(
-    output: Path, overwrite: bool, method: str, recipe: AnyRecipe, digest: str, log: Log
-) -> tuple[Path, Checkpoint | None]:
-    """The folder of a run, and the checkpoint in it that the run goes on from, if any.
+def find_checkpoint(output: Path, method: str, recipe: AnyRecipe, digest: str, log: Log) -> Checkpoint | None:
+    """The checkpoint that a run goes on from, if any.
 
-    The folder is `output`, but to `overwrite` a run there `output`/.new, which `replace_run` ends.
-
-    Raises:
-        InputError: the folder holds another run, or none of its checkpoints can be read.
+    InputError where the folder holds another run, or none of its checkpoints can be read.
     """
-    anew = overwrite and any((output / name).exists() for name in RESULTS)
-    folder = output / NEW if anew else output
-    try:
-        checkpoint = load_checkpoint(folder, log)
-        if checkpoint:
-            what, other = "", differences(checkpoint.recipe, recipe)
-            if checkpoint.method != method:
-                what = f"--method {checkpoint.method}, not of {method}"
-            elif other:
-                what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
-            elif checkpoint.digest != digest:
-                what = "another recipe (the files that data names differ)"
-            if what:
-                raise InputError(
-                    f"{output}: holds a run of {what}: choose another with -o, or --overwrite to start anew"
-                )
-            log(f"{folder}: going on from step {checkpoint.progress.step}")
-    except InputError:
-        if not anew:
-            raise
-        checkpoint = None  # begun by another recipe, or damaged
-    return folder, checkpoint
+    checkpoint = load_checkpoint(output, log)
+    if checkpoint is None:
+        return None
+    what, other = "", differences(checkpoint.recipe, recipe)
+    if checkpoint.method != method:
+        what = f"--method {checkpoint.method}, not of {method}"
+    elif other:
+        what = f"another recipe ({other[0]}{f' and {len(other) - 1} more' if len(other) > 1 else ''} differs)"
+    elif checkpoint.digest != digest:
+        what = "another recipe (the files that data names differ)"
+    if what:
+        raise InputError(f"{output}: holds a run of {what}: choose another with -o, or --overwrite to start anew")
+    log(f"{output}: going on from step {checkpoint.progress.step}")
+    return checkpoint
 
 
-def replace_run(folder: Path, new: Path) -> None:
-    """Move a run that has ended from `new` to where an older one was; the samples there stay.
-
-    Where it is killed, the checkpoint is still in `new`, and a second call does the rest.
-    """
-    for name in (RUN, PREVIOUS, BAD, LOGS, PICTURES, BEST, LAST, NEWEST):
-        old, successor = folder / name, new / name
-        if name in (PREVIOUS, BAD) or successor.exists():  # else it was moved before
-            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
-        if successor.exists():
-            os.replace(successor, old)
-    shutil.rmtree(new)
+def remove_run(output: Path) -> None:
+    """Delete what a run has left; its samples stay."""
+    for path in (output / name for name in (*RESULTS, PICTURES, LOGS, BAD)):
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def open_logs(folder: Path, first: int, log: Log) -> AbstractContextManager[Any]:

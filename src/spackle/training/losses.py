@@ -13,7 +13,6 @@ paper's ResNet-50, or SqueezeNet 1.0, 3 MB and many times faster.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -26,11 +25,11 @@ from spackle.errors import InputError, reading
 from spackle.files import check_file
 from spackle.filters import blurred, greatest_around
 from spackle.network_file import load_strict, read_tensors
+from spackle.training.recipe import LossRecipe
 
 ALPHA_FLOOR = 1e-3  # under the 1/255 that a splat must have to be drawn: no gradient that can reach one is lost
 NO_LENGTH = 1e-10  # of a feature vector, LPIPS' own: such a vector points nowhere
 TINY = 1e-6  # keeps divisions finite: by the RMS of features that are all zero, by the area of no hole
-PAPER_WEIGHTS = {"color": 10.0, "alpha": 0.5, "perceptual": 1.0, "preserve": 5.0}  # how much each term counts
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of sRGB 0..1, as torchvision takes it
 CAFFE_MEAN = (104.0, 117.0, 123.0)  # of BGR 0..255
 # Inputs and squeezed channels of fire2 to fire9.
@@ -233,27 +232,22 @@ def total_loss(
     target: Tensor,
     base_rgb: Tensor,
     hole: Tensor,
-    *,
+    recipe: LossRecipe,
     features: FeatureNet | None = None,
-    weights: Mapping[str, float] = PAPER_WEIGHTS,
-    dilation: int = 21,
-    size: int | None = 512,
-    blur: float = 0.0,
-    gram: float = 1.0,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted sum that is minimised, eq. 12.
+    """The weighted sum that is minimised, eq. 12: the loss [], and its terms by name, each [], unweighted and detached.
 
-    `features` None leaves the perceptual term out; `weights` has a number for each term, `blur` is as in `color_loss`,
-    the rest as in `perceptual_loss`. Returns the loss [], and its terms by name, each [], unweighted and detached.
+    Without `features` the perceptual term is left out, whatever network the recipe names.
     """
     terms = {
-        "color": color_loss(rgb, target, hole, blur),
+        "color": color_loss(rgb, target, hole, recipe.color_blur),
         "alpha": alpha_loss(alpha, hole),
         "preserve": preserve_loss(rgb, base_rgb, hole),
     }
     if features is not None:
+        size, dilation, gram = recipe.feature_size, recipe.dilation, recipe.gram
         terms["perceptual"] = perceptual_loss(features, rgb, target, hole, dilation=dilation, size=size, gram=gram)
-    total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
+    total = torch.stack([getattr(recipe, name) * term for name, term in terms.items()]).sum()
     return total, {name: term.detach() for name, term in terms.items()}
 
 

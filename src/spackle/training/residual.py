@@ -81,16 +81,8 @@ class ViewTask(Task):
 
     def total(self, views: ViewBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """The recipe's loss [] of completed views, and its terms [] unweighted, on the task's device."""
-        loss = self.recipe.loss
-        return total_loss(
-            **{name: tensor.to(self.device) for name, tensor in vars(views).items()},
-            features=self.features,
-            weights=vars(loss),
-            dilation=loss.dilation,
-            size=loss.feature_size,
-            blur=loss.color_blur,
-            gram=loss.gram,
-        )
+        tensors = {name: tensor.to(self.device) for name, tensor in vars(views).items()}
+        return total_loss(**tensors, recipe=self.recipe.loss, features=self.features)
 
     def loss(self, network: nn.Module, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
         return self.total(self.complete(network, batch))

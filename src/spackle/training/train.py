@@ -12,7 +12,6 @@ import dataclasses
 import functools
 import math
 import os
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -47,9 +46,9 @@ from spackle.training.checkpoint import (
     RUN,
     Checkpoint,
     Progress,
-    find_run,
+    find_checkpoint,
     open_logs,
-    replace_run,
+    remove_run,
     save_checkpoint,
 )
 from spackle.training.recipe import AnyRecipe, OptimRecipe
@@ -121,7 +120,7 @@ def train(
         open_task: makes the task whose networks run on a device; refuses what cannot be used, before any long work.
         output: a folder for all results.
         reporter: the first process reports to it.
-        overwrite: start anew, in `output`/.new until the new run has ended; samples stay.
+        overwrite: start anew: an older run in `output` is deleted, its samples stay.
 
     Returns:
         Why the run ended: "steps" (all are done), "patience" (nothing improved) or "stopped" (by a signal).
@@ -138,20 +137,14 @@ def train(
         task = open_task(recipe, device)
         if task.items_a_step % rank_count():
             raise InputError(f"optim.batch={recipe.optim.batch} cannot be divided between {rank_count()} processes")
-        folder, checkpoint = find_run(output, overwrite, task.name, recipe, task.digest, reporter.log)
+        checkpoint = None if overwrite else find_checkpoint(output, task.name, recipe, task.digest, reporter.log)
         facts = task.prepare(output, reporter)
         wait_for_ranks()  # nobody looks for checkpoints any more
-        if folder != output and rank() == 0:
-            if checkpoint is None:
-                shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(exist_ok=True)
-        with reading(folder, "cannot write: {reason}", OSError):
-            why, step = _learn(recipe, task, folder, checkpoint, facts, device, reporter)
-        if rank() == 0:
-            if folder != output and why != "stopped":
-                replace_run(output, folder)
-                folder = output
-            reporter.log(f"{END[why]}, step {step} -> {folder}")
+        with reading(output, "cannot write: {reason}", OSError):
+            if overwrite and rank() == 0:
+                remove_run(output)
+            why, step = _learn(recipe, task, output, checkpoint, facts, device, reporter)
+        reporter.log(f"{END[why]}, step {step} -> {output}")
         return why
 
 

@@ -20,7 +20,7 @@ from spackle.errors import InputError, reading
 from spackle.evaluation.case import Case, has_any, photo_files
 from spackle.evaluation.datasets.colmap import model_folder, read_model
 from spackle.evaluation.datasets.multiview import Posed, check_two, make_cases, posed_by, spread
-from spackle.evaluation.datasets.stereo import HALF_PIXEL, TRUTHS_2014, is_two_view, pair_of_2014
+from spackle.evaluation.datasets.stereo import HALF_PIXEL
 from spackle.evaluation.rows import IMAGES
 from spackle.formats.camera_files import checked_camera
 
@@ -42,19 +42,13 @@ def _camera(K: Tensor, pose: Tensor, width: int, height: int, where: str) -> Cam
 
 
 def eth3d_cases(scenes: Mapping[str, Path]) -> list[Case]:
-    """The undistorted DSLR photos of the training scenes, or the two-view scenes: a case for each photo, or each pair.
+    """The undistorted DSLR photos of the training scenes: a case for each.
 
-    Multi-view: `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and
-    `SCENE/images/dslr_images_undistorted/*.JPG`. The model is metric (it was aligned to laser scans); its sparse points
-    give the scale. The dense truth is of the distorted photos, and not used. Second views: see `make_cases`. The
-    paper's 454 images are the 13 training scenes'.
-
-    Two-view: `SCENE_1l/im0.png`, `im1.png`, `calib.txt`, and the truth beside them or, as it is unpacked, in
-    `two_view_training_gt/SCENE_1l`. A root with both kinds gives both; give the folder of one of them alone.
+    `SCENE/dslr_calibration_undistorted/{cameras,images,points3D}.txt` and `SCENE/images/dslr_images_undistorted/*.JPG`.
+    The model is metric (it was aligned to laser scans); its sparse points give the scale. The dense truth is of the
+    distorted photos, and not used. Second views: see `make_cases`. The paper's 454 images are the 13 training scenes'.
     """
-    pairs = [scene for scene in scenes.values() if is_two_view(scene)]
-    multi = [case for scene in scenes.values() if scene not in pairs for case in _photos_of(scene)]
-    return multi + [_pair_of(scene) for scene in pairs]
+    return [case for scene in scenes.values() for case in _photos_of(scene)]
 
 
 def _photos_of(scene: Path) -> list[Case]:
@@ -72,17 +66,9 @@ def _photos_of(scene: Path) -> list[Case]:
     return make_cases(posed_by(scene, model, photos))
 
 
-def _pair_of(scene: Path) -> Case:
-    """The truth is beside the photos, or in the folder that its own archive makes."""
-    apart = scene.parent.parent / "two_view_training_gt" / scene.name
-    places = [at / name for at in (scene, apart) for name in TRUTHS_2014]
-    return pair_of_2014(scene, next((place for place in places if place.is_file()), None))
-
-
 def is_eth3d(folder: Path) -> bool:
-    """Whether this is a scene of ETH3D, of photos or of two views."""
-    photos = (ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted")
-    return has_any(folder, *photos) or is_two_view(folder)
+    """Whether this is a scene of ETH3D."""
+    return has_any(folder, ETH3D_MODEL, "dslr_calibration_jpg", "images/dslr_images_undistorted")
 
 
 # --- Tanks and Temples
