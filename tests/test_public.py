@@ -20,8 +20,8 @@ Scene SharpBase Spackle complete complete_view fill_scene fill_view get_renderer
 load_cameras load_depth load_photo load_ply predict save_ply
 """
 COMMANDS = """
-bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export; figures; info; predict; render;
-serve; tables; train; view; weights get; weights list; weights make
+bench; dataset build; dataset info; dataset preview; dataset verify; demo; evaluate; export; figures; info; predict;
+render; serve; tables; train; view; weights get; weights list; weights make
 """
 
 
