@@ -63,3 +63,7 @@ def test_the_command_line_takes_what_the_docs_type(line: str) -> None:
     while isinstance(command, TyperGroup):
         command = command.commands[words.pop(0)]
     command.make_context(line, words)
+
+
+def test_the_lab_notes_stay_short() -> None:
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in (ROOT / "docs" / "lab").glob("*.md")) <= 10_000
