@@ -261,6 +261,10 @@ def test_large_views_from_files_to_tables(scenes: Path, tmp_path: Path, monkeypa
     assert done.code == 0, done.err
     assert names_in(tmp_path) == OUTPUTS
     found = load_run(tmp_path)
+    ending = [line.split() for line in done.lines[-2 - 2 * len(found.methods) :]]  # a table, and where the rest is
+    assert ending[0] == ["NIQE", "↓", "MUSIQ", "↑", "HAR", "↓", "added", "GS"]
+    niqe, har = (f"{mean_of(found, '0.3', 'base', metric):.4f}" for metric in ("niqe", "har"))
+    assert ending[1] == ["S1", "base", "(rgbd)", niqe, har, "0"]
     assert (found.problems, found.settings, len(found.measured)) == ({}, ["0.3", "0.5"], 3)
     for setting in ("0.3", "0.5"):
         before = mean_of(found, setting, "base", "har")

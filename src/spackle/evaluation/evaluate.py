@@ -26,9 +26,9 @@ from spackle.evaluation.methods import METHODS, make_method
 from spackle.evaluation.metrics import DEFAULT_METRICS, DEFINITIONS, METRICS, NOTICE, OWN, open_metrics
 from spackle.evaluation.pictures import BEST, WORST, save_picture, write_sheets
 from spackle.evaluation.protocols import INPUT, Alignment, Gauges, align, large_views, measure_views, to_base
-from spackle.evaluation.report import REPORT, check_matplotlib, make_report
+from spackle.evaluation.report import REPORT, check_matplotlib, figures_table, make_report
 from spackle.evaluation.rows import DISPARITIES, NOTE, REMARK, Row
-from spackle.evaluation.table import NOT_RUN
+from spackle.evaluation.table import NOT_RUN, plain
 from spackle.evaluation.tables import FILES, make_tables, write_tables
 from spackle.files import write_whole
 from spackle.folders import digest_of, results_folder
@@ -280,6 +280,8 @@ def evaluate(options: EvaluateOptions, output: Path, reporter: Reporter, html: b
         write_rows(run.rows, output / ROWS)
     count, problems = len(run.measured), len(run.problems)
     more = f", {problems} passed over" if problems else ""
+    for line in plain(figures_table(run, run.rows)):
+        reporter.log(line)
     reporter.log(f"{run.title}: {counted(count, 'image')}{more} -> {output}")
     reporter.result({"folder": output, "images": count + problems, "measured": count})
     return "complete"

@@ -34,9 +34,9 @@ from spackle.evaluation.pictures import (
     ranked,
 )
 from spackle.evaluation.protocols import TRUTH
-from spackle.evaluation.rows import IMAGES, NEAR, REMARK, Row, Run, mean, paper_rows, pivot
-from spackle.evaluation.table import EMPTY, TEXTS, Table, groups
-from spackle.evaluation.tables import make_tables, method_name
+from spackle.evaluation.rows import IMAGES, REMARK, Row, Run, mean, paper_rows, pivot, setting_title
+from spackle.evaluation.table import EMPTY, TEXTS, Cells, Table, groups
+from spackle.evaluation.tables import grouped, make_tables, method_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -49,11 +49,7 @@ LEAST = 2  # of each evaluation, however many there are
 # A slider has the first of these that there are: all methods of all images would make a page too large.
 SHOWN = ("base", "spackle", TRUTH, "inpaint2d", "paper", "seeds", "direct-ft", "spackle-scene", "dense")
 MOST_SHOWN = 6
-HEADLINES = {  # figures of near views: what they are, their unit, digits
-    "psnr_hole": ("PSNR in the hole, higher is better", " dB", 2),
-    "distance": ("Masked perceptual distance in the hole, lower is better", "", 3),
-}
-# Columns beside a picture, in this order, where they were measured.
+# Of a method, in this order, where they were measured.
 COLUMNS: dict[str, tuple[str, Callable[[float], str]]] = {
     "psnr_hole": ("PSNR in the hole ↑", "{:.2f}".format),
     "ssim_hole": ("SSIM in the hole ↑", "{:.4f}".format),
@@ -121,7 +117,7 @@ def _parts(sources: Sequence[Source]) -> list[dict[str, Any]]:
             "run": run,
             "paper_images": IMAGES.get(run.title),
             "methods": [method_name(run, method) for method in run.methods],
-            "findings": findings(run),
+            "summary": figures_table(run, run.rows),
             "plots": plots_of(run),
             "ranking": ranking,
             "cases": [_case(run, name, place, next(fits)) for name, place, _ in cases],
@@ -131,28 +127,22 @@ def _parts(sources: Sequence[Source]) -> list[dict[str, Any]]:
     ]
 
 
-def findings(run: Run) -> list[str]:
-    """What an evaluation found, in sentences, from means over all views."""
-
-    def mean_of(metric: str, method: str, setting: str) -> float | None:
-        return mean(run.numbers(metric, setting, method)).value
-
-    lines = []
-    for metric, (what, unit, digits) in HEADLINES.items() if run.near else ():
-        means = {method: mean_of(metric, method, NEAR) for method in run.methods}
-        texts = [f"{METHODS[method].title} {v:.{digits}f}{unit}" for method, v in means.items() if v is not None]
-        lines += [f"{what}: {', '.join(texts)}."] if texts else []
-    adding = {row.method for row in run.rows if row.metric == "aux"} - {"base"}
-    for method in [name for name in run.methods if name in adding and not run.near][:1]:
-        for setting in run.settings:
-            figures = [mean_of(name, method, setting) for name in ("har_before", "har", "aux_share", "aux")]
-            before, after, share, added = (value or 0.0 for value in figures)
-            lines.append(
-                f"At disparity {setting} the base alone leaves {_percent(before)} of the pixels open, "
-                f"{METHODS[method].title} {_percent(after)}, with {TEXTS['count'](added)} added Gaussians a view "
-                f"({_percent(share)} of the base's)."
-            )
-    return lines
+def figures_table(run: Run, rows: Iterable[Row]) -> Table:
+    """Means of rows of a run: a line for each method, and for each setting where there are several."""
+    values = pivot((row for row in rows if row.metric in COLUMNS), "setting", "method", "metric")
+    settings = list(dict.fromkeys(setting for setting, *_ in values))
+    keys = [key for key in COLUMNS if any(metric == key for *_, metric in values)]
+    bodies: list[list[Cells]] = []
+    for setting in settings:
+        lines = []
+        for method in run.methods:
+            means = [mean(values.get((setting, method, key), ())).value for key in keys]
+            cells = [EMPTY if v is None else COLUMNS[key][1](v) for key, v in zip(keys, means, strict=True)]
+            lines.append([column_title(run, method), *cells])
+        bodies.append(grouped(setting_title(setting), lines) if len(settings) > 1 else list(lines))
+    heads = [re.sub(" ([↑↓])", "\N{NO-BREAK SPACE}\\1", COLUMNS[key][0]) for key in keys]
+    words = ["", ""][len(settings) == 1 :]
+    return Table("", "", "", [("", head) for head in (*words, *heads)], bodies, words=len(words))
 
 
 def _percent(share: float) -> str:
@@ -181,18 +171,11 @@ def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dic
     """An image: its pictures one over the other, and the figures of the view that they show."""
     setting, view = run.largest_hole(name)
     shown = [row for row in run.rows if (row.image, row.setting, row.view) == (name, setting, view)]
-    figures = {(row.method, row.metric): float(row.value) for row in shown if row.value is not None}
-    hole = next((value for (_, metric), value in figures.items() if metric == "har_before"), None)
+    hole = next((float(row.value) for row in shown if row.metric == "har_before" and row.value is not None), None)
     names = list(pictures)
     left = "base" if "base" in names and len(names) > 1 else names[0]
     with Image.open(io.BytesIO(pictures[left])) as image:
         width, height = image.size
-    keys = [key for key in COLUMNS if any(metric == key for _, metric in figures)]
-    rows = []
-    for method in run.methods:
-        values = [(COLUMNS[key][1], figures.get((method, key))) for key in keys]
-        rows.append((column_title(run, method), *(EMPTY if v is None else text(v) for text, v in values)))
-    heads = ["", *(re.sub(" ([↑↓])", "\N{NO-BREAK SPACE}\\1", COLUMNS[key][0]) for key in keys)]
     return {
         "name": name,
         "place": place,
@@ -205,7 +188,7 @@ def _case(run: Run, name: str, place: str, pictures: Mapping[str, bytes]) -> dic
         "right": next((n for n in ("spackle", *reversed(names)) if n in names and n != left), left),
         "width": width,
         "height": height,
-        "table": Table("", "", "", [("", head) for head in heads], [rows]),
+        "table": figures_table(run, shown),
     }
 
 

@@ -69,6 +69,16 @@ def markdown(table: Table) -> str:
     return "\n".join(lines) + "\n"
 
 
+def plain(table: Table) -> list[str]:
+    """Lines for a terminal, without title and notes: words on the left, figures under each other."""
+    heads = [head.replace("\N{NO-BREAK SPACE}", " ") for _, head in table.heads]
+    rows = [heads, *(cells for rows in table.bodies for cells in rows)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sides = "<" * table.words + ">" * (len(widths) - table.words)
+    shapes = list(zip(sides, widths, strict=True))
+    return ["  ".join(f"{c:{side}{wide}}" for c, (side, wide) in zip(r, shapes, strict=True)).rstrip() for r in rows]
+
+
 def _row(cells: Cells) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 

@@ -240,7 +240,7 @@ def _cells(rows: Iterable[Row], columns: Sequence[Column], methods: Iterable[str
 Layout = tuple[list[tuple[str, str]], list[list[Cells]]]  # heads and bodies of a `Table`
 
 
-def _grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
+def grouped(name: str, rows: Sequence[Cells]) -> list[Cells]:
     """Rows whose first one is preceded by the name of all of them."""
     return [(EMPTY if k else name, *cells) for k, cells in enumerate(rows)]
 
@@ -275,7 +275,7 @@ def _dataset_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], set
     columns = _columns(spec, settings, "" if settings == [NEAR] else "{}: disparity {}")
     heads = [("", "Dataset"), ("", "Method"), ("", "n"), *((column.group, column.title) for column in columns)]
     of = {dataset: _rows(label, spec, runs, dataset, columns) for dataset in datasets(runs)}
-    return heads, [_grouped(dataset, [(name, n, *cells) for name, n, cells in rows]) for dataset, rows in of.items()]
+    return heads, [grouped(dataset, [(name, n, *cells) for name, n, cells in rows]) for dataset, rows in of.items()]
 
 
 def _near_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], settings: Sequence[str]) -> Layout:
@@ -299,7 +299,7 @@ def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
     """Added Gaussians of each dataset and on average, and medians of the datasets' median times."""
     counts = _columns(spec, settings, "{}: disparity {}")
     of = {dataset: _rows(EXPANDED, spec, runs, dataset, counts) for dataset in datasets(runs)}
-    bodies = [_grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]
+    bodies = [grouped(dataset, [(name, *cells) for name, _, cells in rows]) for dataset, rows in of.items()]
     pools: dict[str, list[Row]] = {}  # of each row's name the figures of each dataset
     for run in runs:
         for method, name in _row_names(spec, run).items():
@@ -309,13 +309,13 @@ def _overhead_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
                     pools.setdefault(name, []).append(Row("", run.title, setting, "", name, metric, over.value))
     for row in paper_rows(label):
         pools.setdefault(row.method, []).append(row)
-    bodies.append(_grouped("Average", [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]))
+    bodies.append(grouped("Average", [(name, *_cells(pool, counts, [name])[0]) for name, pool in pools.items()]))
     times: list[Cells] = [("Runtime efficiency", *[EMPTY] * (1 + len(counts)))]
     for column in spec["runtime"]:
         columns = _columns({"columns": [column]}, settings)
         medians = {name: _cells(pool, columns, [name])[0] for name, pool in pools.items()}
         spread = [(name, *(part for cell in cells for part in (cell, EMPTY))) for name, cells in medians.items()]
-        times += _grouped(column[1], spread)
+        times += grouped(column[1], spread)
     return [("", "Dataset"), ("", "From"), *((column.group, column.title) for column in counts)], [*bodies, times]
 
 
@@ -327,7 +327,7 @@ def _expanded_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], se
         for setting in settings:
             lines = _rows(label, spec, runs, dataset, _columns(spec, [setting]))
             rows += [(setting_title(setting), name, *cells, n) for name, n, cells in lines]
-        bodies.append(_grouped(dataset, rows))
+        bodies.append(grouped(dataset, rows))
     return [("", head) for head in ("Dataset", "Setting", "From", *(c[1] for c in spec["columns"]), "n")], bodies
 
 
@@ -346,5 +346,5 @@ def _stages_table(label: str, spec: Mapping[str, Any], runs: Sequence[Run], sett
                     low, middle, high = map(text, np.quantile(numbers, [0.25, 0.5, 0.75]))
                     cells.append(f"{middle} [{low}, {high}]")
                 rows.append((setting_title(setting), method_name(run, method), *cells))
-        bodies.append(_grouped(run.title, rows))
+        bodies.append(grouped(run.title, rows))
     return [("", head) for head in ("Dataset", "Setting", "From", *(title for title, *_ in columns))], bodies
