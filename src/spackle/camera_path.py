@@ -1,4 +1,4 @@
-"""Camera paths: SHARP's trajectories around the photo's eye, and paths through the keyframes of a path file."""
+"""Camera paths: trajectories around the photo's eye, and paths through the keyframes of a path file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from torch import Tensor
 from spackle.camera import Camera, look_at
 from spackle.gaussians import Gaussians
 
-TrajectoryKind = Literal["swipe", "shake", "rotate", "rotate-forward"]
+SharpTrajectory = Literal["swipe", "shake", "rotate", "rotate-forward"]
+TrajectoryKind = Literal[SharpTrajectory, "vertical", "orbit", "dolly-zoom"]
+# SHARP's own, as the paper has them: data and training draw from these alone.
+SHARP_TRAJECTORIES: tuple[SharpTrajectory, ...] = get_args(SharpTrajectory)
 TRAJECTORIES: tuple[TrajectoryKind, ...] = get_args(TrajectoryKind)
 PathUnit = Literal["metres", "disparity"]
 UNITS: tuple[PathUnit, ...] = get_args(PathUnit)
@@ -72,23 +75,31 @@ def max_offset(camera: Camera, disparity: float, depth_range: DepthRange) -> flo
 
 
 def trajectory(
-    kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, frames: int = 60
+    kind: TrajectoryKind,
+    camera: Camera,
+    disparity: float,
+    depth_range: DepthRange,
+    frames: int = 60,
+    looped: bool = False,
 ) -> list[Camera]:
     """Cameras along a path around the photo's eye, looking at the focus point.
 
     Args:
-        kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle) or
-            rotate-forward (left-right while moving in and out).
+        kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle), rotate-forward (left-right
+            while moving in and out), vertical (up-down), orbit (left-right at one distance from the focus point), or
+            dolly-zoom (back, while the lens keeps the size of what stands at the focus point).
         camera: the photo's camera at the world's origin.
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
         frames: number of cameras.
+        looped: the frame after the last is the first: swipe comes back, slower at its ends, and the other paths, which
+            end where they began, stop a frame earlier.
 
     Raises:
         ValueError: an unknown path, a disparity out of 0..2, or no frame.
     """
-    eyes, target = _flight(kind, camera, disparity, depth_range, frames)
-    return [camera.looking(eye, target) for eye in eyes]
+    eyes, target = _flight(kind, camera, disparity, depth_range, frames, looped)
+    return [_looking(kind, camera, eye, target) for eye in eyes]
 
 
 def view_at(
@@ -96,7 +107,7 @@ def view_at(
 ) -> Camera:
     """One camera of `trajectory`, the rest of which is not made."""
     eyes, target = _flight(kind, camera, disparity, depth_range, frames)
-    return camera.looking(eyes[index], target)
+    return _looking(kind, camera, eyes[index], target)
 
 
 def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple[Camera, Camera]:
@@ -105,8 +116,18 @@ def extremes(camera: Camera, disparity: float, depth_range: DepthRange) -> tuple
     return left, right
 
 
+def _looking(kind: TrajectoryKind, camera: Camera, eye: Tensor, target: Tensor) -> Camera:
+    view = camera.looking(eye, target)
+    return view.zoomed(1 - float(eye[2] / target[2])) if kind == "dolly-zoom" else view
+
+
 def _flight(
-    kind: TrajectoryKind, camera: Camera, disparity: float, depth_range: DepthRange, frames: int
+    kind: TrajectoryKind,
+    camera: Camera,
+    disparity: float,
+    depth_range: DepthRange,
+    frames: int,
+    looped: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Eye positions [frames, 3] and what they look at, [3]."""
     kind = trajectory_kind(kind)
@@ -114,11 +135,12 @@ def _flight(
         raise ValueError(f"disparity must be between 0 and {MAX_DISPARITY:g}, got {disparity:g}")
     if frames < 1:
         raise ValueError(f"a trajectory needs at least one frame, got {frames}")
-    side, forward = max_offset(camera, disparity, depth_range), MAX_ZOOM * depth_range.near
+    side, forward, focus = max_offset(camera, disparity, depth_range), MAX_ZOOM * depth_range.near, depth_range.focus
+    frames += looped
     zero = torch.zeros(frames, dtype=torch.float64)
     turn = torch.linspace(0, 1, frames, dtype=torch.float64) * 2 * math.pi
     if kind == "swipe":
-        xyz = [torch.linspace(-side, side, frames, dtype=torch.float64), zero, zero]
+        xyz = [-side * turn.cos() if looped else torch.linspace(-side, side, frames, dtype=torch.float64), zero, zero]
     elif kind == "shake":
         across = frames // 2
         first = torch.linspace(0, 1, across, dtype=torch.float64) * 2 * math.pi
@@ -128,9 +150,17 @@ def _flight(
         xyz = [x, y, zero]
     elif kind == "rotate":
         xyz = [side * turn.sin(), side * turn.cos(), zero]
+    elif kind == "vertical":
+        xyz = [zero, side * turn.sin(), zero]
+    elif kind == "orbit":
+        angle = math.atan2(side, focus) * turn.sin()
+        xyz = [focus * angle.sin(), zero, focus * (1 - angle.cos())]
+    elif kind == "dolly-zoom":
+        xyz = [zero, zero, side * (turn.cos() - 1) / 2]
     else:
         xyz = [side * turn.sin(), zero, forward * (1 - turn.cos()) / 2]
-    return torch.stack(xyz, dim=-1), torch.tensor([0.0, 0.0, depth_range.focus], dtype=torch.float64)
+    eyes = torch.stack(xyz, dim=-1)[: frames - looped]
+    return eyes, torch.tensor([0.0, 0.0, focus], dtype=torch.float64)
 
 
 class PathError(ValueError):

@@ -136,7 +136,9 @@ class Pipeline:
         prediction, choice = self.predict(photo, reporter)
         views = plan_views(prediction, self.options.path, photo.path, self.given_views, self.keyframes)
         with reporter.stage("complete") as step:
-            scene, pictures = self.fill(prediction, views.cameras, step)
+            chosen = views.looked_at if self.options.fill.mode == "scene" else range(len(views.cameras))
+            scene, drawn = self.fill(prediction, [views.cameras[index] for index in chosen], step)
+            pictures = {chosen[index]: picture for index, picture in drawn.items()}
         if not scene.aux.finite:
             source = self.options.path.cameras or photo.path
             raise InputError(f"{source}: views too extreme to complete: check their K")

@@ -25,7 +25,7 @@ from spackle.image import focal_length
 from spackle.render import Renderer, get_renderer
 from spackle.render.protocol import Rendering
 from spackle.residual.view_features import hole_mask
-from spackle.views import PATH_FRAMES, scene_path
+from spackle.views import PATH_FRAMES, SECONDS, scene_path
 from spackle.web.page import PageScene, page_scene, single_html
 
 DEFAULT_SIZE = (1280, 720)  # of a scene without a camera
@@ -173,21 +173,22 @@ class Scene:
         target: Target,
         trajectory: TrajectoryKind = "rotate-forward",
         disparity: float | None = None,
-        frames: int = PATH_FRAMES,
+        frames: int | None = None,
         fps: float = 30,
         loop: int | None = None,
         overscan: float = OVERSCAN,
         format: str | None = None,
     ) -> None:
-        """Write a video of a camera path; `loop` as in `spackle.formats.VideoWriter`.
+        """Write a video of a camera path, by default of 4 seconds; `loop` as in `spackle.formats.VideoWriter`.
 
         The lens is longer than the photo's by the share `overscan`: most of what lies beyond the photo stays outside.
         `target` is a path, or a file that is open for writing bytes; `format` is "mp4", "webm", "gif" or "webp", by
         default as the path ends, and mp4 for an open file.
         """
         if format is None and isinstance(target, str | os.PathLike):
-            plays = check_video(target, fps, loop).loop if loop is None else loop
-            cameras = scene_path(self.base, self.camera, trajectory, self._reach(disparity), frames, looped=plays != 1)
+            check_video(target, fps, loop)
+            count = max(1, round(SECONDS * fps)) if frames is None else frames
+            cameras = scene_path(self.base, self.camera, trajectory, self._reach(disparity), count, looped=True)
             views = self.frames(camera.zoomed(1 + overscan) for camera in cameras)
             save_video((view.rgb for view in views), target, fps, loop)
             return

@@ -31,6 +31,7 @@ Fit = Literal["pad", "blur", "crop"]
 PRESETS = {"16:9": (1920, 1080), "9:16": (1080, 1920), "1:1": (1080, 1080)}  # of --size
 ALIKE = 0.01  # an aspect ratio that differs by less is cropped to, without stripes
 BLURRED_PX, BLURRED_LIGHT = 12, 0.6  # pixels that a margin's picture is blurred to, and how bright it is
+GAP = 6  # pixels between two pictures that are compared
 MAX_VIDEO_SIDE = 8192
 MAX_IPD = 1e6
 DEFAULT_FPS = 30
@@ -129,6 +130,7 @@ class VideoOptions:
     stereo: StereoLayout | None = None
     ipd: float | None = None  # as `default_ipd` has it where None
     convergence: float | None = None  # the focus depth where None
+    compare: bool = False  # to the left what the photo shows, with its holes; to the right the completed scene
 
     @property
     def suffix(self) -> str:
@@ -156,6 +158,8 @@ class VideoOptions:
                 raise InputError(f"{option} {value:g}: is for two eyes: add --stereo, or leave it out")
             if not value > 0 or (option == "--ipd" and value > MAX_IPD):
                 raise InputError(f"{option} must be a positive number, got {value:g}")
+        if self.compare and self.stereo is not None:
+            raise InputError(f"--compare: has two pictures already: leave --stereo {self.stereo} out")
         if self.show == "depth" and self.stereo == "anaglyph":
             raise InputError(
                 "--show depth: an anaglyph mixes the colours that stand for depth: give --stereo sbs or ou"
@@ -218,10 +222,13 @@ class FrameMaker:
         return (camera,) if self.stereo is None else self.stereo.eyes(camera)
 
     def frame(self, views: Sequence[Rendering]) -> Tensor:
-        """One frame [H, W, 3], sRGB, of the renderings of `eyes`."""
+        """One frame [H, W, 3], sRGB, of the renderings of `eyes`, or of the base and the scene that are compared."""
         pictures = [v.rgb if self.depth is None else self.depth(v.depth, v.alpha >= COVERED) for v in views]
         if self.canvas is not None:
             pictures = [with_margins(picture, *self.canvas, self.options.fit == "blur") for picture in pictures]
+        if self.options.compare:
+            left, right = pictures
+            return torch.cat([left, left.new_ones(len(left), GAP, 3), right], dim=1)
         return pictures[0] if self.stereo is None else self.stereo.pack(*pictures)
 
     def sized(self, camera: Camera) -> Camera:
@@ -237,8 +244,10 @@ class FrameMaker:
 
     def frame_size(self, camera: Camera) -> tuple[int, int]:
         """Width and height of a frame of a view of this size; the file's, too, where these are even."""
-        size = self.canvas or (camera.width, camera.height)
-        return size if self.stereo is None else self.stereo.frame_size(*size)
+        width, height = self.canvas or (camera.width, camera.height)
+        if self.options.compare:
+            return 2 * width + GAP, height
+        return (width, height) if self.stereo is None else self.stereo.frame_size(width, height)
 
     def note(self, name: str, camera: Camera, frames: int) -> dict[str, object]:
         """What a report says of the video: its file, for there may be others from earlier runs, and what it shows."""

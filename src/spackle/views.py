@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -31,6 +32,7 @@ from spackle.residual.view_features import hole_area_ratio
 from spackle.video_frames import FrameMaker, VideoOptions
 
 PATH_FRAMES, MAX_FRAMES = 60, 10_000  # of a path: as usual, and at most
+SECONDS = 4.0  # of a video along a trajectory
 MAX_OVERSCAN = 0.5
 MEASURED_KEYFRAMES = 16  # keyframes at most whose holes are reported
 
@@ -45,12 +47,9 @@ def scene_path(
 ) -> list[Camera]:
     """Cameras around the photo's eye at the photo's size, both sides made even.
 
-    Every path but `swipe` ends where it began. `looped` leaves out that last camera: a video that starts again would
-    show the view twice in a row.
+    A path that is `looped`, as videos are, goes on from its last camera to the first, see `trajectory`.
     """
-    once = looped and kind != "swipe"
-    path = trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames + once)
-    return path[:frames]
+    return trajectory(kind, camera.even(), disparity, DepthRange.of(base), frames, looped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +60,8 @@ class PathOptions:
     disparity: float | None = None  # as the base has it where None
     cameras: Path | None = None  # exactly these views in place of a trajectory
     path: Path | None = None  # keyframes in place of a trajectory
-    frames: int | None = None  # 60, or as many as the keyframes take
+    frames: int | None = None  # as many as the seconds take where None
+    seconds: float | None = None  # of the video; 4, or the keyframes' own, where None
     video: VideoOptions = dataclasses.field(default_factory=VideoOptions)
     overscan: float = OVERSCAN  # by which share the lens along a trajectory is longer than the photo's
 
@@ -71,6 +71,11 @@ class PathOptions:
             raise InputError(f"--disparity must be between 0 and {MAX_DISPARITY:g}, got {self.disparity:g}")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
             raise InputError(f"--frames must be between 1 and {MAX_FRAMES}, got {self.frames}")
+        if self.seconds is not None:
+            if self.frames is not None:
+                raise InputError(f"--seconds {self.seconds:g}: --frames {self.frames} says it: leave one out")
+            if not 1 <= self.seconds * self.video.rate <= MAX_FRAMES:
+                raise InputError(f"--seconds must give 1 to {MAX_FRAMES} frames, got {self.seconds:g}")
         if self.cameras is not None and self.path is not None:
             raise InputError(f"--path {self.path}: --cameras gives the views already: leave one of them out")
         if self.cameras is not None and self.video.size is not None:
@@ -104,10 +109,11 @@ class PathOptions:
             ValueError: this scene allows no such path.
         """
         if keyframes is None:
-            looped, count = self.video.plays != 1, self.frames or PATH_FRAMES
-            path = scene_path(gaussians, camera, self.trajectory, self.reach(disparity), count, looped)
+            count = self.frames or max(1, round((self.seconds or SECONDS) * self.video.rate))
+            path = scene_path(gaussians, camera, self.trajectory, self.reach(disparity), count, looped=True)
             return [view.zoomed(1 + self.overscan) for view in path]
-        count = self.frames or keyframes.frame_count(self.video.rate)
+        given = self.frames or (self.seconds and round(self.seconds * self.video.rate))
+        count = given or keyframes.frame_count(self.video.rate)
         if count > MAX_FRAMES:
             raise PathError(f"{keyframes.seconds:g} s take {count} frames (at most {MAX_FRAMES}): give --frames")
         return keyframes.cameras(camera.even(), count, DepthRange.of(gaussians))
@@ -122,12 +128,21 @@ class PlannedViews:
     frames: list[tuple[int, ...]]  # of the video: each a view, or the left eye's and the right eye's
     stills: int  # this many views, the first ones, are also saved as pictures
     maker: FrameMaker
+    looked_at: list[int]  # views that a scene is completed for: more frames of the same path uncover nothing more
 
     @staticmethod
     def of(
-        path: list[Camera], others: dict[str, Camera], maker: FrameMaker, stills: bool, unseen: Sequence[Camera] = ()
+        path: list[Camera],
+        others: dict[str, Camera],
+        maker: FrameMaker,
+        stills: bool,
+        unseen: Sequence[Camera] = (),
+        every: int = 1,
     ) -> PlannedViews:
-        """The views of a path through the eyes of its frames, others by their names, and those that no one looks at."""
+        """The views of a path through the eyes of its frames, others by their names, and those that no one looks at.
+
+        A scene is completed for one frame in `every`.
+        """
         middles = path if stills and maker.stereo else []  # the pictures show what is between the eyes
         eyes = [maker.eyes(camera) for camera in path]
         cameras = [*middles, *(eye for pair in eyes for eye in pair), *unseen, *others.values()]
@@ -135,7 +150,9 @@ class PlannedViews:
         frames = [tuple(range(first + k * each, first + (k + 1) * each)) for k in range(len(path))]
         last = len(cameras) - len(others)
         measured = {name: last + k for k, name in enumerate(others)} or {str(k): k for k in range(len(path))}
-        return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker)
+        others_at = range(first + len(path) * each, len(cameras))
+        looked_at = [*range(first), *itertools.chain(*frames[::every]), *others_at]
+        return PlannedViews(cameras, measured, frames, len(path) if stills else 0, maker, looked_at)
 
 
 COARSE_PX = 240  # long side of the pictures that show what a move uncovers
@@ -207,12 +224,13 @@ def plan_views(
             reach, depths = path.reach(prediction.disparity), DepthRange.of(gaussians)
             others = _measured(reach, camera.even(), depths, keyframes)
             # What a longer lens leaves out is filled all the same: other programs draw the scene with the photo's.
-            upright = keyframes is None and path.trajectory in ("shake", "rotate")
+            upright = keyframes is None and path.trajectory in ("shake", "rotate", "vertical")
             unseen = trajectory("rotate", camera.even(), reach, depths, frames=5)[:4:2] if upright else []
     except PathError as error:
         raise InputError(f"{path.path}: {error}") from error
     maker = FrameMaker.of(path.video, gaussians, cameras, source)
-    return PlannedViews.of(cameras, others, maker, stills=False, unseen=unseen)
+    every = 1 if keyframes else max(1, len(cameras) // PATH_FRAMES)
+    return PlannedViews.of(cameras, others, maker, stills=False, unseen=unseen, every=every)
 
 
 def _measured(

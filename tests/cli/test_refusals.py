@@ -50,6 +50,7 @@ PREDICT = [
     *((f"--fov {value}", "--fov") for value in ("0", "180")),
     *((f"--disparity {value}", "--disparity") for value in ("-0.1", "nan")),
     *((f"--frames {value}", "--frames") for value in ("0", "1000000", "many")),
+    *((f"--seconds {value}", "--seconds") for value in ("0", "1e9", "2 --frames 9")),
     *((f"--sharp {value}", "--sharp") for value in ("windows=1", "windws=1", "windows=many", "compile")),
     *((f"--residual {file}.safetensors", f"{file}.safetensors") for file in ("nowhere", "bad")),
     *((f"{option} 0", f"{option} must be between 1 and") for option in ("--workers", "--threads")),
@@ -100,7 +101,7 @@ def place(tmp_path: Path, pair: tuple[Path, Path], scene: Path, monkeypatch: pyt
 @pytest.mark.parametrize(("command", "options", "says"), ROWS, ids=lambda value: value[:40])
 def test_options_that_cannot_be(place: Path, command: str, options: str, says: str) -> None:
     before = names_in(place)
-    short = () if any(word in options for word in ("--cameras", "--path", "--frames")) else SHORT
+    short = () if any(word in options for word in ("--cameras", "--path", "--frames", "--seconds")) else SHORT
     result = run(command, *INPUTS[command], "-o", "new/out", *short, *options.split())
     assert (result.code, result.out) == (2, ""), result.err
     assert result.lines[-1].startswith("error: ")

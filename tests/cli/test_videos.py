@@ -11,18 +11,16 @@ import av
 import numpy as np
 import pytest
 import torch
-from command import SHORT, Run, decode, names_in, report_of, run
+from command import SHORT, Run, decode, names_in, refuses, report_of, run
 from photos import HEIGHT, WIDTH, box, camera_file, damaged_scene
-from PIL import Image
-from scenes import box_before_wall, psnr
+from PIL import Image, ImageSequence
+from scenes import psnr
 from torch import Tensor
 
 import spackle
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, TrajectoryKind
 from spackle.render import CpuRenderer
-from spackle.video_frames import Fit, Stereo, VideoOptions, cover
-from spackle.views import PathOptions
+from spackle.video_frames import GAP, Fit, Stereo, cover
 
 CPU = CpuRenderer()
 
@@ -47,8 +45,9 @@ def test_render_draws_a_saved_scene(tmp_path: Path, scene: Path, plain: tuple[Pa
     ours, predicted = decode(tmp_path / "new" / "a.mp4"), decode(plain[0] / "video.mp4")
     assert len(ours) == len(predicted) == 3
     assert (ours[0].width, ours[0].height, ours[0].format.name) == (WIDTH, HEIGHT, "yuv420p")
-    first = [frames[0].to_ndarray(format="rgb24").astype(float) for frames in (ours, predicted)]
-    assert np.abs(first[0] - first[1]).mean() < 1  # the path starts at the photo's place
+    for frames in zip(ours, predicted, strict=True):
+        one, other = (frame.to_ndarray(format="rgb24").astype(float) for frame in frames)
+        assert np.abs(one - other).mean() < 1
     far = rendered(scene, tmp_path / "far.mp4", "--trajectory", "swipe", "--disparity", 1.5, "--json", *SHORT)
     beyond = "--disparity 1.5 goes beyond the 0.07 that it was completed for: `spackle predict --disparity 1.5`"
     assert beyond in far.lines[0]
@@ -89,13 +88,23 @@ def test_render_says_where_it_guesses_the_lens(tmp_path: Path, scene: Path) -> N
     assert len(rendered(bare, tmp_path, "--size", "64x48", "--focal-px", 55, *SHORT).lines) == 1
 
 
-@pytest.mark.parametrize("kind", TRAJECTORIES)
-def test_a_repeated_video_shows_its_first_view_once(kind: TrajectoryKind) -> None:
-    scene = box_before_wall()
-    for options, looped in ((VideoOptions(), 0), (VideoOptions(loop=2), 1), (VideoOptions(format="gif"), 1)):
-        path = PathOptions(kind, frames=8, video=options).fly(scene.base(), scene.camera, None)
-        assert len(path) == 8
-        assert (float((path[-1].position - path[0].position).norm()) > 1e-5) == bool(looped or kind == "swipe")
+def test_compare_puts_the_base_beside_the_scene(tmp_path: Path, scene: Path) -> None:
+    words = ("--trajectory", "swipe", "--seconds", 0.2, "--fps", 10)
+    rendered(scene, tmp_path / "both.webp", "--compare", *words)
+    rendered(scene, tmp_path / "whole.webp", *words)
+    both, whole = ([*ImageSequence.all_frames(Image.open(tmp_path / f"{name}.webp"))] for name in ("both", "whole"))
+    assert len(both) == len(whole) == 2
+    for pair, right in zip(both, whole, strict=True):
+        assert pair.size == (2 * WIDTH + GAP, HEIGHT)
+        sides = [pair.crop(box).convert("RGB") for box in ((0, 0, WIDTH, HEIGHT), (WIDTH + GAP, 0, *pair.size))]
+        open_, filled, expected = (np.asarray(image.convert("RGB"), float) for image in (*sides, right))
+        assert np.abs(filled - expected).mean() < 6  # WebP is lossy
+        dark = open_.max(axis=-1) < 40  # the holes
+        assert dark.mean() > 0.01
+        assert filled[dark].max(axis=-1).mean() > 60
+    bare = tmp_path / "base.ply"
+    spackle.save_ply(spackle.load_ply(scene), bare)
+    refuses(run("render", bare, "-o", tmp_path / "a.mp4", "--compare"), bare, "--compare")
 
 
 def test_given_views_become_pictures_and_a_stereo_video(tmp_path: Path, scene: Path) -> None:
@@ -144,23 +153,25 @@ def test_render_makes_every_kind(
 
 def test_predict_completes_what_both_eyes_see(tmp_path: Path, pair: tuple[Path, Path]) -> None:
     # A path that stays where it is: all holes are those that the eyes see.
-    common = ("predict", pair[0], "--depth", pair[1], "--frames", 3, "--disparity", 0)
+    common = ("predict", pair[0], "--depth", pair[1], "--frames", 4, "--disparity", 0)
     assert run(*common, "-o", tmp_path / "one").code == 0
     wide = ("--stereo", "sbs", "--ipd", 0.8, "--format", "webm", "--fps", 12, "--size", "32x24", "--keep-base")
     assert run(*common, "-o", tmp_path / "two", *wide).code == 0
     one, two = (report_of(tmp_path / name / "photo") for name in ("one", "two"))
     assert (one["video"]["file"], one["video"]["stereo"]) == ("video.mp4", None)
-    expected = {"file": "video.webm", "frames": 3, "fps": 12, "plays": 1, "width": 64, "height": 24, "show": "color"}
+    expected = {"file": "video.webm", "frames": 4, "fps": 12, "plays": 1, "width": 64, "height": 24, "show": "color"}
     stereo = {"layout": "sbs", "ipd": 0.8, "convergence": pytest.approx(2.0, rel=0.02)}
     assert two["video"] == {**expected, "stereo": stereo}
     before = [[view["before"] for view in report["hole_area_ratio"]] for report in (one, two)]
     assert before[0] == before[1]  # measured at the same views
     folder = tmp_path / "two" / "photo"
     frames = frames_of(folder / "video.webm")
-    assert (len(frames), frames[0].shape) == (3, (24, 64, 3))
+    assert (len(frames), frames[0].shape) == (4, (24, 64, 3))
     base, merged = (spackle.load_ply(folder / name) for name in ("base.ply", "scene.ply"))
     camera = spackle.Scene.load(folder / "scene.ply").camera
-    for eye, picture in zip(Stereo("sbs", 0.8, 2.01).eyes(camera), frames[0].split(32, dim=1), strict=True):
+    for eye, picture in zip(
+        Stereo("sbs", 0.8, 2.01).eyes(camera.zoomed(1.05)), frames[0].split(32, dim=1), strict=True
+    ):
         holes, rest = (float((CPU.render(part, eye).alpha < 0.95).float().mean()) for part in (base, merged))
         assert rest < 0.01 < 0.1 < holes
         assert psnr(CPU.render(merged, cover(eye, 32, 24)).rgb, picture) > 25

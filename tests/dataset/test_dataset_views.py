@@ -10,15 +10,15 @@ from scenes import box_before_wall, cast, shifted
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind
+from spackle.camera_path import SHARP_TRAJECTORIES, DepthRange, SharpTrajectory
 from spackle.dataset.views import APART, ViewStack, complete_views, paint_video, path_cameras, render_views
 from spackle.inpaint import INPAINTERS, InpainterOptions, get_inpainter, known_inverse_depth
 from spackle.render import get_renderer
 
 
-@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("kind", SHARP_TRAJECTORIES)
 @pytest.mark.parametrize("views", [2, 3, 20])
-def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: TrajectoryKind, views: int) -> None:
+def test_no_two_views_are_alike_and_the_first_is_the_photos(kind: SharpTrajectory, views: int) -> None:
     camera = Camera.from_focal(80.0, 96, 72)
     cameras = path_cameras(kind, 0.4, camera, DepthRange(2.0, 3.0), views)
     assert len(cameras) == views

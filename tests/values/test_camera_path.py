@@ -17,6 +17,7 @@ from torch import Tensor
 
 from spackle.camera import Camera
 from spackle.camera_path import (
+    TRAJECTORIES,
     DepthRange,
     Keyframe,
     KeyframePath,
@@ -135,6 +136,7 @@ def test_the_widest_offset_by_hand() -> None:
 
 WAVE = [0.0, 0.8, 0.0, -0.8, 0.0]
 LEVEL = [0.0] * 5
+AWAY, NEARER = 4 * 0.2 / math.sqrt(1.04), 4 - 4 / math.sqrt(1.04)
 
 
 @pytest.mark.parametrize(
@@ -146,6 +148,10 @@ LEVEL = [0.0] * 5
         ("shake", 10, [WAVE + LEVEL, LEVEL + WAVE, LEVEL * 2]),
         ("rotate-forward", 5, [WAVE, LEVEL, [0.0, 0.15, 0.3, 0.15, 0.0]]),  # 15 % of the nearest depth to and fro
         ("rotate_forward", 1, [[0.0]] * 3),
+        ("vertical", 5, [LEVEL, WAVE, LEVEL]),
+        # An arc around the focus point, 4 m away, to the angle that swipe sees it from.
+        ("orbit", 5, [[0.0, AWAY, 0.0, -AWAY, 0.0], LEVEL, [0.0, NEARER, 0.0, NEARER, 0.0]]),
+        ("dolly-zoom", 5, [LEVEL, LEVEL, [0.0, -0.4, -0.8, -0.4, 0.0]]),
     ],
 )
 def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]]) -> None:
@@ -154,10 +160,25 @@ def test_trajectories_by_hand(kind: str, frames: int, places: list[list[float]])
     for camera, *place in zip(path, *places, strict=True):
         assert camera.position.tolist() == pytest.approx(place, abs=1e-6)
         assert camera.project(torch.tensor([0.0, 0.0, RANGE.focus]))[0].tolist() == pytest.approx([200, 150], abs=1e-3)
-        assert torch.equal(camera.K, PHOTO.K)
+        if kind == "dolly-zoom":  # what stands 1 m aside of the focus point stays where it is
+            aside = camera.project(torch.tensor([1.0, 0.0, RANGE.focus]))[0].tolist()
+            assert aside == pytest.approx([200 + 500 / 4, 150], abs=1e-3)
+        else:
+            assert torch.equal(camera.K, PHOTO.K)
     if kind == "swipe" and frames > 1:
         ends = zip(extremes(PHOTO, 0.4, RANGE), (path[0], path[-1]), strict=True)
         assert all(torch.equal(one.world_to_camera, other.world_to_camera) for one, other in ends)
+
+
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_a_looped_path_goes_on_at_its_beginning(kind: TrajectoryKind) -> None:
+    eyes = torch.stack([view.position for view in trajectory(kind, PHOTO, 0.4, RANGE, 40, looped=True)])
+    steps = (eyes - eyes.roll(1, 0)).norm(dim=1)
+    assert float(steps[0]) <= float(steps.max())
+    assert len(eyes) == 40
+    plain = torch.stack([view.position for view in trajectory(kind, PHOTO, 0.4, RANGE, 41)])
+    assert torch.equal(eyes, plain[:40]) == (kind != "swipe")  # which comes back
+    assert float(eyes[:, 0].min()) == pytest.approx(float(plain[:, 0].min()), abs=1e-3)
 
 
 @pytest.mark.parametrize(

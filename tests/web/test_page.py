@@ -26,7 +26,7 @@ from torch import Tensor
 from web_client import eventually, served
 
 from spackle.camera import Camera
-from spackle.camera_path import OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
+from spackle.camera_path import OVERSCAN, SHARP_TRAJECTORIES, DepthRange, TrajectoryKind, trajectory
 from spackle.color import linear_to_srgb
 from spackle.gaussians import Gaussians
 from spackle.gaussians import quat_to_matrix as matrices
@@ -238,7 +238,7 @@ def test_the_single_file_opens_from_a_disk_and_asks_nobody(shown: Opened) -> Non
     assert all(shown.page.locator(name).is_hidden() for name in ("#open", "#notice"))
 
 
-@pytest.mark.parametrize("kind", TRAJECTORIES)
+@pytest.mark.parametrize("kind", SHARP_TRAJECTORIES)
 def test_the_page_goes_where_the_trajectory_goes(page: Any, kind: TrajectoryKind) -> None:
     cameras = trajectory(kind, box().camera, 0.45, DepthRange.of(box().base), 121)
     places = [0, 17, 60, 61, 103, 120]

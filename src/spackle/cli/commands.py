@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -144,6 +145,9 @@ def render(
     *,
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="A 3D Gaussian scene.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="A folder, or name.mp4|webm|gif|webp.")],
+    compare: Annotated[
+        bool, typer.Option("--compare", help="To the left what the photo shows, with its holes; to the right all.")
+    ] = False,
     path: PathOptions,
     focal_px: Annotated[float | None, typer.Option(help="Focal length in pixels of the video.")] = None,
     device: DeviceOption = "auto",
@@ -154,6 +158,7 @@ def render(
     from spackle.cli.saved_scene import render_scene
     from spackle.progress import Reporter
 
+    path = dataclasses.replace(path, video=dataclasses.replace(path.video, compare=compare))
     render_scene(scene, output, path, focal_px, device, Reporter(verbose, as_json=as_json))
 
 

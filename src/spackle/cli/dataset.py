@@ -11,7 +11,7 @@ from spackle.cli.options import (
     INTERRUPTED,
     DeviceOption,
     PrecisionOption,
-    TrajectoryName,
+    SharpTrajectoryName,
     VerboseOption,
 )
 
@@ -45,7 +45,7 @@ def dataset_build(
     precision: PrecisionOption = "auto",
     views: Annotated[int, typer.Option(min=2, max=100, help="Views of a photo, its own among them.")] = 20,
     trajectory: Annotated[
-        TrajectoryName | None, typer.Option(help="Camera path; default: drawn for each photo.")
+        SharpTrajectoryName | None, typer.Option(help="Camera path; default: drawn for each photo.")
     ] = None,
     disparity: Annotated[
         tuple[float, float], typer.Option(metavar="LO HI", help="How far the camera moves, drawn between these.")

@@ -17,8 +17,9 @@ if TYPE_CHECKING:  # torch takes seconds to load
 
 INTERRUPTED = 130  # what shells report of a command that Ctrl-C ended
 
-# As `TrajectoryKind` has it; names are normalised, so that rotate_forward is taken, too.
-TrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
+# As `TrajectoryKind` has them; names are normalised, so that rotate_forward is taken, too.
+SharpTrajectoryName = Literal["swipe", "shake", "rotate", "rotate-forward"]
+TrajectoryName = Literal[SharpTrajectoryName, "vertical", "orbit", "dolly-zoom"]
 PrecisionName = Literal["auto", "fp32", "bf16"]
 DepthKindName = Literal["auto", "metric", "disparity", "near-white", "near-black"]
 PrecisionOption = Annotated[PrecisionName, typer.Option(help="Of the base's network.")]
@@ -109,8 +110,9 @@ def path_options(
     cameras: Annotated[
         Path | None, typer.Option(metavar="FILE.json", hidden=True, help="Exactly these views in place of a path.")
     ] = None,
-    frames: Annotated[
-        int | None, typer.Option(help="Frames of the path.", show_default="60, or the keyframes' seconds")
+    frames: Annotated[int | None, typer.Option(hidden=True, help="Frames of the path, in place of --seconds.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="How long the video lasts.", show_default="4, or as --path has it")
     ] = None,
     video_format: Annotated[
         Literal["mp4", "webm", "gif", "webp"] | None,
@@ -182,7 +184,8 @@ def path_options(
     if path is not None:
         reason = f"--path {path}: is a camera path of its own"
     elif cameras is not None:
-        reason, useless["--frames"] = f"--cameras {cameras}: gives the views themselves", frames
+        reason = f"--cameras {cameras}: gives the views themselves"
+        useless |= {"--frames": frames, "--seconds": seconds}
     else:
         reason, useless = "", {}
     for option, value in useless.items():
@@ -191,7 +194,7 @@ def path_options(
     pixels = None if size is None else parse_size(size)
     video = VideoOptions(video_format, fps, loop, pixels, fit, show, stereo, ipd, convergence)
     kind, zoom = trajectory or "rotate-forward", OVERSCAN if overscan is None else overscan
-    return PathOptions(kind, disparity, cameras, path, frames, video, zoom)
+    return PathOptions(kind, disparity, cameras, path, frames, seconds, video, zoom)
 
 
 def with_path_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -50,13 +50,18 @@ def render_scene(
     elif (mimetypes.guess_type(output.name)[0] or "").startswith(("video/", "image/")):
         raise InputError(f"{output}: not a kind of video that can be written: end it with {', '.join(FORMATS)}")
     path.check()
+    compare = path.video.compare
     if path.cameras is not None and focal_px is not None:
         raise InputError(f"--focal-px: the views of --cameras {path.cameras} have lenses of their own: leave it out")
     renderer = get_renderer(device)
     with reporter.stage("load"):
         given, keyframes = path.load()
         loaded = load_scene(scene)
-        gaussians, reach = loaded.gaussians, loaded.disparity
+        gaussians, reach, base_count = loaded.gaussians, loaded.disparity, loaded.base_count
+        if compare and (base_count is None or base_count >= len(gaussians)):
+            raise InputError(f"{scene}: --compare needs a completed scene, such as the scene.ply of `spackle predict`")
+        base = gaussians.select(slice(0, base_count))  # whose depths set how far a path goes, as for `spackle predict`
+        parts = [base, gaussians] if compare else [gaussians]
         if given:
             cameras = given
         else:
@@ -64,7 +69,7 @@ def render_scene(
             if focal_px is not None or reach is None:  # the lens is given, or nothing is known of the scene
                 path = dataclasses.replace(path, overscan=0)
             try:
-                cameras = path.fly(gaussians, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
+                cameras = path.fly(base, camera, keyframes, USUAL_DISPARITY if reach is None else reach)
             except PathError as error:
                 raise InputError(f"{path.path}: {error}") from error
             except ValueError as error:
@@ -80,7 +85,7 @@ def render_scene(
                     f"{scene.name}: no camera stored, taking {DEFAULT_FOCAL_MM:g} mm at "
                     f"{camera.width}×{camera.height} (--focal-px, --size)"
                 )
-        maker = FrameMaker.of(path.video, gaussians, cameras, scene)
+        maker = FrameMaker.of(path.video, base, cameras, scene)
     target = output if single else output / f"{scene.stem}{path.video.suffix}"
     names = [f"{index:04d}.png" for index in range(len(cameras))] if given and not single else []
     problem = video_problem([maker.sized(camera) for camera in cameras])
@@ -94,9 +99,10 @@ def render_scene(
             """The frames of the video, each also saved as a picture, where these are wanted."""
             for index, camera in enumerate(cameras):
                 with torch.no_grad():
-                    views = [renderer.render([gaussians], maker.sized(eye)) for eye in maker.eyes(camera)]
+                    eyes = [maker.sized(eye) for eye in maker.eyes(camera)]
+                    views = [renderer.render([part], eye) for part in parts for eye in eyes]
                     frame = maker.frame(views)
-                holes.append(max(hole_area_ratio(view.alpha) for view in views))
+                holes.append(max(hole_area_ratio(view.alpha) for view in views[-len(eyes) :]))
                 if names:
                     save_png(frame, target.parent / names[index])
                 yield frame

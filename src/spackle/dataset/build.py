@@ -14,7 +14,7 @@ import spackle
 from spackle.bases.depth_map import find_depth
 from spackle.bases.open import BaseError, open_base
 from spackle.bases.settings import NETWORKS, BaseSettings
-from spackle.camera_path import MAX_DISPARITY, DepthRange, TrajectoryKind
+from spackle.camera_path import MAX_DISPARITY, DepthRange, SharpTrajectory
 from spackle.dataset.photos import PhotoFile, choose, find_photos
 from spackle.dataset.sample import pack_sample
 from spackle.dataset.shards import NAME, Manifest, load_manifest, write_shard
@@ -44,7 +44,7 @@ class DatasetOptions:
     sample: int | None = None  # number of photos; all where None
     seed: int = 0  # of the choice of photos, and of the paths
     views: int = 20  # of a photo, its own among them, as in the paper
-    trajectory: TrajectoryKind | None = None  # drawn for each photo where None
+    trajectory: SharpTrajectory | None = None  # drawn for each photo where None
     disparity: tuple[float, float] = (0.1, 0.6)  # drawn between these, see `spackle.camera_path.max_offset`
     inpainter: str = "exemplar"  # of `COMPLETIONS`
     inpainter_weights: Path | None = None  # a file or a folder, for one with a network

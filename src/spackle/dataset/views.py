@@ -16,7 +16,7 @@ from torch.nn.functional import grid_sample
 
 from spackle.bases import BasePrediction
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+from spackle.camera_path import SHARP_TRAJECTORIES, DepthRange, SharpTrajectory, max_offset, trajectory
 from spackle.filters import far_fill
 from spackle.inpaint import INPAINTERS, Inpainter, known_inverse_depth
 from spackle.pipeline import complete
@@ -32,16 +32,16 @@ COMPLETIONS = (*INPAINTERS, "geometry", "none")  # values of --inpainter
 
 
 def draw_path(
-    kind: TrajectoryKind | None, disparity: tuple[float, float], seed: int, photo_sha256: str
-) -> tuple[TrajectoryKind, float]:
+    kind: SharpTrajectory | None, disparity: tuple[float, float], seed: int, photo_sha256: str
+) -> tuple[SharpTrajectory, float]:
     """A photo's path and its disparity, drawn by seed and file alone; `kind` is kept where it is given."""
     rng = np.random.default_rng(list(hashlib.sha256(f"{seed}:{photo_sha256}".encode()).digest()))
-    drawn = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
+    drawn = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     return kind or drawn, float(rng.uniform(*disparity))
 
 
 def path_cameras(
-    kind: TrajectoryKind, disparity: float, camera: Camera, depth_range: DepthRange, views: int
+    kind: SharpTrajectory, disparity: float, camera: Camera, depth_range: DepthRange, views: int
 ) -> list[Camera]:
     """The photo's own view (`camera`, of the views' size), then others along the path: `views` in all, no two alike.
 

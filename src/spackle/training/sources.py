@@ -23,7 +23,7 @@ from spackle.bases import BasePrediction
 from spackle.bases.depth_map import DepthMap, load_depth, read_calibration
 from spackle.bases.lift import lift
 from spackle.camera import Camera
-from spackle.camera_path import TRAJECTORIES, DepthRange, trajectory
+from spackle.camera_path import SHARP_TRAJECTORIES, DepthRange, trajectory
 from spackle.dataset.shards import DatasetFiles
 from spackle.errors import InputError, reading
 from spackle.files import files_in
@@ -161,7 +161,7 @@ def random_reverse_view(
     """`reverse_view` of a photo from a random frame of a random path."""
     rgb, depth, camera = draw(rng)
     prediction = lift(rgb, depth, camera, levels=0)  # a tile is seen as a whole, and a hole's outline is not a tile's
-    kind = TRAJECTORIES[rng.integers(len(TRAJECTORIES))]
+    kind = SHARP_TRAJECTORIES[rng.integers(len(SHARP_TRAJECTORIES))]
     reach = DepthRange.of(prediction.gaussians)
     viewer = trajectory(kind, camera, rng.uniform(*disparity), reach, FRAMES)[rng.integers(FRAMES)]
     return reverse_view(prediction, rgb, viewer, renderer)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from spackle.camera import Camera
-from spackle.camera_path import OVERSCAN, TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
+from spackle.camera_path import OVERSCAN, SHARP_TRAJECTORIES, DepthRange, TrajectoryKind, max_offset, trajectory
 from spackle.color import linear_to_srgb
 from spackle.errors import InputError
 from spackle.formats.scene_files import smallest_three
@@ -77,7 +77,7 @@ def page_scene(
         "focus": depths.focus,
         "zNear": depths.near,
         "orbit": {"unit": max_offset(camera, 1.0, depths), "free": free, "limit": free},
-        "paths": {kind: _path(kind, camera, depths) for kind in TRAJECTORIES},
+        "paths": {kind: _path(kind, camera, depths) for kind in SHARP_TRAJECTORIES},
         "layers": layers,
     }
     return PageScene(description, files)

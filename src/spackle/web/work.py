@@ -30,12 +30,16 @@ from spackle.progress import Reporter, Step
 from spackle.render import get_renderer
 from spackle.scene import Scene
 from spackle.task_process import Tell
-from spackle.views import MAX_FRAMES, PATH_FRAMES, PathOptions
+from spackle.video_frames import DEFAULT_FPS
+from spackle.views import MAX_FRAMES, SECONDS, PathOptions
 from spackle.web.jobs import Job
 from spackle.web.page import as_json, single_html
 
 Download = Literal["scene.ply", "scene.spz", "scene.sog", "scene.glb", "scene.html", "report.json"]
-Video = Literal["video.mp4", "swipe.mp4", "shake.mp4", "rotate.mp4", "rotate-forward.mp4"]
+Video = Literal[
+    "video.mp4", "swipe.mp4", "shake.mp4", "rotate.mp4", "rotate-forward.mp4", "vertical.mp4", "orbit.mp4",
+    "dolly-zoom.mp4",
+]  # fmt: skip
 FileName = Download | Video
 MADE: list[FileName] = ["scene.ply", "scene.spz", "scene.glb", "scene.html", "video.mp4", "report.json"]  # as usual
 PAGE, PREVIEW, SIDE = "page.json", "photo.jpg", 1280  # pixels of the long side of what stands for the photo
@@ -52,7 +56,9 @@ class SceneOptions(BaseModel):
     depth_kind: DepthKind = Field("auto", description="What the numbers of the depth map are.")
     disparity: float | None = Field(None, ge=0, le=MAX_DISPARITY, description="How far the camera moves; 0.3 is large.")
     trajectory: TrajectoryKind = Field("rotate-forward", description="Camera path of the video.")
-    frames: int = Field(PATH_FRAMES, ge=1, le=MAX_FRAMES, description="Frames of the video, 30 a second.")
+    frames: int = Field(
+        round(SECONDS * DEFAULT_FPS), ge=1, le=MAX_FRAMES, description="Frames of the video, 30 a second."
+    )
     fill: Fill = Field("auto", description="Texture of what fills the holes.")
     focal_px: float | None = Field(None, gt=0, description="Focal length in pixels of the photo.")
     focal_mm: float | None = Field(None, gt=0, description="Focal length in mm, 35 mm equivalent.")
