@@ -86,8 +86,8 @@ def trajectory(
 
     Args:
         kind: swipe (left to right), shake (left-right, then up-down), rotate (a circle), rotate-forward (left-right
-            while moving in and out), vertical (up-down), orbit (left-right at one distance from the focus point), or
-            dolly-zoom (back, while the lens keeps the size of what stands at the focus point).
+            while moving in and out), vertical (up-down, less in a wide picture), orbit (left-right at one distance from
+            the focus point), or dolly-zoom (back, while the lens keeps the size of what stands at the focus point).
         camera: the photo's camera at the world's origin.
         disparity: the widest offset, in the units of `max_offset`.
         depth_range: depths of the base's Gaussians.
@@ -151,7 +151,8 @@ def _flight(
     elif kind == "rotate":
         xyz = [side * turn.sin(), side * turn.cos(), zero]
     elif kind == "vertical":
-        xyz = [zero, side * turn.sin(), zero]
+        flat = min(1.0, camera.height / camera.width)  # who looks up in a wide picture soon stands beneath its floor
+        xyz = [zero, flat * side * turn.sin(), zero]
     elif kind == "orbit":
         angle = math.atan2(side, focus) * turn.sin()
         xyz = [focus * angle.sin(), zero, focus * (1 - angle.cos())]

@@ -148,7 +148,7 @@ AWAY, NEARER = 4 * 0.2 / math.sqrt(1.04), 4 - 4 / math.sqrt(1.04)
         ("shake", 10, [WAVE + LEVEL, LEVEL + WAVE, LEVEL * 2]),
         ("rotate-forward", 5, [WAVE, LEVEL, [0.0, 0.15, 0.3, 0.15, 0.0]]),  # 15 % of the nearest depth to and fro
         ("rotate_forward", 1, [[0.0]] * 3),
-        ("vertical", 5, [LEVEL, WAVE, LEVEL]),
+        ("vertical", 5, [LEVEL, [0.0, 0.6, 0.0, -0.6, 0.0], LEVEL]),
         # An arc around the focus point, 4 m away, to the angle that swipe sees it from.
         ("orbit", 5, [[0.0, AWAY, 0.0, -AWAY, 0.0], LEVEL, [0.0, NEARER, 0.0, NEARER, 0.0]]),
         ("dolly-zoom", 5, [LEVEL, LEVEL, [0.0, -0.4, -0.8, -0.4, 0.0]]),
