@@ -30,6 +30,7 @@ MAX_PIXELS = 100_000_000  # a bigger picture would take more than a gigabyte as 
 SMALL_PIXELS, PIXELS_A_BYTE = 32_000_000, 32  # a strongly compressed photo has 20 pixels in a byte
 LEAST_SIDE, MOST_ASPECT = 32, 8  # pixels, and long side over short side: there is no scene in less, or in a stripe
 MAX_SIDE = 1536  # long side of the working size
+EDGE = 0.005  # of the long side: see `pad_edge`
 DEFAULT_FOCAL_MM = 30.0  # 35 mm equivalent, where nothing else is known; SHARP's choice
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 PHONE_FOCAL_MM, PHONE_FACTOR = 10.0, 8.4  # a shorter real lens sits on a small sensor: SHARP's crude rule
@@ -215,6 +216,18 @@ def resize_photo(photo: Photo, max_side: int = MAX_SIDE) -> Photo:
     run_chunks(resize, 3, 1)
     frame = photo.frame and photo.frame.scaled(width / photo.width, height / photo.height)
     return dataclasses.replace(photo, rgb=rgb, focal_px=photo.focal_px * width / photo.width, frame=frame)
+
+
+def pad_edge(rgb: Tensor) -> Tensor:
+    """A photo [H, W, 3] whose outermost pixels, `EDGE` of its long side, take the colour of the pixel just inside.
+
+    The last lines of a photo are often none of the picture: a scan's edge, or what resizing mixed in from outside. In a
+    view from the side they show as a line, and as streaks where the fill extends them.
+    """
+    height, width = rgb.shape[:2]
+    edge = min(round(EDGE * max(height, width)), (min(height, width) - 1) // 2)
+    rows, columns = (torch.arange(side).clamp(edge, side - 1 - edge) for side in (height, width))
+    return rgb[rows][:, columns]
 
 
 def working_size(width: int, height: int, max_side: int = MAX_SIDE) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageCms, ImageOps, TiffImagePlugin
 
 from spackle.errors import InputError
-from spackle.image import film_to_pixels, focal_from_exif, load_photo, resize_photo, working_size
+from spackle.image import film_to_pixels, focal_from_exif, load_photo, pad_edge, resize_photo, working_size
 
 
 def picture(width: int = 48, height: int = 32) -> Image.Image:
@@ -145,6 +145,15 @@ def test_resize(tmp_path: Path) -> None:
     assert (small.rgb - expected).abs().max() < 2 / 255
     assert resize_photo(photo) is photo
     assert [working_size(9000, 1, 100), working_size(3, 5000, 1000)] == [(100, 1), (1, 1000)]
+
+
+def test_bad_lines_at_the_edge_take_the_colour_inside() -> None:
+    photo = torch.full((100, 400, 3), 0.5)
+    photo[:, -2:], photo[0] = 1.0, 0.0
+    assert (pad_edge(photo) == 0.5).all()
+    photo[2:-2, 2:-2] = torch.rand(96, 396, 3)
+    assert (pad_edge(photo)[2:-2, 2:-2] == photo[2:-2, 2:-2]).all()
+    assert pad_edge(photo[:3, :1]).shape == (3, 1, 3)
 
 
 def png_claiming(width: int, height: int) -> bytes:

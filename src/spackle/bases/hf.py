@@ -24,7 +24,7 @@ from spackle.bases.lift import lift
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError, reading, reason_in_a_line
-from spackle.image import Photo, resize_photo
+from spackle.image import Photo, pad_edge, resize_photo
 
 _HUB_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 _NEVER_USED = re.compile(r".*fusion_stage\.layers\.0\.residual_layer1\..*")  # for finer features; the published lack it
@@ -103,7 +103,7 @@ class HfBase:
         depth = to_depth_map(raw, self.meaning, camera.focal[0] / photo.width, self.name, photo.path)
         if progress:
             progress(1, 2)
-        prediction = lift(photo.rgb, depth, camera)
+        prediction = lift(pad_edge(photo.rgb), depth, camera)
         if progress:
             progress(2, 2)
         relative = self.meaning == "relative disparity"

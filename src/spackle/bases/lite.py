@@ -21,7 +21,7 @@ from spackle.bases.depth_map import DepthMap
 from spackle.bases.lift import lift
 from spackle.device import own_arithmetic, pick_device
 from spackle.errors import InputError
-from spackle.image import Photo, resize_photo
+from spackle.image import Photo, pad_edge, resize_photo
 from spackle.network_file import channels_last, load_strict, read_tensors
 
 STRIDE = 32  # both sides of the input are multiples of it
@@ -251,7 +251,8 @@ class LiteBase:
         known = torch.ones_like(depth, dtype=torch.bool)
         if progress:
             progress(1, 2)
-        prediction = lift(photo.rgb, DepthMap(depth, known, None, None, "disparity", photo.path), photo.camera)
+        depth_map = DepthMap(depth, known, None, None, "disparity", photo.path)
+        prediction = lift(pad_edge(photo.rgb), depth_map, photo.camera)
         if progress:
             progress(2, 2)
         notes = {**prediction.notes, "precision": "fp32", "depth_scale": f"relative, the nearest at {NEAREST_M:g} m"}

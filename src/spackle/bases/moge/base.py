@@ -18,7 +18,7 @@ from spackle.bases.moge.network import FINEST, MogeNetwork, MogeOutput, load_net
 from spackle.camera import Camera
 from spackle.device import Precision, enough_memory, own_arithmetic, pick_device, pick_dtype
 from spackle.errors import InputError
-from spackle.image import Photo, resize_photo
+from spackle.image import Photo, pad_edge, resize_photo
 
 TOKENS = 1800  # that a photo is seen as, where the checkpoint's range has it
 SAMPLES = 64  # of a side of the map: so many points tell focal length and shift
@@ -87,7 +87,7 @@ class MogeBase:
             raise InputError(f"{photo.path}: MoGe sees no surface in it: give another photo, or --base lite")
         depth = torch.where(view.surface, view.depth.where(valid, 0.0), SKY * view.depth[valid].max())
         depth_map = DepthMap(depth, valid | ~view.surface, None, None, "depth", photo.path)
-        prediction = lift(photo.rgb, depth_map, camera)
+        prediction = lift(pad_edge(photo.rgb), depth_map, camera)
         if progress:
             progress(2, 2)
         notes = {**prediction.notes, "precision": self.precision, "depth_scale": "metric, by the model"}
